@@ -1,0 +1,172 @@
+"""What may be unknown about a simulator: named parameters with units and bounds.
+
+Everywhere in the library ``theta`` (B, N) is normalised to the unit cube and ``values`` (B, N) are the same
+numbers in physical units. A parameter on a linear scale maps affinely, one on a log scale geometrically.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Scale = Literal["linear", "log"]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One unknown of a simulator.
+
+    name: unique within its space. low, high: bounds in ``unit``. default: the model's own value, if it has one
+    within the bounds. scale: how theta in [0, 1] maps to the value. targets: what the value is written to, in the
+    words of the environment. log: set when the value holds for that log alone (a nuisance parameter).
+    prior_mean, prior_sd: a normal prior in ``unit`` truncated to the bounds; without them the prior is uniform
+    in theta. On a log scale the normal is one of the logarithm, with relative sd ``prior_sd / prior_mean``.
+    """
+
+    name: str
+    low: float = 0.0
+    high: float = 1.0
+    default: float | None = None
+    unit: str = ""
+    scale: Scale = "linear"
+    targets: tuple[str, ...] = ()
+    log: str | None = None
+    prior_mean: float | None = None
+    prior_sd: float | None = None
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        where = f"parameter {self.name!r}"
+        if not self.name:
+            raise ValueError("parameter name: expected a non-empty string, got ''")
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            raise ValueError(f"{where}: bounds must be finite, got [{self.low}, {self.high}]")
+        if self.low >= self.high:
+            raise ValueError(
+                f"{where}: bounds are reversed or empty, got [{self.low:g}, {self.high:g}]; give [low, high] with low < high"
+            )
+        if self.scale not in ("linear", "log"):
+            raise ValueError(f"{where}: scale must be 'linear' or 'log', got {self.scale!r}")
+        if self.scale == "log" and self.low <= 0:
+            raise ValueError(
+                f"{where}: a log scale needs bounds above zero, got low = {self.low:g}; raise it or use scale = 'linear'"
+            )
+        if self.default is not None and not self.low <= self.default <= self.high:
+            raise ValueError(
+                f"{where}: the default {self.default:g} {self.unit} lies outside the bounds "
+                f"[{self.low:g}, {self.high:g}]; widen the bounds to include it"
+            )
+        if (self.prior_mean is None) != (self.prior_sd is None):
+            raise ValueError(f"{where}: a normal prior needs both mean and sd")
+        if self.prior_sd is not None and not self.prior_sd > 0:
+            raise ValueError(f"{where}: prior sd must be positive, got {self.prior_sd}")
+        if self.scale == "log" and self.prior_mean is not None and self.prior_mean <= 0:
+            raise ValueError(f"{where}: prior mean must be positive on a log scale, got {self.prior_mean}")
+
+    def normalise(self, value: Any) -> Any:
+        """Theta of a value in ``unit`` (scalar or array)."""
+        if self.scale == "log":
+            return np.log(np.asarray(value) / self.low) / math.log(self.high / self.low)
+        return (np.asarray(value) - self.low) / (self.high - self.low)
+
+    def value(self, theta: Any) -> Any:
+        """The value in ``unit`` of theta (scalar or array)."""
+        if self.scale == "log":
+            return self.low * np.exp(np.asarray(theta) * math.log(self.high / self.low))
+        return self.low + np.asarray(theta) * (self.high - self.low)
+
+    @property
+    def theta_prior(self) -> tuple[float, float]:
+        """Mean and sd of the normal prior in theta; (0.5, inf) when the prior is uniform."""
+        if self.prior_mean is None or self.prior_sd is None:
+            return 0.5, math.inf
+        mean = float(self.normalise(self.prior_mean))
+        if self.scale == "log":
+            return mean, self.prior_sd / self.prior_mean / math.log(self.high / self.low)
+        return mean, self.prior_sd / (self.high - self.low)
+
+
+class ParameterSpace(Sequence[Parameter]):
+    """An ordered set of parameters; immutable. ``theta`` (..., N) <-> ``values`` (..., N)."""
+
+    def __init__(self, parameters: Iterable[Parameter]) -> None:
+        self._parameters = tuple(parameters)
+        names = [p.name for p in self._parameters]
+        if not names:
+            raise ValueError("parameters: expected at least one, got none")
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"parameters: the names must differ, but {twice} appear more than once")
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._parameters[key]
+
+    def __len__(self) -> int:
+        return len(self._parameters)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self._parameters)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ParameterSpace) and self._parameters == other._parameters
+
+    def __hash__(self) -> int:
+        return hash(self._parameters)
+
+    def __repr__(self) -> str:
+        return f"ParameterSpace({', '.join(self.names)})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self._parameters)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(p.unit for p in self._parameters)
+
+    def index(self, name: str, *_: Any) -> int:  # type: ignore[override]
+        """Position of the parameter called ``name``."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise KeyError(f"no parameter {name!r}; this space has {list(self.names)}") from None
+
+    def subset(self, names: Iterable[str]) -> ParameterSpace:
+        """The space of some parameters, in the order given."""
+        return ParameterSpace(self._parameters[self.index(n)] for n in names)
+
+    def values(self, theta: Any) -> FloatArray:
+        """Physical values (..., N) of theta (..., N)."""
+        theta = self.check_shape(theta)
+        return np.stack([p.value(theta[..., j]) for j, p in enumerate(self._parameters)], -1)
+
+    def normalise(self, values: Any) -> FloatArray:
+        """Theta (..., N) of physical values (..., N)."""
+        values = self.check_shape(values)
+        return np.stack([p.normalise(values[..., j]) for j, p in enumerate(self._parameters)], -1)
+
+    @property
+    def default_theta(self) -> FloatArray:
+        """Theta (N,) of the model's own values; 0.5 where a parameter has none."""
+        return np.array([0.5 if p.default is None else float(p.normalise(p.default)) for p in self._parameters])
+
+    def check_shape(self, array: Any) -> FloatArray:
+        """``array`` as float64 (..., N); raises ValueError when its last axis is not N."""
+        array = np.asarray(array, dtype=np.float64)
+        if array.ndim == 0 or array.shape[-1] != len(self):
+            raise ValueError(f"expected {len(self)} parameters on the last axis, got shape {array.shape}")
+        return array
+
+    def to_dict(self) -> list[dict[str, Any]]:
+        """Plain data, for JSON."""
+        return [{**p.__dict__, "targets": list(p.targets)} for p in self._parameters]
+
+    @classmethod
+    def from_dict(cls, items: list[dict[str, Any]]) -> ParameterSpace:
+        return cls(Parameter(**{**item, "targets": tuple(item.get("targets", ()))}) for item in items)

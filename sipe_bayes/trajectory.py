@@ -1,0 +1,161 @@
+"""Recorded or simulated motion: one ``Trajectory``, or a padded batch ``Trajectories``.
+
+Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state); dt in seconds. Action t
+is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``: masked, never
+invented.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One trajectory of T control steps, ``dt`` seconds apart.
+
+    observations (T+1, O), NaN where there is no measurement; actions (T, A), finite; states (T+1, S) or None.
+    ``name`` is the log's name; ``channels`` names the O observed quantities.
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    dt: float
+    states: FloatArray | None = None
+    name: str = ""
+    channels: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        label = f"trajectory {self.name!r}"
+        observations = np.atleast_2d(np.asarray(self.observations, dtype=np.float64))
+        actions = np.asarray(self.actions, dtype=np.float64)
+        if observations.ndim != 2 or actions.ndim != 2 or len(observations) != len(actions) + 1:
+            raise ValueError(
+                f"{label}: expected observations (T+1, O) and actions (T, A), got {observations.shape} and {actions.shape}"
+            )
+        if not len(actions):
+            raise ValueError(f"{label}: expected at least one control step, got none")
+        if not self.dt > 0:
+            raise ValueError(f"{label}: dt must be positive, got {self.dt}")
+        if not np.isfinite(actions).all():
+            raise ValueError(f"{label}: actions must be finite, got {int((~np.isfinite(actions)).sum())} that are not")
+        if self.states is not None and len(self.states) != len(observations):
+            raise ValueError(f"{label}: expected states ({len(observations)}, S), got {self.states.shape}")
+        if self.channels and len(self.channels) != observations.shape[1]:
+            raise ValueError(f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels")
+        object.__setattr__(self, "observations", observations)
+        object.__setattr__(self, "actions", actions)
+
+    def __len__(self) -> int:
+        """Control steps T."""
+        return len(self.actions)
+
+    @property
+    def time(self) -> FloatArray:
+        """Sample times (T+1,) in seconds from the start."""
+        return np.arange(len(self) + 1) * self.dt
+
+    def slice(self, start: int, stop: int) -> Trajectory:
+        """Control steps start..stop, with both end samples."""
+        states = None if self.states is None else self.states[start : stop + 1]
+        return Trajectory(
+            self.observations[start : stop + 1], self.actions[start:stop], self.dt, states, self.name, self.channels
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories(Sequence[Trajectory]):
+    """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,), length (B,).
+
+    Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first sample
+    of a diverged simulation on, and on padding; it is all True on recorded samples. Indexing gives a Trajectory.
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    dt: FloatArray
+    length: NDArray[np.int64]
+    valid: BoolArray
+    states: FloatArray | None = None
+    names: tuple[str, ...] = ()
+    channels: tuple[str, ...] = field(default=())
+
+    @classmethod
+    def stack(cls, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Trajectories:
+        """A batch of one or several trajectories, which may differ in length and dt."""
+        if isinstance(trajectories, Trajectories):
+            return trajectories
+        items = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
+        if not items:
+            raise ValueError("trajectories: expected at least one, got none")
+        sizes = {(t.observations.shape[1], t.actions.shape[1]) for t in items}
+        if len(sizes) > 1:
+            raise ValueError(f"trajectories differ in (observation, action) sizes: {sorted(sizes)}")
+        batch, steps = len(items), max(len(t) for t in items)
+        (n_obs, n_act), with_states = sizes.pop(), all(t.states is not None for t in items)
+        observations = np.full((batch, steps + 1, n_obs), np.nan)
+        actions = np.zeros((batch, steps, n_act))
+        states = None
+        if with_states:
+            states = np.full((batch, steps + 1, items[0].states.shape[1]), np.nan)  # type: ignore[union-attr]
+        for i, t in enumerate(items):
+            observations[i, : len(t) + 1], actions[i, : len(t)] = t.observations, t.actions
+            if states is not None and t.states is not None:
+                states[i, : len(t) + 1] = t.states
+        length = np.array([len(t) for t in items])
+        valid = np.arange(steps + 1)[None] <= length[:, None]
+        names = tuple(t.name or str(i) for i, t in enumerate(items))
+        dt = np.array([t.dt for t in items])
+        return cls(observations, actions, dt, length, valid, states, names, items[0].channels)
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, slice):
+            return Trajectories.stack([self[i] for i in range(len(self))[key]])
+        n = int(self.length[key])
+        states = None if self.states is None else self.states[key, : n + 1]
+        name = self.names[key] if self.names else ""
+        dt = float(self.dt[key])
+        return Trajectory(self.observations[key, : n + 1], self.actions[key, :n], dt, states, name, self.channels)
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return (self[i] for i in range(len(self)))
+
+    def save(self, path: str | Path) -> None:
+        """Write to an npz file, atomically."""
+        arrays: dict[str, Any] = {
+            "observations": self.observations,
+            "actions": self.actions,
+            "dt": self.dt,
+            "length": self.length,
+            "valid": self.valid,
+            "names": np.array(self.names, dtype=np.str_),
+            "channels": np.array(self.channels, dtype=np.str_),
+        }
+        if self.states is not None:
+            arrays["states"] = self.states
+        path = Path(path)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
+            np.savez_compressed(file, **arrays)
+        os.replace(file.name, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Trajectories:
+        """Read what ``save`` wrote; runs no code from the file."""
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        names, channels = (tuple(str(s) for s in arrays.pop(key)) for key in ("names", "channels"))
+        return cls(**arrays, names=names, channels=channels)
