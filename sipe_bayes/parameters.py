@@ -24,7 +24,8 @@ class Parameter:
 
     name: unique within its space. low, high: bounds in ``unit``. default: the model's own value, if it has one
     within the bounds. scale: how theta in [0, 1] maps to the value. targets: what the value is written to, in the
-    words of the environment. log: set when the value holds for that log alone (a nuisance parameter).
+    words of the environment. relative: until the environment has filled in the model's own value, the bounds are
+    factors of it; several targets then keep their proportions. log: set when the value holds for that log alone (a nuisance parameter).
     prior_mean, prior_sd: a normal prior in ``unit`` truncated to the bounds; without them the prior is uniform
     in theta. On a log scale the normal is one of the logarithm, with relative sd ``prior_sd / prior_mean``.
     """
@@ -36,6 +37,7 @@ class Parameter:
     unit: str = ""
     scale: Scale = "linear"
     targets: tuple[str, ...] = ()
+    relative: bool = False
     log: str | None = None
     prior_mean: float | None = None
     prior_sd: float | None = None

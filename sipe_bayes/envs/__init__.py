@@ -1,0 +1,1 @@
+"""Environments: immutable descriptions of what is simulated and which of its parameters are unknown."""

@@ -1,0 +1,321 @@
+"""What a parameter may change in a MuJoCo model: targets such as ``"body:rod.mass"``, read and written in place.
+
+A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's options). ``bind`` looks it up in a compiled
+model and returns a ``Target`` that knows its unit, its present value and how to write another one into any copy of
+that model. Writing is always relative to the model the target was bound to, so it may be repeated in any order of
+values. Mass scales the inertia with it; an inertia component is set in the body's own frame, about its centre of
+mass, and must stay physical: no principal moment may exceed the sum of the other two.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+Writer = Callable[[Any, float], None]
+
+_PATTERN = re.compile(r"^(?:(body|joint|actuator|geom):(.+)|(option))\.([a-z0-9_]+)$")
+_OBJECTS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "joint": mujoco.mjtObj.mjOBJ_JOINT,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
+}
+_COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nactuator", "geom": "ngeom", "sensor": "nsensor"}
+_AXES = ("x", "y", "z")
+
+
+class TargetError(ValueError):
+    """A target that the model does not have, or that cannot be written."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One number of a compiled model. ``order``: writes with a smaller order come first. ``constants``: MuJoCo's
+    derived constants depend on it, so mj_setConst follows a write. ``minimum``: the smallest physical value."""
+
+    spec: str
+    unit: str
+    value: float
+    write: Writer
+    order: int = 0
+    constants: bool = False
+    minimum: float = -np.inf
+    physical: bool = True
+
+
+def named(model: Any, kind: str, name: str, where: str) -> int:
+    """Id of an object of ``kind``; raises TargetError that lists what there is."""
+    index = mujoco.mj_name2id(model, _OBJECTS[kind], name)
+    if index < 0:
+        names = [mujoco.mj_id2name(model, _OBJECTS[kind], i) for i in range(getattr(model, _COUNTS[kind]))]
+        known = [n for n in names if n]
+        close = difflib.get_close_matches(name, known, 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"the model has {known}"
+        raise TargetError(f"{where}: the model has no {kind} {name!r}; {hint}")
+    return index
+
+
+def split(spec: str) -> tuple[str, str, str]:
+    """(kind, name, attribute) of a target; raises TargetError."""
+    match = _PATTERN.match(spec)
+    if not match:
+        raise TargetError(
+            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {sorted(_OBJECTS)}, or option.ATTRIBUTE"
+        )
+    kind, name, option, attribute = match.groups()
+    return (option or kind, name or "", attribute)
+
+
+def bind(model: Any, spec: str) -> Target:
+    """The target ``spec`` of ``model``; raises TargetError naming what is unknown."""
+    kind, name, attribute = split(spec)
+    legal = _ATTRIBUTES[kind]
+    if attribute not in legal:
+        close = difflib.get_close_matches(attribute, legal, 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(sorted(legal))}"
+        raise TargetError(f"target {spec!r}: a {kind} has no attribute {attribute!r}; {hint}")
+    index = 0 if kind == "option" else named(model, kind, name, f"target {spec!r}")
+    return legal[attribute](model, spec, index, attribute)
+
+
+def _array_target(spec: str, unit: str, field: str, index: Any, model: Any, **kwargs: Any) -> Target:
+    def write(other: Any, value: float) -> None:
+        getattr(other, field)[index] = value
+
+    return Target(spec, unit, float(getattr(model, field)[index]), write, **kwargs)
+
+
+def _hinge(model: Any, joint: int) -> bool:
+    return int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+
+
+def _scalar_joint(model: Any, joint: int, spec: str) -> int:
+    if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        raise TargetError(f"target {spec!r}: only hinge and slide joints have this attribute")
+    return int(model.jnt_dofadr[joint])
+
+
+def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) -> Callable[..., Target]:
+    def make(model: Any, spec: str, joint: int, attribute: str) -> Target:
+        start = int(model.jnt_dofadr[joint])
+        size = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(int(model.jnt_type[joint]), 1)
+        unit = hinge_unit if _hinge(model, joint) else slide_unit
+        value = float(getattr(model, field)[start])
+
+        def write(other: Any, number: float) -> None:
+            getattr(other, field)[start : start + size] = number
+
+        return Target(spec, unit, value, write, constants=constants, minimum=0.0)
+
+    return make
+
+
+def _joint_stiffness(model: Any, spec: str, joint: int, attribute: str) -> Target:
+    unit = "N m/rad" if _hinge(model, joint) else "N/m"
+    return _array_target(spec, unit, "jnt_stiffness", joint, model, minimum=0.0)
+
+
+def _joint_springref(model: Any, spec: str, joint: int, attribute: str) -> Target:
+    _scalar_joint(model, joint, spec)
+    unit = "rad" if _hinge(model, joint) else "m"
+    return _array_target(spec, unit, "qpos_spring", int(model.jnt_qposadr[joint]), model)
+
+
+def _actuator_gear(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    return _array_target(spec, "1", "actuator_gear", (actuator, 0), model, constants=True)
+
+
+def _fixed_gain(model: Any, actuator: int, spec: str) -> None:
+    if int(model.actuator_gaintype[actuator]) != int(mujoco.mjtGain.mjGAIN_FIXED):
+        raise TargetError(f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)")
+
+
+def _affine_bias(model: Any, actuator: int, spec: str) -> None:
+    legal = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+    if int(model.actuator_biastype[actuator]) not in legal:
+        raise TargetError(f"target {spec!r}: needs an actuator whose bias is none or affine")
+
+
+def _actuator_gain(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    _fixed_gain(model, actuator, spec)
+    return _array_target(spec, "force/command", "actuator_gainprm", (actuator, 0), model)
+
+
+def _actuator_bias(slot: int, unit: str) -> Callable[..., Target]:
+    def make(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+        _affine_bias(model, actuator, spec)
+
+        def write(other: Any, value: float) -> None:
+            other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
+            other.actuator_biasprm[actuator, slot] = value
+
+        return Target(spec, unit, float(model.actuator_biasprm[actuator, slot]), write)
+
+    return make
+
+
+def _actuator_kp(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    _fixed_gain(model, actuator, spec)
+    _affine_bias(model, actuator, spec)
+
+    def write(other: Any, value: float) -> None:
+        other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
+        other.actuator_gainprm[actuator, 0] = value
+        other.actuator_biasprm[actuator, 1] = -value
+
+    return Target(spec, "force/position", float(model.actuator_gainprm[actuator, 0]), write, minimum=0.0)
+
+
+def _actuator_kv(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    _affine_bias(model, actuator, spec)
+
+    def write(other: Any, value: float) -> None:
+        other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
+        other.actuator_biasprm[actuator, 2] = -value
+
+    return Target(spec, "force/velocity", -float(model.actuator_biasprm[actuator, 2]), write, minimum=0.0)
+
+
+def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    """A constant added to the command behind its limits and dynamics: gain * offset joins the bias force."""
+    _fixed_gain(model, actuator, spec)
+    _affine_bias(model, actuator, spec)
+    base = float(model.actuator_biasprm[actuator, 0])
+
+    def write(other: Any, value: float) -> None:
+        other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
+        other.actuator_biasprm[actuator, 0] = base + other.actuator_gainprm[actuator, 0] * value
+
+    return Target(spec, "command", 0.0, write, order=2, physical=False)
+
+
+def _actuator_delay(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    def write(other: Any, value: float) -> None:
+        other.actuator_delay[actuator] = value
+
+    return Target(spec, "s", float(model.actuator_delay[actuator]), write, minimum=0.0, physical=False)
+
+
+def _geom_friction(slot: int, unit: str) -> Callable[..., Target]:
+    def make(model: Any, spec: str, geom: int, attribute: str) -> Target:
+        return _array_target(spec, unit, "geom_friction", (geom, slot), model, minimum=0.0)
+
+    return make
+
+
+def _body_mass(model: Any, spec: str, body: int, attribute: str) -> Target:
+    mass, inertia = float(model.body_mass[body]), model.body_inertia[body].copy()
+    if mass <= 0:
+        raise TargetError(f"target {spec!r}: the body has no mass of its own to scale; give it one in the MJCF")
+
+    def write(other: Any, value: float) -> None:
+        other.body_mass[body] = value
+        other.body_inertia[body] = inertia * (value / mass)
+
+    return Target(spec, "kg", mass, write, constants=True, minimum=0.0)
+
+
+def _body_com(axis: int) -> Callable[..., Target]:
+    def make(model: Any, spec: str, body: int, attribute: str) -> Target:
+        return _array_target(spec, "m", "body_ipos", (body, axis), model, order=1, constants=True)
+
+    return make
+
+
+def _rotation(quaternion: Any) -> Any:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
+def body_frame_inertia(model: Any, body: int) -> Any:
+    """Inertia (3, 3) in kg m^2 about the centre of mass, in the axes of the body's frame."""
+    rotation = _rotation(model.body_iquat[body])
+    return rotation @ np.diag(model.body_inertia[body]) @ rotation.T
+
+
+def _body_inertia(row: int, column: int) -> Callable[..., Target]:
+    def make(model: Any, spec: str, body: int, attribute: str) -> Target:
+        def write(other: Any, value: float) -> None:
+            matrix = body_frame_inertia(other, body)
+            matrix[row, column] = matrix[column, row] = value
+            if np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0:
+                moments, axes = np.diag(matrix), np.eye(3)
+            else:
+                moments, axes = np.linalg.eigh(matrix)
+                axes = axes * np.sign(np.linalg.det(axes))
+            quaternion = np.empty(4)
+            mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(axes).ravel())
+            other.body_inertia[body], other.body_iquat[body] = moments, quaternion
+
+        value = float(body_frame_inertia(model, body)[row, column])
+        minimum = 0.0 if row == column else -np.inf
+        return Target(spec, "kg m^2", value, write, order=2, constants=True, minimum=minimum)
+
+    return make
+
+
+def check_inertia(model: Any, bodies: list[int]) -> bool:
+    """Whether the principal moments of the bodies are ones a rigid body can have: positive, A + B >= C."""
+    moments = np.sort(model.body_inertia[bodies], axis=1)
+    return bool((moments[:, 0] >= 0).all() and (moments[:, 2] <= moments[:, :2].sum(1) * (1 + 1e-9)).all())
+
+
+def _option(field: str, slot: int | None, unit: str) -> Callable[..., Target]:
+    def make(model: Any, spec: str, index: int, attribute: str) -> Target:
+        def write(other: Any, value: float) -> None:
+            if slot is None:
+                setattr(other.opt, field, value)
+            else:
+                getattr(other.opt, field)[slot] = value
+
+        value = getattr(model.opt, field)
+        return Target(spec, unit, float(value if slot is None else value[slot]), write)
+
+    return make
+
+
+_ATTRIBUTES: dict[str, dict[str, Callable[..., Target]]] = {
+    "body": {
+        "mass": _body_mass,
+        **{f"com_{a}": _body_com(i) for i, a in enumerate(_AXES)},
+        **{f"inertia_{_AXES[i]}{_AXES[j]}": _body_inertia(i, j) for i in range(3) for j in range(i, 3)},
+    },
+    "joint": {
+        "damping": _dof("dof_damping", "N m s/rad", "N s/m"),
+        "frictionloss": _dof("dof_frictionloss", "N m", "N"),
+        "armature": _dof("dof_armature", "kg m^2", "kg", constants=True),
+        "stiffness": _joint_stiffness,
+        "springref": _joint_springref,
+    },
+    "actuator": {
+        "gear": _actuator_gear,
+        "gain": _actuator_gain,
+        "kp": _actuator_kp,
+        "kv": _actuator_kv,
+        "bias_force": _actuator_bias(0, "force"),
+        "bias_position": _actuator_bias(1, "force/position"),
+        "bias_velocity": _actuator_bias(2, "force/velocity"),
+        "offset": _actuator_offset,
+        "delay": _actuator_delay,
+    },
+    "geom": {
+        "friction": _geom_friction(0, "1"),
+        "friction_torsional": _geom_friction(1, "m"),
+        "friction_rolling": _geom_friction(2, "m"),
+    },
+    "option": {
+        **{f"gravity_{a}": _option("gravity", i, "m/s^2") for i, a in enumerate(_AXES)},
+        **{f"wind_{a}": _option("wind", i, "m/s") for i, a in enumerate(_AXES)},
+        "density": _option("density", None, "kg/m^3"),
+        "viscosity": _option("viscosity", None, "Pa s"),
+    },
+}

@@ -1,0 +1,255 @@
+"""log p(trajectory | theta) by windows of the log (multiple shooting), each window's start estimated with theta.
+
+A log of T samples is cut into windows of ``window`` seconds; each is simulated from its own starting state, which is
+unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by exactly one
+window. Long open loops are chaotic and one model error would dominate them; short windows with measured starts give
+away the noise of the measurement: both cost coverage. The residuals are white or first-order autoregressive and carry
+on across windows (``sipe_bayes.noise``).
+
+A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior whose sd is
+``_START_SD``, far wider than any measurement, so that what is never measured does not make the equations singular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from sipe_bayes.noise import Moments, Noise, Sequence, sequences, whiten
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+
+FloatArray = NDArray[np.float64]
+
+_THETA_STEP = 1e-5  # finite differences, of the unit cube
+_START_STEP = 1e-5  # rad or m, rad/s or m/s
+_START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
+_SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Multiple shooting with white or autoregressive noise.
+
+    window: seconds, or None for each log as one window. noise: "ar1" or "white". fit: names of the channels whose
+    residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated.
+    """
+
+    window: float | None = 0.5
+    noise: str = "ar1"
+    fit: tuple[str, ...] | None = None
+    noise_sd: tuple[float | None, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.noise not in ("ar1", "white"):
+            raise ValueError(f"noise: expected 'ar1' or 'white', got {self.noise!r}")
+        if self.window is not None and not self.window > 0:
+            raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
+
+    def bind(self, simulator: Simulator, trajectories: Trajectories) -> Windows:
+        """Cut the trajectories into windows; raises ValueError for logs that do not fit the simulator."""
+        return Windows(self, simulator, trajectories)
+
+
+def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
+    """A first guess of the states (T+1, S) along a log: recorded ones, else measured ones.
+
+    Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
+    the slopes of the positions; what no channel measures stays at the model's reset state. The search starts here,
+    and so do the windows of held-out logs."""
+    if trajectory.states is not None:
+        return trajectory.states
+    model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
+    columns = simulator.environment.state_columns(model)
+    measured: dict[int, FloatArray] = {}
+    for channel, column in enumerate(columns):
+        series = trajectory.observations[:, channel]
+        there = np.flatnonzero(np.isfinite(series))
+        if column is not None and len(there):
+            measured[column] = np.interp(np.arange(len(series)), there, series[there])
+    for joint in range(model.njnt):
+        if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            position, velocity = 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
+            if position in measured and velocity not in measured:
+                states[:, velocity] = _smooth(measured[position], trajectory.dt, 1)
+    for column, series in measured.items():
+        states[:, column] = _smooth(series, trajectory.dt)
+    return states
+
+
+def _smooth(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
+    """Local quadratics over ``_SMOOTHING`` seconds, at least 5 samples."""
+    span = min(max(5, 2 * round(_SMOOTHING / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
+    if span < 3:
+        return np.gradient(series, dt) if derivative else series
+    return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt)
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """residual (W, L, C) = measured - predicted; jacobian (W, L, C, N + D) of the prediction; valid: all simulated."""
+
+    residual: FloatArray
+    jacobian: FloatArray
+    valid: bool
+
+
+class Windows:
+    """Recorded trajectories cut into W windows of at most L samples and C fitted channels, with D start unknowns."""
+
+    def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
+        self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
+        environment = simulator.environment
+        if trajectories.observations.shape[2] != len(environment.channels):
+            raise ValueError(
+                f"trajectories: expected observations of the {len(environment.channels)} channels "
+                f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
+            )
+        if trajectories.actions.shape[2] != environment.num_actions:
+            raise ValueError(f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}")
+        self.channels = self._fitted(environment.channels)
+        self._cut(trajectories, settings.window)
+        self._read_samples(trajectories)
+
+    def _fitted(self, names: SequenceOf[str]) -> list[int]:
+        fit = self.settings.fit or tuple(names)
+        unknown = [n for n in fit if n not in names]
+        if unknown:
+            raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
+        return [list(names).index(n) for n in fit]
+
+    def _cut(self, trajectories: Trajectories, window: float | None) -> None:
+        pieces = []
+        for k, trajectory in enumerate(trajectories):
+            steps = len(trajectory) if window is None else max(1, round(window / trajectory.dt))
+            if window is not None and steps > len(trajectory):
+                raise ValueError(
+                    f"log {trajectory.name!r}: lasts {len(trajectory) * trajectory.dt:.3g} s, shorter than one window of "
+                    f"{window:g} s; use a shorter window"
+                )
+            for start in range(0, len(trajectory), steps):
+                pieces.append((k, start, min(steps, len(trajectory) - start)))
+        self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
+        self.dt = trajectories.dt[self.log]
+        self.names = [trajectories.names[k] for k in self.log]
+
+    def _read_samples(self, trajectories: Trajectories) -> None:
+        simulator, environment = self.simulator, self.simulator.environment
+        longest = int(self.steps.max())
+        sample = self.start[:, None] + np.arange(longest + 1)
+        last = self.start + self.steps == trajectories.length[self.log]
+        self.owned = np.arange(longest + 1) < (self.steps + last)[:, None]
+        clipped = np.minimum(sample, trajectories.length[self.log][:, None])
+        self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
+        self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
+        if not self.observed.any(axis=(0, 1)).all():
+            raise ValueError("trajectories: a fitted channel has no sample at all; leave it out of `fit`")
+        self.actions = trajectories.actions[self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)][:, :-1]
+        self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
+        guesses = [estimate_states(simulator, t) for t in trajectories]
+        reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
+        reference[:, 0] = 0.0
+        self.reference = environment.history(simulator.model, reference, self._past(trajectories), self._timestep())
+        model = simulator.model
+        self.num_start = 2 * model.nv + model.na
+        sd = np.repeat(_START_SD, [model.nv, model.nv, model.na])
+        self.start_precision = sd**-2.0
+
+    def _timestep(self) -> FloatArray:
+        return np.array([self.simulator.physics_steps(float(d))[1] for d in self.dt])
+
+    def _past(self, trajectories: Trajectories) -> list[FloatArray]:
+        """The commands before each window, one row a physics step; before the log its first command."""
+        past = []
+        for k, start, dt in zip(self.log, self.start, self.dt, strict=True):
+            skip = self.simulator.physics_steps(float(dt))[0]
+            rows = trajectories.actions[k, max(0, start - 2000) : start]
+            past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
+        return past
+
+    @property
+    def num_windows(self) -> int:
+        return len(self.log)
+
+    @property
+    def num_theta(self) -> int:
+        return len(self.simulator.space)
+
+    def no_starts(self) -> FloatArray:
+        """The starts (W, D) at their reference."""
+        return np.zeros((self.num_windows, self.num_start))
+
+    def states(self, starts: FloatArray) -> FloatArray:
+        """Starting states (..., W, S) of starts (..., W, D)."""
+        model = self.simulator.model
+        out = np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
+        nq, nv = model.nq, model.nv
+        if nq == nv:
+            out[..., 1 : 1 + nq] += starts[..., :nv]
+        else:
+            for position, tangent in zip(
+                out[..., 1 : 1 + nq].reshape(-1, nq), starts[..., :nv].reshape(-1, nv), strict=True
+            ):
+                moved = position.copy()
+                mujoco.mj_integratePos(model, moved, np.ascontiguousarray(tangent), 1.0)
+                position[:] = moved
+        out[..., 1 + nq : 1 + nq + nv + model.na] += starts[..., nv:]
+        return out
+
+    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid."""
+        batch = len(theta)
+        lanes = np.repeat(theta, self.num_windows, axis=0)
+        states = self.states(starts).reshape(batch * self.num_windows, -1)
+        actions = np.tile(self.actions, (batch, 1, 1))
+        result = self.simulator.rollout(lanes, actions, states, np.tile(self.dt, batch), self.names * batch)
+        shape = (batch, self.num_windows)
+        reached = result.valid.reshape(*shape, -1) | ~self.owned
+        predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
+        return predicted, reached.all(axis=(1, 2))
+
+    def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Measured minus predicted (B, W, L, C), zero where nothing was measured, and which of the B are valid."""
+        predicted, valid = self.predict(theta, starts)
+        with np.errstate(invalid="ignore"):
+            residual = np.where(self.observed, self.measured - predicted, 0.0)
+        return np.where(valid[:, None, None, None], residual, 0.0), valid
+
+    def linearise(self, theta: FloatArray, starts: FloatArray, with_theta: bool = True) -> Linearisation:
+        """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs."""
+        n, d = (self.num_theta if with_theta else 0), self.num_start
+        sign = np.where(theta + _THETA_STEP <= 1, 1.0, -1.0)
+        thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
+        for j in range(n):
+            thetas[j + 1, j] += sign[j] * _THETA_STEP
+        for j in range(d):
+            all_starts[n + 1 + j, :, j] += _START_STEP
+        predicted, valid = self.predict(thetas, all_starts)
+        wrong = [j for j in range(n) if not valid[j + 1]]
+        if wrong and valid[0]:  # a step across a physical limit: look the other way
+            sign[wrong] = -sign[wrong]
+            again = np.tile(theta, (len(wrong), 1))
+            again[np.arange(len(wrong)), wrong] += sign[wrong] * _THETA_STEP
+            inside = np.clip(again, 0, 1)
+            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
+        scale = np.concatenate([sign[:n] * _THETA_STEP, np.full(d, _START_STEP)])
+        with np.errstate(invalid="ignore"):
+            jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
+        jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
+        residual = np.where(self.observed, self.measured - predicted[0], 0.0)
+        return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
+
+    def moments(self, lin: Linearisation) -> Moments:
+        """Products of the linearised rows, from which every noise model's normal equations follow."""
+        return Moments(lin.residual, lin.jacobian, lin.jacobian.shape[-1] - self.num_start, self.sequences)
+
+    def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
+        """Whitened sum of squares (B,) of residuals (B, W, L, C)."""
+        flat = residual.reshape(len(residual), -1, len(self.channels))
+        parts = [whiten(flat[..., c], s, float(noise.sd[c]), float(noise.tau[c])) for c, s in enumerate(self.sequences)]
+        return sum((p**2).sum(-1) for p in parts)  # type: ignore[return-value]

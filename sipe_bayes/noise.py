@@ -1,0 +1,271 @@
+"""Coloured residuals and the linear algebra of windows: whitening, restricted likelihood, start states marginalised.
+
+Residual model, per channel c and along each log: e_j = a_j e_{j-1} + sqrt(1 - a_j^2) sigma_c z_j, z_j ~ N(0, 1), with
+a_j = exp(-gap_j / tau_c) for the time since the previous sample there is (first-order autoregression, which carries
+on across windows and across missing samples); e_0 ~ N(0, sigma_c^2). White noise is tau = 0.
+
+Linearised at (theta, starts), the residual of window w is r - J_theta dtheta - J_x dx_w. Because sample j is whitened
+with sample j-1, which may lie in the window before, the whitened rows of w have the columns
+[theta (N) | x_w (D) | x_{w-1} (D) | r]. Their products are sums of three moment matrices that do not depend on (sigma,
+tau), so the noise can be re-estimated without touching the samples again. The normal equations are an arrow: dense in
+theta, block-tridiagonal in the starts, which a banded Cholesky factor eliminates in time linear in the log's length.
+
+Restricted likelihood (Patterson & Thompson 1971, "Recovery of inter-block information when block sizes are unequal",
+Biometrika 58): -2 l_R = log|V| + log|A| + r' V^-1 r - b' A^-1 b, A = J' V^-1 J + prior precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
+_SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """The observed samples of one channel in order of time: rows of the flattened (W * L) samples.
+
+    index (n,), previous (n,; -1 begins a sequence), window (n,), gap (n,) an index into ``gaps`` seconds (inf first).
+    """
+
+    index: IntArray
+    previous: IntArray
+    window: IntArray
+    crosses: NDArray[np.bool_]
+    gap: IntArray
+    gaps: FloatArray
+
+
+def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
+    """One Sequence per channel. observed (W, L, C): samples that count; sample (W, L): their number within the log;
+    log (W,): the log of each window; dt (W,): seconds per sample."""
+    windows, length, channels = observed.shape
+    found = []
+    for c in range(channels):
+        index = np.flatnonzero(observed[:, :, c].ravel())
+        window, number = index // length, sample.ravel()[index]
+        steps = np.diff(number, prepend=0)
+        linked = np.zeros(len(index), bool)
+        if len(index) > 1:
+            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
+        previous = np.where(linked, np.concatenate([[-1], index[:-1]])[: len(index)], -1)
+        seconds = np.where(linked, steps * dt[window], np.inf)
+        gaps, gap = np.unique(np.round(seconds, 12), return_inverse=True)
+        crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
+        found.append(Sequence(index, previous, window, crosses, gap, gaps))
+    return found
+
+
+def coefficients(gaps: FloatArray, tau: float) -> FloatArray:
+    """Autoregression coefficient of each gap in seconds; 0 for white noise (tau = 0) and infinite gaps."""
+    return np.exp(-gaps / tau) if tau > 0 else np.zeros_like(gaps)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Stationary sd (C,) in the channels' units and correlation time tau (C,) in seconds, 0 for white."""
+
+    sd: FloatArray
+    tau: FloatArray
+
+
+def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
+    """Whitened residuals (..., n) of one channel's residual (..., W * L)."""
+    a = coefficients(sequence.gaps, tau)[sequence.gap]
+    before = np.where(sequence.previous >= 0, residual[..., sequence.previous], 0.0)
+    return (residual[..., sequence.index] - a * before) / (sd * np.sqrt(1 - a**2))
+
+
+def log_determinant(all_sequences: list[Sequence], noise: Noise) -> float:
+    """log|V| of the residual covariance."""
+    total = 0.0
+    for c, s in enumerate(all_sequences):
+        a = coefficients(s.gaps, float(noise.tau[c]))
+        counts = np.bincount(s.gap, minlength=len(s.gaps))
+        total += float(counts @ np.log(noise.sd[c] ** 2 * (1 - a**2)))
+    return total
+
+
+class Moments:
+    """Noise-free products of the rows of a linearisation, per channel and gap.
+
+    residual (W, L, C); jacobian (W, L, C, N + D): derivatives of the prediction by theta and the window's start.
+    """
+
+    def __init__(
+        self, residual: FloatArray, jacobian: FloatArray, num_theta: int, all_sequences: list[Sequence]
+    ) -> None:
+        windows, length, _channels, columns = jacobian.shape
+        self.num_theta, self.num_start, self.windows = num_theta, columns - num_theta, windows
+        self.sequences = all_sequences
+        width = num_theta + 2 * self.num_start + 1
+        own = slice(num_theta, num_theta + self.num_start)
+        prev = slice(num_theta + self.num_start, width - 1)
+        self.blocks: list[list[tuple[FloatArray, FloatArray, FloatArray]]] = []
+        flat_r = residual.reshape(windows * length, -1)
+        flat_j = jacobian.reshape(windows * length, -1, columns)
+        for c, s in enumerate(all_sequences):
+            rows = np.zeros((len(s.index), width))
+            rows[:, :num_theta], rows[:, own], rows[:, -1] = (
+                flat_j[s.index, c, :num_theta],
+                flat_j[s.index, c, num_theta:],
+                flat_r[s.index, c],
+            )
+            lagged = np.zeros_like(rows)
+            has = s.previous >= 0
+            before = s.previous[has]
+            lagged[has, :num_theta], lagged[has, -1] = flat_j[before, c, :num_theta], flat_r[before, c]
+            same = has & ~s.crosses
+            lagged[same, own] = flat_j[s.previous[same], c, num_theta:]
+            lagged[s.crosses, prev] = flat_j[s.previous[s.crosses], c, num_theta:]
+            self.blocks.append([self._products(rows, lagged, s, g) for g in range(len(s.gaps))])
+
+    def _products(self, rows: FloatArray, lagged: FloatArray, s: Sequence, g: int) -> tuple[FloatArray, ...]:
+        """Sums over the samples with gap g of x x', x y' + y x', y y' per window; x a row, y the row before."""
+        chosen = np.flatnonzero(s.gap == g)
+        bounds = np.searchsorted(s.window[chosen], np.arange(self.windows + 1))
+        width = rows.shape[1]
+        out = np.zeros((3, self.windows, width, width))
+        for w in range(self.windows):
+            part = chosen[bounds[w] : bounds[w + 1]]
+            if len(part):
+                x, y = rows[part], lagged[part]
+                cross = x.T @ y
+                out[0, w], out[1, w], out[2, w] = x.T @ x, cross + cross.T, y.T @ y
+        return out[0], out[1], out[2]
+
+    def normal(self, noise: Noise) -> FloatArray:
+        """Whitened products (W, K, K), K = N + 2 D + 1, summed over channels."""
+        total = 0.0
+        for c, s in enumerate(self.sequences):
+            a = coefficients(s.gaps, float(noise.tau[c]))
+            for g, (xx, xy, yy) in enumerate(self.blocks[c]):
+                total = total + (xx - a[g] * xy + a[g] ** 2 * yy) / (noise.sd[c] ** 2 * (1 - a[g] ** 2))
+        return np.asarray(total)
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """Normal equations with the starts eliminated.
+
+    precision (N, N) and gradient (N,) of theta with the starts marginalised (no prior on theta in them);
+    log_determinant of the starts' block; explained: b_x' A_xx^-1 b_x; square: r' V^-1 r; solve gives the starts' step.
+    """
+
+    precision: FloatArray
+    gradient: FloatArray
+    log_determinant: float
+    explained: float
+    square: float
+    start_offset: FloatArray
+    start_slope: FloatArray
+
+    def starts(self, step: FloatArray) -> FloatArray:
+        """Best change of the starts (W, D) for a change ``step`` (N,) of theta."""
+        return self.start_offset - self.start_slope @ step
+
+
+def eliminate(normal: FloatArray, num_theta: int, start_precision: FloatArray, start_pull: FloatArray, damping: float = 0.0) -> Arrow:
+    """Eliminate the starts from the normal equations.
+
+    normal (W, K, K) as Moments.normal gives; start_precision (D,): weak prior on the starts; start_pull (W, D): its
+    gradient; damping: relative Levenberg-Marquardt damping of the starts' block.
+    """
+    windows, width, _ = normal.shape
+    n, d = num_theta, (width - 1 - num_theta) // 2
+    theta, own, prev, r = slice(0, n), slice(n, n + d), slice(n + d, n + 2 * d), width - 1
+    diagonal = normal[:, own, own].copy()
+    diagonal[:-1] += normal[1:, prev, prev]
+    corner = normal[1:, prev, own]  # couples x_{w-1} (rows) with x_w (columns)
+    right = np.empty((windows, d, n + 1))
+    right[:, :, :n] = normal[:, own, theta]
+    right[:-1, :, :n] += normal[1:, prev, theta]
+    right[:, :, n] = normal[:, own, r] + start_pull
+    right[:-1, :, n] += normal[1:, prev, r]
+    index = np.arange(d)
+    diagonal[:, index, index] = diagonal[:, index, index] * (1 + damping) + start_precision
+    band = np.zeros((2 * d, windows * d))  # lower form: band[i - j, j] = A[i, j]
+    for i in range(d):
+        for j in range(i + 1):
+            band[i - j, j::d] = diagonal[:, i, j]
+        for j in range(d):
+            band[d + i - j, j : (windows - 1) * d : d] = corner[:, j, i]
+    factor = scipy.linalg.cholesky_banded(band, lower=True, check_finite=False)
+    solved = scipy.linalg.cho_solve_banded((factor, True), right.reshape(windows * d, n + 1), check_finite=False)
+    flat = right.reshape(windows * d, n + 1)
+    reduced = flat.T @ solved
+    precision = normal[:, theta, theta].sum(0) - reduced[:n, :n]
+    gradient = normal[:, theta, r].sum(0) - reduced[:n, n]
+    return Arrow(
+        0.5 * (precision + precision.T),
+        gradient,
+        2 * float(np.log(factor[0]).sum()),
+        float(reduced[n, n]),
+        float(normal[:, r, r].sum()),
+        solved[:, n].reshape(windows, d),
+        solved[:, :n].reshape(windows, d, n),
+    )
+
+
+def restricted(moments: Moments, noise: Noise, prior: FloatArray, pull: FloatArray, start_precision: FloatArray, start_pull: FloatArray) -> float:
+    """Restricted log-likelihood of the noise, up to a constant; prior (N, N), pull (N,): prior precision of theta and
+    its gradient."""
+    arrow = eliminate(moments.normal(noise), moments.num_theta, start_precision, start_pull)
+    value = log_determinant(moments.sequences, noise) + arrow.log_determinant + arrow.square - arrow.explained
+    if moments.num_theta:
+        factor = np.linalg.cholesky(arrow.precision + prior)
+        half = scipy.linalg.solve_triangular(factor, arrow.gradient + pull, lower=True)
+        value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)
+    return -0.5 * value
+
+
+def estimate_noise(
+    moments: Moments,
+    noise: Noise,
+    fixed_sd: FloatArray,
+    coloured: bool,
+    shortest: float,
+    longest: float,
+    prior: FloatArray,
+    pull: FloatArray,
+    start_precision: FloatArray,
+    start_pull: FloatArray,
+) -> Noise:
+    """Noise that maximises the restricted likelihood, started from ``noise``.
+
+    fixed_sd (C,): given sds, NaN where to be estimated. coloured: whether tau is estimated, within [shortest, longest]
+    seconds. Each channel's (log innovation sd, log tau) is searched by L-BFGS with numerical gradients.
+    """
+    channels = len(noise.sd)
+    free_sd = np.isnan(fixed_sd)
+
+    def unpack(x: FloatArray) -> Noise:
+        tau = np.exp(x[channels:]) if coloured else np.zeros(channels)
+        step = 1 - np.exp(-2 * shortest / np.maximum(tau, 1e-300)) if coloured else np.ones(channels)
+        return Noise(np.where(free_sd, np.exp(x[:channels]) / np.sqrt(step), fixed_sd), tau)
+
+    def loss(x: FloatArray) -> float:
+        try:
+            value = -restricted(moments, unpack(x), prior, pull, start_precision, start_pull)
+        except np.linalg.LinAlgError:
+            return 1e12
+        return value if np.isfinite(value) else 1e12
+
+    low, high = np.log(_SHORTEST_TAU * shortest), np.log(longest)
+    tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
+    if coloured and (noise.tau <= 0).all():
+        tau = np.full(channels, np.log(10 * shortest))
+    step = 1 - np.exp(-2 * shortest / np.exp(tau)) if coloured else np.ones(channels)
+    x0 = np.concatenate([np.log(noise.sd * np.sqrt(step)), tau if coloured else []])
+    bounds = [(x0[i] - 12, x0[i] + 12) for i in range(channels)] + [(low, high)] * (channels if coloured else 0)
+    result = scipy.optimize.minimize(loss, x0, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4, "ftol": 1e-9})
+    return unpack(result.x)

@@ -1,0 +1,21 @@
+"""Posteriors: probability distributions over a simulator's normalised parameters theta in [0, 1]^N."""
+
+from sipe_bayes.posterior.base import NoDensityError, Posterior
+from sipe_bayes.posterior.dirac import Dirac
+from sipe_bayes.posterior.independent import IndependentPrior, prior, uniform
+from sipe_bayes.posterior.mixture import GaussianMixture
+from sipe_bayes.posterior.particles import Particles
+from sipe_bayes.posterior.registry import FAMILIES, load_posterior
+
+__all__ = [
+    "FAMILIES",
+    "Dirac",
+    "GaussianMixture",
+    "IndependentPrior",
+    "NoDensityError",
+    "Particles",
+    "Posterior",
+    "load_posterior",
+    "prior",
+    "uniform",
+]

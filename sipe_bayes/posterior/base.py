@@ -1,0 +1,274 @@
+"""The base class of every posterior: a Pyro distribution over theta in [0, 1]^N that knows its parameters."""
+
+from __future__ import annotations
+
+import copy
+import os
+import warnings
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import torch
+from numpy.typing import NDArray
+from pyro.distributions import TorchDistribution
+from torch import Generator, Tensor
+from torch.distributions import constraints
+
+from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.posterior.storage import write_pair
+
+REFERENCE_DRAWS = 20_000
+MARGINAL_DRAWS = 8_000
+_ROUNDING = 1e-6
+
+
+class NoDensityError(RuntimeError):
+    """Raised by ``log_prob`` of a posterior that is a set of points and has no density."""
+
+
+def as_float64(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
+    """``value`` as a finite float64 tensor of ``shape`` (None: any length); ValueError names ``name``."""
+    try:
+        tensor = torch.as_tensor(value, dtype=torch.float64).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"{name}: expected an array of numbers, got {type(value).__name__} ({error})"
+        ) from error
+    if tensor.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, tensor.shape)):  # noqa: B905
+        wanted = ", ".join("any" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name}: expected shape ({wanted}), got {tuple(tensor.shape)}; reshape it")
+    if not torch.isfinite(tensor).all():
+        raise ValueError(f"{name}: expected finite numbers, got NaN or infinity; drop those rows")
+    return tensor
+
+
+def as_theta(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
+    """``as_float64`` within the unit cube; what rounding (1e-6) put outside is clipped, the rest refused."""
+    theta = as_float64(name, value, shape)
+    if theta.numel() and (theta.min() < -_ROUNDING or theta.max() > 1 + _ROUNDING):
+        raise ValueError(
+            f"{name}: expected theta in [0, 1], got [{theta.min():.4g}, {theta.max():.4g}]; "
+            "normalise values with space.normalise and clip to the cube"
+        )
+    return theta.clamp(0.0, 1.0)
+
+
+def check_bandwidth(bandwidth: Any) -> float:
+    """``bandwidth`` as a positive float."""
+    if isinstance(bandwidth, (int, float)) and 0 < bandwidth < float("inf"):
+        return float(bandwidth)
+    raise ValueError(f"bandwidth: expected a positive number in theta units, got {bandwidth!r}; try 0.02")
+
+
+class Posterior(TorchDistribution):
+    """A distribution over theta (N,) in the unit cube, with the ``space`` of its N parameters.
+
+    Everything is float64. ``mean``, ``stddev``, ``variance`` (N,), ``covariance`` (N, N) and ``mode`` (N,) are
+    properties; ``sample``, ``log_prob``, ``quantile``, ``values``, ``marginal``, ``save`` are methods. Families
+    with ``has_density`` work inside ``pyro.sample``: GaussianMixture, IndependentPrior, and those of other
+    files that do not say otherwise. Dirac and Particles draw, but their ``log_prob`` raises NoDensityError.
+
+    **Adding a family** takes one file and one line in ``registry.FAMILIES``. The base class owns batches, dtypes,
+    seeds, shape checks and files; a subclass writes its own mathematics on plain (n, N) tensors:
+
+    - ``_sample(n, generator) -> (n, N)``: exact draws, random numbers from ``generator`` alone.
+    - ``_log_prob(theta (n, N)) -> (n,)``: normalised log density of points inside the cube.
+    - ``_state() -> (tensors, settings)`` and ``_restore(space, tensors, settings)``: what goes to disk and back;
+      settings are plain JSON numbers and strings.
+
+    and, where it knows better than 20,000 fixed-seed draws, ``_moments() -> (mean, covariance)``,
+    ``_quantile(q (Q,)) -> (Q, N)``, ``_mode() -> (N,)``, ``marginal(names)``. The simplest one::
+
+        class Uniform(Posterior):
+            def _sample(self, n, generator):
+                return torch.rand(n, len(self.space), dtype=torch.float64, generator=generator)
+
+            def _log_prob(self, theta):
+                return theta.new_zeros(len(theta))
+
+            def _state(self):
+                return {}, {}
+
+            @classmethod
+            def _restore(cls, space, tensors, settings):
+                return cls(space)
+    """
+
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+    support = constraints.independent(constraints.unit_interval, 1)
+    has_rsample = False
+    has_density: ClassVar[bool] = True
+
+    def __init__(self, space: ParameterSpace) -> None:
+        if not isinstance(space, ParameterSpace):
+            raise TypeError(f"space: expected a ParameterSpace, got {type(space).__name__}")
+        self.space = space
+        super().__init__(torch.Size(), torch.Size([len(space)]), validate_args=False)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self.space.names)})"
+
+    # What a family writes.
+
+    def _sample(self, n: int, generator: Generator | None) -> Tensor:
+        raise NotImplementedError(f"{type(self).__name__} must define _sample(n, generator) -> (n, N)")
+
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        raise NotImplementedError(f"{type(self).__name__} must define _log_prob(theta (n, N)) -> (n,)")
+
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        raise NotImplementedError(f"{type(self).__name__} must define _state() -> (tensors, settings)")
+
+    @classmethod
+    def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
+        raise NotImplementedError(f"{cls.__name__} must define _restore(space, tensors, settings)")
+
+    def _moments(self) -> tuple[Tensor, Tensor]:
+        return self._reference.mean(0), torch.atleast_2d(torch.cov(self._reference.T))
+
+    def _quantile(self, q: Tensor) -> Tensor:
+        return torch.quantile(self._reference, q, dim=0)
+
+    def _mode(self) -> Tensor:
+        return self._reference[self._log_prob(self._reference).argmax()]
+
+    def _chains(self, num_draws: int, generator: Generator | None) -> Tensor:
+        return self._sample(num_draws, generator)[None]
+
+    # What the base class owns.
+
+    @cached_property
+    def _reference(self) -> Tensor:
+        with torch.no_grad():
+            return self._sample(REFERENCE_DRAWS, Generator().manual_seed(0))
+
+    @cached_property
+    def _cached_moments(self) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            return self._moments()
+
+    @cached_property
+    def _cached_mode(self) -> Tensor:
+        with torch.no_grad():
+            return self._mode()
+
+    def _expanded(self, value: Tensor) -> Tensor:
+        return value.expand(*self.batch_shape, *value.shape)
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> Self:
+        """Independent copies in ``batch_shape``, as Pyro's plates ask for."""
+        new = copy.copy(self)
+        new._batch_shape = torch.broadcast_shapes(self.batch_shape, torch.Size(batch_shape))
+        return new
+
+    def sample(self, sample_shape: Any = (), generator: Generator | None = None) -> Tensor:
+        """Exact draws (*sample_shape, *batch_shape, N); without a generator, from torch's global one."""
+        shape = torch.Size(sample_shape) + self.batch_shape
+        with torch.no_grad():
+            return self._sample(shape.numel(), generator).reshape(*shape, len(self.space))
+
+    def log_prob(self, theta: Any) -> Tensor:
+        """Log density (...) of theta (..., N), -inf outside the cube; NoDensityError where there is none."""
+        if not self.has_density:
+            raise NoDensityError(
+                f"{type(self).__name__} has no density; use .smoothed(bandwidth), which returns a GaussianMixture"
+            )
+        theta = torch.as_tensor(theta, dtype=torch.float64)
+        if theta.ndim == 0 or theta.shape[-1] != len(self.space):
+            raise ValueError(
+                f"theta: expected shape (..., {len(self.space)}), got {tuple(theta.shape)}; reshape it"
+            )
+        flat = theta.reshape(-1, len(self.space))
+        inside = ((flat >= 0) & (flat <= 1)).all(-1)
+        result = torch.full((len(flat),), -torch.inf, dtype=torch.float64)
+        if inside.any():
+            result = result.masked_scatter(inside, self._log_prob(flat[inside]))
+        result = result.reshape(theta.shape[:-1])
+        return result.expand(torch.broadcast_shapes(result.shape, self.batch_shape))
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean of theta (N,)."""
+        return self._expanded(self._cached_moments[0])
+
+    @property
+    def covariance(self) -> Tensor:
+        """Covariance of theta (N, N)."""
+        return self._expanded(self._cached_moments[1])
+
+    @property
+    def variance(self) -> Tensor:
+        """Variance of each theta (N,)."""
+        return self._expanded(self._cached_moments[1].diagonal().clamp_min(0.0))
+
+    @property
+    def stddev(self) -> Tensor:
+        """Standard deviation of each theta (N,)."""
+        return self.variance.sqrt()
+
+    @property
+    def mode(self) -> Tensor:
+        """The most probable theta (N,)."""
+        return self._expanded(self._cached_mode)
+
+    def gaussian_moments(self) -> tuple[Tensor, Tensor]:
+        """Mean (N,) and covariance (N, N) of the Gaussian which, restricted to the cube, stands for this posterior.
+
+        For an earlier posterior that becomes a prior. Moment-matched unless the family says it is exact.
+        """
+        return self._cached_moments
+
+    def quantile(self, q: Any) -> Tensor:
+        """Quantiles of each parameter's marginal: (N,) for a number q, (Q, N) for a vector (Q,)."""
+        levels = torch.as_tensor(q, dtype=torch.float64)
+        if levels.ndim > 1 or not ((levels >= 0) & (levels <= 1)).all():
+            raise ValueError(f"q: expected a number or a vector of numbers in [0, 1], got {q!r}")
+        with torch.no_grad():
+            result = self._quantile(levels.reshape(-1))
+        return result[0] if levels.ndim == 0 else result
+
+    def _columns(self, names: Iterable[str]) -> tuple[list[int], ParameterSpace]:
+        if isinstance(names, str):
+            raise TypeError(
+                f"names: expected a list of parameter names, got the string {names!r}; write [{names!r}]"
+            )
+        names = list(names)
+        return [self.space.index(n) for n in names], self.space.subset(names)
+
+    def marginal(self, names: Iterable[str]) -> Posterior:
+        """The posterior of some parameters, in the order given: here Particles of 8,000 fixed-seed draws."""
+        from sipe_bayes.posterior.particles import Particles
+
+        columns, space = self._columns(names)
+        with torch.no_grad():
+            draws = self._sample(MARGINAL_DRAWS, Generator().manual_seed(0))
+        return Particles(draws[:, columns], space)
+
+    def values(self, n: int, generator: Generator | None = None) -> NDArray[Any]:
+        """Draws (n, N) in physical units."""
+        with torch.no_grad():
+            return self.space.values(self._sample(n, generator).numpy())
+
+    def to_inference_data(self, num_draws: int = 2000, generator: Generator | None = None) -> Any:
+        """ArviZ InferenceData: one (chain, draw) variable per parameter, in physical units, attribute ``units``.
+
+        Posteriors that came as chains keep all of their draws; the others draw ``num_draws`` in one chain.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # arviz < 1 announces its successor on import
+            import arviz
+        with torch.no_grad():
+            values = self.space.values(self._chains(num_draws, generator).numpy())
+        data = arviz.from_dict(posterior={name: values[..., j] for j, name in enumerate(self.space.names)})
+        for parameter in self.space:
+            data.posterior[parameter.name].attrs.update(
+                units=parameter.unit, description=parameter.description
+            )
+        return data
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``<path>.safetensors`` and ``<path>.json``; ``load_posterior(path)`` reads them back."""
+        tensors, settings = self._state()
+        header = {"family": type(self).__name__, "space": self.space.to_dict(), "settings": settings}
+        write_pair(path, header, tensors)

@@ -1,0 +1,148 @@
+"""A weighted set of points: what particle methods and Markov chains return.
+
+With weights w_m that sum to one, the mean is sum_m w_m theta_m and the covariance sum_m w_m (theta_m - mean)
+(theta_m - mean)^T, the moments of the discrete distribution itself. Its quantiles interpolate linearly between
+the sorted points at the midpoints of their steps in the cumulative weight. ``smoothed`` puts one Gaussian on each
+point; "scott" is D. W. Scott's rule for a product kernel ("Multivariate Density Estimation", 1992, section 6.3),
+h_j = sd_j M_eff^(-1 / (N + 4)) with the effective number of points M_eff = 1 / sum_m w_m^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.posterior.base import Posterior, as_float64, as_theta, check_bandwidth
+from sipe_bayes.posterior.mixture import GaussianMixture
+
+MAX_KERNELS = 500
+
+
+class Particles(Posterior):
+    """Points ``theta`` (M, N) with ``weights`` (M,), equal if not given. No density: ``log_prob`` raises.
+
+    chains: the rows are this many equal consecutive Markov chains (their weights must be equal).
+    log_density: (M,) values up to a constant; ``mode`` is the best row. Without it, ``mode`` is the row closest
+    to the weighted mean in the metric of the covariance.
+    """
+
+    has_density: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        theta: Any,
+        space: ParameterSpace,
+        weights: Any = None,
+        chains: int | None = None,
+        log_density: Any = None,
+    ) -> None:
+        super().__init__(space)
+        self.theta = as_theta("theta", theta, (None, len(space)))
+        rows = len(self.theta)
+        if rows == 0:
+            raise ValueError(f"theta: expected at least one row, got shape {tuple(self.theta.shape)}")
+        self.weights = _normalised(weights, rows)
+        self.log_density = None if log_density is None else as_float64("log_density", log_density, (rows,))
+        self.chains = chains
+        if chains is not None and (chains < 1 or rows % chains):
+            raise ValueError(
+                f"chains: expected a divisor of the {rows} rows, got {chains}; cut the chains to one length"
+            )
+        if chains is not None and self.weights.max() - self.weights.min() > 1e-12:
+            raise ValueError("chains: expected equal weights, got unequal ones; leave chains or weights out")
+
+    @property
+    def effective_size(self) -> float:
+        """The number of equally weighted points with the same sum of squared weights."""
+        return float(1 / (self.weights**2).sum())
+
+    def smoothed(self, bandwidth: float | str = "scott") -> GaussianMixture:
+        """A Gaussian mixture on the points; of more than 500, on 500 picked evenly along the cumulative weight.
+
+        bandwidth: kernel sd in theta units, or "scott". Raises ValueError when "scott" meets a constant column.
+        """
+        if bandwidth == "scott":
+            sd = self.stddev * self.effective_size ** (-1 / (len(self.space) + 4))
+            if (sd <= 0).any():
+                raise ValueError(
+                    'bandwidth: "scott" needs spread in every parameter, got none; give a number'
+                )
+        else:
+            sd = torch.full((len(self.space),), check_bandwidth(bandwidth), dtype=torch.float64)
+        centres, weights = self._kernels()
+        covariances = torch.diag(sd**2).expand(len(centres), -1, -1)
+        return GaussianMixture(weights.log(), centres, covariances, self.space)
+
+    def _kernels(self) -> tuple[Tensor, Tensor]:
+        used = self.weights > 0
+        if used.sum() <= MAX_KERNELS:
+            return self.theta[used], self.weights[used]
+        levels = (torch.arange(MAX_KERNELS, dtype=torch.float64) + 0.5) / MAX_KERNELS
+        rows = torch.searchsorted(self.weights.cumsum(0), levels).clamp_max(len(self.theta) - 1)
+        return self.theta[rows], torch.full((MAX_KERNELS,), 1 / MAX_KERNELS, dtype=torch.float64)
+
+    def marginal(self, names: Iterable[str]) -> Particles:
+        """The same points in fewer parameters; weights and chains stay, joint log densities do not."""
+        columns, space = self._columns(names)
+        return Particles(self.theta[:, columns], space, self.weights, self.chains)
+
+    def _sample(self, n: int, generator: Generator | None) -> Tensor:
+        if n == 0:
+            return self.theta[:0]
+        return self.theta[torch.multinomial(self.weights, n, replacement=True, generator=generator)]
+
+    def _moments(self) -> tuple[Tensor, Tensor]:
+        mean = self.weights @ self.theta
+        deviation = self.theta - mean
+        return mean, deviation.T @ (self.weights[:, None] * deviation)
+
+    def _quantile(self, q: Tensor) -> Tensor:
+        used = self.weights > 0
+        theta, order = self.theta[used].sort(0)
+        weights = self.weights[used][order]
+        middle = weights.cumsum(0) - weights / 2
+        columns = [np.interp(q, middle[:, j], theta[:, j]) for j in range(len(self.space))]
+        return torch.from_numpy(np.stack(columns, -1))
+
+    def _mode(self) -> Tensor:
+        if self.log_density is not None:
+            return self.theta[self.log_density.argmax()]
+        mean, covariance = self._cached_moments
+        deviation = self.theta - mean
+        distance = ((deviation @ torch.linalg.pinv(covariance, hermitian=True)) * deviation).sum(-1)
+        return self.theta[torch.where(self.weights > 0, distance, torch.inf).argmin()]
+
+    def _chains(self, num_draws: int, generator: Generator | None) -> Tensor:
+        if self.chains is None:
+            return super()._chains(num_draws, generator)
+        return self.theta.reshape(self.chains, -1, len(self.space))
+
+    def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        tensors = {"theta": self.theta, "weights": self.weights}
+        if self.log_density is not None:
+            tensors["log_density"] = self.log_density
+        return tensors, {"chains": self.chains}
+
+    @classmethod
+    def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
+        return cls(
+            tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("log_density")
+        )
+
+
+def _normalised(weights: Any, rows: int) -> Tensor:
+    if weights is None:
+        return torch.full((rows,), 1 / rows, dtype=torch.float64)
+    weights = as_float64("weights", weights, (rows,))
+    total = weights.sum()
+    if (weights < 0).any() or not total > 0:
+        raise ValueError(
+            "weights: expected non-negative numbers with a positive sum; exponentiate log weights first"
+        )
+    # weights read back from disk sum to one already and must stay the same to the last bit
+    return weights if (total - 1).abs() < 1e-12 else weights / total

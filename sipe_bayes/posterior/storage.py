@@ -1,0 +1,71 @@
+"""A posterior on disk: ``<path>.safetensors`` (tensors) and ``<path>.json`` (everything else). Never pickle.
+
+Each file is written to a temporary name in the same directory and renamed. The JSON holds the checksum of the
+tensors, so that a pair torn by a crash between the two renames is refused and not silently mixed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+FORMAT = "sipe_bayes.posterior/1"
+_SAVE_AGAIN = "save it again with posterior.save(path)"
+
+
+def pair_paths(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """The two files of ``path``: (tensors, header). A suffix of either is dropped first."""
+    stem = Path(path)
+    if stem.suffix in (".safetensors", ".json"):
+        stem = stem.with_suffix("")
+    return stem.with_name(stem.name + ".safetensors"), stem.with_name(stem.name + ".json")
+
+
+def _write(path: Path, content: bytes) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_pair(path: str | os.PathLike[str], header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Write header and tensors; missing parent directories are made."""
+    tensor_path, header_path = pair_paths(path)
+    content = safetensors.torch.save({k: v.detach().clone().contiguous() for k, v in tensors.items()})
+    header = {"format": FORMAT, **header, "sha256": hashlib.sha256(content).hexdigest()}
+    text = json.dumps(header, indent=1, default=float)
+    tensor_path.parent.mkdir(parents=True, exist_ok=True)
+    _write(tensor_path, content)
+    _write(header_path, text.encode())
+
+
+def read_pair(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Header and tensors; raises FileNotFoundError or ValueError, each naming the file and what to do."""
+    tensor_path, header_path = pair_paths(path)
+    for file in (header_path, tensor_path):
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file}: no such file; a saved posterior is {tensor_path.name} beside {header_path.name}"
+            )
+    content = tensor_path.read_bytes()
+    try:
+        header = json.loads(header_path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{header_path}: not JSON ({error}); {_SAVE_AGAIN}") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError(f"{header_path}: expected a posterior header of format {FORMAT!r}; {_SAVE_AGAIN}")
+    if header.get("sha256") != hashlib.sha256(content).hexdigest():
+        raise ValueError(f"{tensor_path}: does not match the checksum in {header_path.name}; {_SAVE_AGAIN}")
+    try:
+        return header, safetensors.torch.load(content)
+    except SafetensorError as error:
+        raise ValueError(f"{tensor_path}: not a safetensors file ({error}); {_SAVE_AGAIN}") from error
