@@ -12,6 +12,7 @@ A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 
@@ -30,6 +31,10 @@ _THETA_STEP = 1e-5  # finite differences, of the unit cube
 _START_STEP = 1e-5  # rad or m, rad/s or m/s
 _START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
 _SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
+
+
+class BudgetExhausted(RuntimeError):
+    """Raised instead of simulating beyond the budget."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,7 @@ class Windows:
 
     def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
+        self.rollouts, self.budget = 0, math.inf
         environment = simulator.environment
         if trajectories.observations.shape[2] != len(environment.channels):
             raise ValueError(
@@ -204,6 +210,10 @@ class Windows:
     def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid."""
         batch = len(theta)
+        cost = batch * len(self.trajectories)
+        if self.rollouts + cost > self.budget:
+            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost}")
+        self.rollouts += cost
         lanes = np.repeat(theta, self.num_windows, axis=0)
         states = self.states(starts).reshape(batch * self.num_windows, -1)
         actions = np.tile(self.actions, (batch, 1, 1))

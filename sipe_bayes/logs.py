@@ -42,7 +42,7 @@ GAP_PERIODS = 5.0
 CLIPPED_RUN = 5
 """Samples in a row at the extreme value that count as saturation."""
 CLIPPED_SHARE = 0.01
-"""Share of the samples from which saturation is worth a note: dry friction holds a turning joint for a few."""
+"""Share of the samples above which that is worth a note: dry friction holds a turning joint for a few."""
 
 
 class LogError(ValueError):
@@ -128,11 +128,17 @@ def _read_csv(path: Path) -> Columns:
         skiprows=1,
         index_col=False,
         decimal="," if separator == ";" and "," in first and "." not in first else ".",
-        float_precision=None if separator == r"\s+" else "round_trip",
         skipinitialspace=True,
         encoding="utf-8-sig",
+        **_exact_floats(pd.__version__),
     )
     return _frame_columns(frame)
+
+
+def _exact_floats(version: str) -> dict[str, Any]:
+    """What makes this pandas read every float exactly; from 3.1 it always does."""
+    major, minor = (int(part) for part in version.split(".")[:2])
+    return {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
 
 
 def _separator(header: str) -> str:
@@ -143,7 +149,11 @@ def _separator(header: str) -> str:
 
 
 def _split(header: str, separator: str) -> list[str]:
-    return header.split() if separator == r"\s+" else next(csv.reader([header], delimiter=separator))
+    return (
+        header.split()
+        if separator == r"\s+"
+        else next(csv.reader([header], delimiter=separator, skipinitialspace=True))
+    )
 
 
 def _is_number(text: str) -> bool:

@@ -157,7 +157,7 @@ WRONG: list[tuple[str, str, str]] = [
     ),
     ("sd = 0.1", "sd = -1", r"`parameters\[0\].prior.sd`: .*got -1"),
     ('target = "body:rod.mass"', "", r"`parameters\[0\].target`: .*got neither"),
-    ('target = "body:rod.mass"', "target = 1", r"`parameters\[0\].target`: expected a string, got 1"),
+    ('target = "body:rod.mass"', "target = 1", r"`parameters\[0\].target`: expected one string, got 1"),
     (
         '"body:rod.mass"',
         '"joint:hinge.damping"',
@@ -253,7 +253,7 @@ def test_units() -> None:
 
 UNIT_ERRORS: list[tuple[Any, str]] = [
     (lambda: to_si("Rad"), "'Rad'; did you mean 'rad'"),
-    (lambda: convert([1.0], "m", "angle"), r"expected a unit of angle, got 'm' \(length\); use 'rad'"),
+    (lambda: convert([1.0], "m", "angle"), r"expected a unit of angle, got 'm' \(length\); use one of 'rad'"),
     (lambda: convert([1.0], "m", "angel"), "unknown dimension 'angel'"),
     (lambda: to_si(""), "got ''; use one of"),
 ]

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.likelihood import Linearisation, Windows
+from sipe_bayes.likelihood import Windows
 from sipe_bayes.noise import Moments, Noise, eliminate
 
 FloatArray = NDArray[np.float64]
@@ -30,6 +30,7 @@ class QuadraticPrior:
     precision: FloatArray
 
     def energy(self, theta: FloatArray) -> float:
+        """-log density at theta, up to a constant."""
         return 0.5 * float((theta - self.mean) @ self.precision @ (theta - self.mean))
 
     def pull(self, theta: FloatArray) -> FloatArray:
@@ -48,30 +49,25 @@ class Fit:
     converged: bool = False
 
 
-def energy(windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray) -> float:
-    """Half the whitened sum of squares plus the priors; infinite where the simulation is not valid."""
-    residual, valid = windows.residuals(theta[None], starts[None])
-    if not valid[0]:
-        return np.inf
-    fit = 0.5 * float(windows.chi_square(residual, noise)[0])
+def energy_of(
+    windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, residual: FloatArray
+) -> float:
+    """Half the whitened sum of squares of a residual (W, L, C), plus the priors."""
+    fit = 0.5 * float(windows.chi_square(residual[None], noise)[0])
     return fit + prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
 
 
-def iterate(
-    windows: Windows, noise: Noise, prior: QuadraticPrior, fit: Fit, tolerance: float = 1e-3
-) -> tuple[Fit, Linearisation, Moments]:
-    """One accepted step (or convergence) from ``fit``; also the linearisation at the point it started from.
-
-    Converged when a full step would lower the energy by less than ``tolerance`` nats."""
-    linearisation = windows.linearise(fit.theta, fit.starts)
-    moments = windows.moments(linearisation)
-    return step(windows, noise, prior, fit, moments, tolerance), linearisation, moments
+def energy(windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray) -> float:
+    """``energy_of`` a simulation at (theta, starts); infinite where that is not valid."""
+    residual, valid = windows.residuals(theta[None], starts[None])
+    return energy_of(windows, noise, prior, theta, starts, residual[0]) if valid[0] else np.inf
 
 
 def step(
     windows: Windows, noise: Noise, prior: QuadraticPrior, fit: Fit, moments: Moments, tolerance: float
 ) -> Fit:
-    """The best of ever shorter damped steps from ``fit``, for the linearisation behind ``moments``."""
+    """The first of ever shorter damped steps from ``fit`` that lowers the energy, for the linearisation behind
+    ``moments``; converged where it would lower it by less than ``tolerance`` nats."""
     normal = moments.normal(noise)
     pull = -windows.start_precision * fit.starts
     damping = fit.damping
@@ -80,24 +76,22 @@ def step(
         hessian = arrow.precision + prior.precision
         gradient = arrow.gradient + prior.pull(fit.theta)
         move = box_step(hessian, gradient, fit.theta, damping)
-        starts = fit.starts + arrow.starts(move)
         expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * arrow.explained
         if expected < tolerance:
             return replace(fit, converged=True)
-        theta = np.clip(fit.theta + move, 0.0, 1.0)
+        theta, starts = np.clip(fit.theta + move, 0.0, 1.0), fit.starts + arrow.starts(move)
         value = energy(windows, noise, prior, theta, starts)
         if value < fit.energy:
             damping = max(_DAMPING_MIN, damping * _DAMPING_DOWN)
             return Fit(theta, starts, value, damping, fit.energy - value < tolerance)
         damping *= _DAMPING_UP
-    return replace(fit, converged=True)
+    return replace(fit, damping=fit.damping, converged=True)
 
 
 def box_step(hessian: FloatArray, gradient: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
     """Minimiser of the damped quadratic model within the unit cube."""
     n = len(theta)
-    damped = hessian + damping * (np.diag(np.diag(hessian)) + 1e-12 * np.trace(hessian) / n * np.eye(n))
-    result, factor = np.zeros(n), np.zeros((n, n + 7))
-    index = np.zeros(n, np.int32)
-    ok = mujoco.mju_boxQP(result, factor, index, damped, -gradient, -theta, 1 - theta)
-    return result if ok >= 0 else np.zeros(n)
+    damped = hessian + damping * np.diag(np.diag(hessian)) + 1e-12 * np.trace(hessian) / n * np.eye(n)
+    result, factor, index = np.zeros(n), np.zeros((n, n + 7)), np.zeros(n, np.int32)
+    rank = mujoco.mju_boxQP(result, factor, index, damped, -gradient, -theta, 1 - theta)
+    return result if rank >= 0 else np.zeros(n)

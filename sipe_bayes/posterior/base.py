@@ -64,18 +64,19 @@ def check_bandwidth(bandwidth: Any) -> float:
 class Posterior(TorchDistribution):
     """A distribution over theta (N,) in the unit cube, with the ``space`` of its N parameters.
 
-    Everything is float64. ``mean``, ``stddev``, ``variance`` (N,), ``covariance`` (N, N) and ``mode`` (N,) are
-    properties; ``sample``, ``log_prob``, ``quantile``, ``values``, ``marginal``, ``save`` are methods. Families
-    with ``has_density`` work inside ``pyro.sample``: GaussianMixture, IndependentPrior, and those of other
-    files that do not say otherwise. Dirac and Particles draw, but their ``log_prob`` raises NoDensityError.
+    Everything is float64. ``mean``, ``stddev``, ``variance`` (N,), ``covariance`` (N, N) and ``mode`` (N,)
+    are properties; ``sample``, ``log_prob``, ``quantile``, ``values``, ``marginal``, ``save`` are methods.
+    Families with ``has_density`` work inside ``pyro.sample``: GaussianMixture, IndependentPrior, and those of
+    other files that do not say otherwise. Dirac and Particles draw, but their ``log_prob`` raises
+    NoDensityError.
 
-    **Adding a family** takes one file and one line in ``registry.FAMILIES``. The base class owns batches, dtypes,
-    seeds, shape checks and files; a subclass writes its own mathematics on plain (n, N) tensors:
+    **Adding a family** takes one file and one line in ``registry.FAMILIES``. The base class owns batches,
+    dtypes, seeds, shape checks and files; a subclass writes its own mathematics on plain (n, N) tensors:
 
     - ``_sample(n, generator) -> (n, N)``: exact draws, random numbers from ``generator`` alone.
     - ``_log_prob(theta (n, N)) -> (n,)``: normalised log density of points inside the cube.
-    - ``_state() -> (tensors, settings)`` and ``_restore(space, tensors, settings)``: what goes to disk and back;
-      settings are plain JSON numbers and strings.
+    - ``_state() -> (tensors, settings)`` and ``_restore(space, tensors, settings)``: what goes to disk and
+      back; settings are plain JSON numbers and strings.
 
     and, where it knows better than 20,000 fixed-seed draws, ``_moments() -> (mean, covariance)``,
     ``_quantile(q (Q,)) -> (Q, N)``, ``_mode() -> (N,)``, ``marginal(names)``. The simplest one::
@@ -172,7 +173,7 @@ class Posterior(TorchDistribution):
         """Log density (...) of theta (..., N), -inf outside the cube; NoDensityError where there is none."""
         if not self.has_density:
             raise NoDensityError(
-                f"{type(self).__name__} has no density; use .smoothed(bandwidth), which returns a GaussianMixture"
+                f"{type(self).__name__} has no density; use .smoothed(bandwidth), a GaussianMixture"
             )
         theta = torch.as_tensor(theta, dtype=torch.float64)
         if theta.ndim == 0 or theta.shape[-1] != len(self.space):
@@ -213,7 +214,8 @@ class Posterior(TorchDistribution):
         return self._expanded(self._cached_mode)
 
     def gaussian_moments(self) -> tuple[Tensor, Tensor]:
-        """Mean (N,) and covariance (N, N) of the Gaussian which, restricted to the cube, stands for this posterior.
+        """Mean (N,) and covariance (N, N) of the Gaussian which, restricted to the cube, stands for this
+        posterior.
 
         For an earlier posterior that becomes a prior. Moment-matched unless the family says it is exact.
         """
@@ -251,7 +253,8 @@ class Posterior(TorchDistribution):
             return self.space.values(self._sample(n, generator).numpy())
 
     def to_inference_data(self, num_draws: int = 2000, generator: Generator | None = None) -> Any:
-        """ArviZ InferenceData: one (chain, draw) variable per parameter, in physical units, attribute ``units``.
+        """ArviZ InferenceData: one (chain, draw) variable per parameter, in physical units, attribute
+        ``units``.
 
         Posteriors that came as chains keep all of their draws; the others draw ``num_draws`` in one chain.
         """

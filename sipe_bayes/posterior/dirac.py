@@ -1,7 +1,7 @@
 """A point estimate: all probability at one theta. What regression and meta-learning return.
 
-Dirac(theta) has mean, mode and every quantile equal to theta and no spread; proper scores such as CRPS reduce to
-its absolute error, so it stands on one axis with real posteriors.
+Dirac(theta) has mean, mode and every quantile equal to theta and no spread; proper scores such as CRPS reduce
+to its absolute error, so it stands on one axis with real posteriors.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Independent parameters, each uniform or normal, restricted to [0, 1]: what is believed before any log is seen.
+"""Independent parameters, each uniform or normal, restricted to [0, 1]: what is believed before any log is
+seen.
 
-p(theta) = prod_j N(theta_j; m_j, s_j^2) / [Phi((1 - m_j) / s_j) - Phi(-m_j / s_j)]; s_j = inf is the uniform density 1.
+p(theta) = prod_j N(theta_j; m_j, s_j^2) / [Phi((1 - m_j) / s_j) - Phi(-m_j / s_j)]; s_j = inf is the uniform
+density 1.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ FLAT_SD = 1e3
 
 
 class IndependentPrior(Posterior):
-    """A product of truncated normals with ``mean`` (N,) and ``sd`` (N,) before truncation; sd = inf is uniform."""
+    """A product of truncated normals; ``mean`` (N,) and ``sd`` (N,) before truncation, sd = inf uniform."""
 
     has_density: ClassVar[bool] = True
 
@@ -73,7 +75,7 @@ class IndependentPrior(Posterior):
         return torch.from_numpy(mean), torch.diag(torch.from_numpy(variance))
 
     def gaussian_moments(self) -> tuple[Tensor, Tensor]:
-        """The normals before truncation, exact once restricted to the cube; uniform stands as sd 1,000 (1e-7 nats)."""
+        """The normals before truncation, exact once restricted to the cube; uniform as sd 1000 (1e-7)."""
         return self.normal_mean, torch.diag(self.normal_sd.clamp_max(FLAT_SD) ** 2)
 
     def _mode(self) -> Tensor:
@@ -94,7 +96,7 @@ class IndependentPrior(Posterior):
 
 
 def prior(space: ParameterSpace) -> IndependentPrior:
-    """What the parameters' own ``prior_mean`` and ``prior_sd`` say; uniform in theta where they say nothing."""
+    """What the parameters' ``prior_mean`` and ``prior_sd`` say; uniform in theta where they say nothing."""
     pairs = [parameter.theta_prior for parameter in space]
     return IndependentPrior([mean for mean, _ in pairs], [sd for _, sd in pairs], space)
 

@@ -1,21 +1,23 @@
 """A Gaussian mixture restricted to the unit cube. What BayesSim and Laplace approximations return.
 
-The components are *not* renormalised one by one. The mixture density q(theta) = sum_k w_k N(theta; m_k, C_k) is cut
-off outside the cube and divided by the mass that is left,
+The components are *not* renormalised one by one. The mixture density q(theta) = sum_k w_k N(theta; m_k, C_k)
+is cut off outside the cube and divided by the mass that is left,
 
     p(theta) = q(theta) / Z,   Z = sum_k w_k Z_k,   Z_k = mass of N(m_k, C_k) in the cube,
 
-so a draw comes from component k with probability w_k Z_k / Z: a component that lies mostly outside loses weight.
-Z_k is exact for diagonal covariances and in one dimension, otherwise Botev's estimate (see truncated_normal.py).
+so a draw comes from component k with probability w_k Z_k / Z: a component that lies mostly outside loses
+weight. Z_k is exact for diagonal covariances and in one dimension, otherwise Botev's estimate (see
+truncated_normal.py).
 
 Mode: with responsibilities r_k(theta) the log density is bounded below, touching at theta, by
--1/2 sum_k r_k |W_k (theta' - m_k)|^2 + const, with W_k^T W_k = C_k^-1. Maximising the bound over the cube is a
-bounded least-squares problem, solved by an active-set method; repeated, the density never falls. For K = 1 the first
-step is the answer.
+-1/2 sum_k r_k |W_k (theta' - m_k)|^2 + const, with W_k^T W_k = C_k^-1. Maximising the bound over the cube is
+a bounded least-squares problem, solved by an active-set method; repeated, the density never falls. For K = 1
+the first step is the answer.
 
-Marginals: the marginal of a truncated normal is not a truncated normal. It is one if the dropped parameters are
-uncorrelated with the kept ones (their mass goes into the weight), or if they are hardly truncated: when the mass cut
-off along them is below 1e-9 of the component's own. Otherwise the marginal is Particles, of 8,000 exact draws.
+Marginals: the marginal of a truncated normal is not a truncated normal. It is one if the dropped parameters
+are uncorrelated with the kept ones (their mass goes into the weight), or if they are hardly truncated: when
+the mass cut off along them is below 1e-9 of the component's own. Otherwise the marginal is Particles, of
+8,000 exact draws.
 """
 
 from __future__ import annotations
@@ -46,9 +48,9 @@ class GaussianMixture(Posterior):
     """sum_k w_k N(means_k, covariances_k), restricted to the cube and divided by its mass there.
 
     log_weights (K,), normalised or not; means (K, N), inside the cube or not; covariances (K, N, N), positive
-    definite. Components of weight zero are dropped. ``mean``, ``covariance`` and ``quantile`` are closed-form where
-    every covariance is diagonal (or no component is truncated); otherwise the moments come from at least 4,096
-    fixed-seed quasi-random points per component and the quantiles from 20,000 fixed-seed draws.
+    definite. Components of weight zero are dropped. ``mean``, ``covariance`` and ``quantile`` are closed-form
+    where every covariance is diagonal (or no component is truncated); otherwise the moments come from at
+    least 4,096 fixed-seed quasi-random points per component and the quantiles from 20,000 fixed-seed draws.
     """
 
     has_density: ClassVar[bool] = True
@@ -137,7 +139,7 @@ class GaussianMixture(Posterior):
         return mean, torch.einsum("k,kij->ij", p, covariances) + deviation.T @ (p[:, None] * deviation)
 
     def gaussian_moments(self) -> tuple[Tensor, Tensor]:
-        """For K = 1 the untruncated Gaussian itself, exact once restricted to the cube; otherwise moment-matched."""
+        """For K = 1 the untruncated Gaussian, exact once restricted to the cube; otherwise moment-matched."""
         return (self.means[0], self.covariances[0]) if len(self.means) == 1 else super().gaussian_moments()
 
     def _quantile(self, q: Tensor) -> Tensor:
@@ -192,7 +194,7 @@ class GaussianMixture(Posterior):
         return torch.from_numpy(np.clip(solution.x, 0.0, 1.0))
 
     def marginal(self, names: Iterable[str]) -> Posterior:
-        """A GaussianMixture where that is exact (to 1e-9), otherwise Particles; the module docstring says when."""
+        """A GaussianMixture where that is exact (to 1e-9), otherwise Particles: see the module docstring."""
         columns, space = self._columns(names)
         corrections = [_marginal_correction(c, columns) for c in self._components]
         if any(correction is None for correction in corrections):
@@ -249,8 +251,8 @@ def _cholesky(covariances: Tensor) -> Tensor:
         k = int(failed.nonzero()[0])
         least = float(torch.linalg.eigvalsh(covariances[k])[0])
         raise ValueError(
-            f"covariances: expected positive definite matrices, got smallest eigenvalue {least:.3g} in component {k}; "
-            "add a small number to its diagonal"
+            f"covariances: expected positive definite matrices, got smallest eigenvalue {least:.3g} "
+            f"in component {k}; add a small number to its diagonal"
         )
     return factor
 

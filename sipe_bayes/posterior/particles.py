@@ -1,10 +1,11 @@
 """A weighted set of points: what particle methods and Markov chains return.
 
 With weights w_m that sum to one, the mean is sum_m w_m theta_m and the covariance sum_m w_m (theta_m - mean)
-(theta_m - mean)^T, the moments of the discrete distribution itself. Its quantiles interpolate linearly between
-the sorted points at the midpoints of their steps in the cumulative weight. ``smoothed`` puts one Gaussian on each
-point; "scott" is D. W. Scott's rule for a product kernel ("Multivariate Density Estimation", 1992, section 6.3),
-h_j = sd_j M_eff^(-1 / (N + 4)) with the effective number of points M_eff = 1 / sum_m w_m^2.
+(theta_m - mean)^T, the moments of the discrete distribution itself. Its quantiles interpolate linearly
+between the sorted points at the midpoints of their steps in the cumulative weight. ``smoothed`` puts one
+Gaussian on each point; "scott" is D. W. Scott's rule for a product kernel ("Multivariate Density Estimation",
+1992, section 6.3), h_j = sd_j M_eff^(-1 / (N + 4)) with the effective number of points M_eff = 1 / sum_m
+w_m^2.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ class Particles(Posterior):
     """Points ``theta`` (M, N) with ``weights`` (M,), equal if not given. No density: ``log_prob`` raises.
 
     chains: the rows are this many equal consecutive Markov chains (their weights must be equal).
-    log_density: (M,) values up to a constant; ``mode`` is the best row. Without it, ``mode`` is the row closest
-    to the weighted mean in the metric of the covariance.
+    log_density: (M,) values up to a constant; ``mode`` is the best row. Without it, ``mode`` is the row
+    closest to the weighted mean in the metric of the covariance.
     """
 
     has_density: ClassVar[bool] = False
@@ -62,9 +63,11 @@ class Particles(Posterior):
         return float(1 / (self.weights**2).sum())
 
     def smoothed(self, bandwidth: float | str = "scott") -> GaussianMixture:
-        """A Gaussian mixture on the points; of more than 500, on 500 picked evenly along the cumulative weight.
+        """A Gaussian mixture on the points; of more than 500, on 500 picked evenly along the cumulative
+        weight.
 
-        bandwidth: kernel sd in theta units, or "scott". Raises ValueError when "scott" meets a constant column.
+        bandwidth: kernel sd in theta units, or "scott". Raises ValueError when "scott" meets a constant
+        column.
         """
         if bandwidth == "scott":
             sd = self.stddev * self.effective_size ** (-1 / (len(self.space) + 4))

@@ -1,7 +1,7 @@
 """The list of posterior families, and reading a saved posterior back.
 
-A new family is its own file plus one line in FAMILIES: class name -> the module that defines it, imported only
-when it is asked for.
+A new family is its own file plus one line in FAMILIES: class name -> the module that defines it, imported
+only when it is asked for.
 """
 
 from __future__ import annotations
@@ -40,5 +40,5 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
         return get_family(header["family"])._restore(space, tensors, header["settings"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(
-            f"{path}: not a posterior this version can read ({error}); save it again with posterior.save(path)"
+            f"{path}: not a posterior this version reads ({error}); save it again with posterior.save(path)"
         ) from error

@@ -1,26 +1,28 @@
 """The multivariate normal N(m, C) restricted to the unit cube: its mass there, exact samples, moments.
 
-**One dimension.** With a = (0 - m) / s and b = (1 - m) / s the mass is Phi(b) - Phi(a). By symmetry let a + b <= 0.
-If b > 0 it is [erf(b / sqrt2) - erf(a / sqrt2)] / 2, without cancellation; else, in the tail, with
-Phi(x) = exp(-x^2 / 2) erfcx(-x / sqrt2) / 2, its logarithm is log Phi(b) + log(1 - Phi(a) / Phi(b)), where the ratio
-needs only (b - a)(b + a). Inverse-CDF samples are drawn on the same logarithmic scale. A diagonal C factorises.
+**One dimension.** With a = (0 - m) / s and b = (1 - m) / s the mass is Phi(b) - Phi(a). By symmetry let a + b
+<= 0. If b > 0 it is [erf(b / sqrt2) - erf(a / sqrt2)] / 2, without cancellation; else, in the tail, with
+Phi(x) = exp(-x^2 / 2) erfcx(-x / sqrt2) / 2, its logarithm is log Phi(b) + log(1 - Phi(a) / Phi(b)), where
+the ratio needs only (b - a)(b + a). Inverse-CDF samples are drawn on the same logarithmic scale. A diagonal C
+factorises.
 
-**Full covariance.** Z. I. Botev, "The normal law under linear restrictions: simulation and estimation via minimax
-tilting", Journal of the Royal Statistical Society B 79 (2017), 125-148, https://arxiv.org/abs/1603.04166. Let
-C = L L^T (variables ordered so that the least probable given the earlier ones comes first), D = diag(L) and
-A = D^-1 L - I, strictly lower triangular. The cube is l <= z + A z <= u, with l, u the bounds minus m over D, and z
-standard normal. Draw z_k one after another from N(mu_k, 1) truncated to [l_k - (Az)_k, u_k - (Az)_k]; the likelihood
-ratio of the normal law to this proposal is exp psi(z; mu), with
+**Full covariance.** Z. I. Botev, "The normal law under linear restrictions: simulation and estimation via
+minimax tilting", Journal of the Royal Statistical Society B 79 (2017), 125-148,
+https://arxiv.org/abs/1603.04166. Let C = L L^T (variables ordered so that the least probable given the
+earlier ones comes first), D = diag(L) and A = D^-1 L - I, strictly lower triangular. The cube is l <= z + A z
+<= u, with l, u the bounds minus m over D, and z standard normal. Draw z_k one after another from N(mu_k, 1)
+truncated to [l_k - (Az)_k, u_k - (Az)_k]; the likelihood ratio of the normal law to this proposal is exp
+psi(z; mu), with
 
     psi(z; mu) = sum_k  mu_k^2 / 2 - mu_k z_k + log[ Phi(u_k - (Az)_k - mu_k) - Phi(l_k - (Az)_k - mu_k) ].
 
-So E exp psi is the mass for any mu. psi is concave in z and convex in mu; the tilting mu* is its saddle point, where
-the worst ratio is least. With t_k and V_k the mean and variance of the truncated N(mu_k, 1), and w = t - mu, the
-saddle solves t - z = 0 and A^T w - mu = 0; its Hessian blocks are diag(V), diag(V - 1) A - I and A^T diag(V - 1) A,
-and Newton's method finds it. As psi(z; mu*) <= psi* = psi(z*; mu*) for all z, accepting a draw with probability
-exp(psi - psi*) is exact, and the acceptance rate is mass / exp(psi*). The mass is estimated by averaging exp psi over
-eight scrambled Sobol sequences of fixed seed; their spread gives the standard error. The moments are weighted
-averages over the same points.
+So E exp psi is the mass for any mu. psi is concave in z and convex in mu; the tilting mu* is its saddle
+point, where the worst ratio is least. With t_k and V_k the mean and variance of the truncated N(mu_k, 1), and
+w = t - mu, the saddle solves t - z = 0 and A^T w - mu = 0; its Hessian blocks are diag(V), diag(V - 1) A - I
+and A^T diag(V - 1) A, and Newton's method finds it. As psi(z; mu*) <= psi* = psi(z*; mu*) for all z,
+accepting a draw with probability exp(psi - psi*) is exact, and the acceptance rate is mass / exp(psi*). The
+mass is estimated by averaging exp psi over eight scrambled Sobol sequences of fixed seed; their spread gives
+the standard error. The moments are weighted averages over the same points.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ Array = NDArray[np.float64]
 RELATIVE_ERROR = 1e-4
 UNTRUNCATED = 1e-12
 _SCRAMBLES = 8
-_FIRST_POINTS, _MOST_POINTS = 2**9, 2**13
+_FIRST_POINTS, _MOST_POINTS = 2**11, 2**13
 _REJECTION_MASS = 0.05
 _LEAST_ACCEPTANCE = 1e-6
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
@@ -74,10 +76,11 @@ def interval_quantile(a: Any, b: Any, u: Any) -> Array:
 def interval_moments(low: Any, high: Any, location: Any, scale: Any) -> tuple[Array, Array]:
     """Mean and variance of N(location, scale^2) truncated to [low, high], elementwise; scale may be infinite.
 
-    64-point Gauss-Legendre quadrature from the density's maximum to where it has fallen by exp(-40): the textbook
-    formulas subtract nearly equal numbers in the tails and in narrow intervals, this does not.
+    64-point Gauss-Legendre quadrature from the density's maximum to where it has fallen by exp(-40): the
+    textbook formulas subtract nearly equal numbers in the tails and in narrow intervals, this does not.
     """
-    start = np.clip(location, low, high)
+    low, high, location, scale = (np.asarray(x, dtype=np.float64) for x in (low, high, location, scale))
+    start = np.asarray(np.clip(location, low, high))
     slope = start - location
     reach = np.sqrt(slope**2 + 80 * np.square(scale))
     left, right = np.maximum(low, location - reach), np.minimum(high, location + reach)
@@ -102,11 +105,21 @@ class Tilting(NamedTuple):
     log_bound: float
 
 
+class Estimate(NamedTuple):
+    """What the quasi-random points say: log mass, its standard error, and the truncated moments."""
+
+    log_mass: float
+    error: float
+    mean: Array
+    covariance: Array
+
+
 def ordered_cholesky(mean: Array, covariance: Array) -> tuple[NDArray[np.intp], Array]:
     """An order of the variables, least probable interval first, and the Cholesky factor in that order.
 
-    The greedy order of G. J. Gibson, C. A. Glasbey, D. A. Elston, "Monte Carlo evaluation of multivariate normal
-    integrals and sensitivity to variate ordering" (1994); each chosen variable stands at its truncated mean.
+    The greedy order of G. J. Gibson, C. A. Glasbey, D. A. Elston, "Monte Carlo evaluation of multivariate
+    normal integrals and sensitivity to variate ordering" (1994); each chosen variable stands at its truncated
+    mean.
     """
     size = len(mean)
     order, factor = np.arange(size), np.zeros((size, size))
@@ -125,8 +138,8 @@ def ordered_cholesky(mean: Array, covariance: Array) -> tuple[NDArray[np.intp], 
         factor[k, k] = spread[best - k]
         factor[k + 1 :, k] = (covariance[k + 1 :, k] - factor[k + 1 :, :k] @ factor[k, :k]) / factor[k, k]
         offset = factor[k, :k] @ z[:k]
-        bounds = ((low[k] - offset) / factor[k, k], (high[k] - offset) / factor[k, k])
-        z[k] = interval_moments(*map(np.asarray, bounds), np.asarray(0.0), np.asarray(1.0))[0]
+        bounds = (low[k] - offset) / factor[k, k], (high[k] - offset) / factor[k, k]
+        z[k] = interval_moments(*bounds, 0.0, 1.0)[0]
     return order, factor
 
 
@@ -154,7 +167,7 @@ def saddle_point(lower: Array, low: Array, high: Array) -> tuple[Array, float]:
     z = np.zeros(n + 1)
     for k in range(n):  # start where the untilted proposal's means are: they solve half of the equations
         shift = lower[k, :k] @ z[:k]
-        z[k] = interval_moments(low[k] - shift, high[k] - shift, np.asarray(0.0), np.asarray(1.0))[0]
+        z[k] = interval_moments(low[k] - shift, high[k] - shift, 0.0, 1.0)[0]
     point = np.concatenate([z[:n], np.zeros(n)])
     gradient, jacobian = _saddle_equations(point, lower, low, high)
     for _ in range(200):
@@ -174,7 +187,8 @@ def saddle_point(lower: Array, low: Array, high: Array) -> tuple[Array, float]:
 
 
 class TruncatedNormal:
-    """N(mean, covariance) restricted to [0, 1]^N and renormalised. mean (N,), covariance (N, N), positive definite.
+    """N(mean, covariance) restricted to [0, 1]^N and renormalised. mean (N,), covariance (N, N), positive
+    definite.
 
     log_mass: given when it is known already, so that it is not estimated again.
     """
@@ -209,11 +223,18 @@ class TruncatedNormal:
             return 0.0, 0.0
         if self.diagonal:
             return float(log_interval(-self.mean / self.sd, (1 - self.mean) / self.sd).sum()), 0.0
-        log_ratios = self._points[1]
-        per_scramble = logsumexp(log_ratios, axis=1) - math.log(log_ratios.shape[1])
+        return self._estimate.log_mass, self._estimate.error
+
+    @cached_property
+    def _estimate(self) -> Estimate:
+        theta, psi = self._points()
+        per_scramble = logsumexp(psi, axis=1) - math.log(psi.shape[1])
         log_mass = float(logsumexp(per_scramble) - math.log(_SCRAMBLES))
-        spread = np.exp(per_scramble - log_mass).std(ddof=1) / math.sqrt(_SCRAMBLES)
-        return log_mass, float(spread)
+        error = float(np.exp(per_scramble - log_mass).std(ddof=1)) / math.sqrt(_SCRAMBLES)
+        theta, psi = theta.reshape(-1, len(self.mean)), psi.reshape(-1)
+        weight = np.exp(psi - logsumexp(psi))
+        mean = weight @ theta
+        return Estimate(log_mass, error, mean, (theta - mean).T @ (weight[:, None] * (theta - mean)))
 
     @cached_property
     def _tilting(self) -> Tilting:
@@ -236,9 +257,8 @@ class TruncatedNormal:
         theta[:, tilting.order] = tilting.diagonal * (z + z @ tilting.lower.T)
         return np.clip(theta + self.mean, 0.0, 1.0), psi
 
-    @cached_property
     def _points(self) -> tuple[Array, Array]:
-        """theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences, n doubled until precise enough."""
+        """theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences, n doubled until precise."""
         engines = [qmc.Sobol(len(self.mean), scramble=True, seed=seed) for seed in range(_SCRAMBLES)]
         uniforms = np.stack([engine.random(_FIRST_POINTS) for engine in engines])
         theta, psi = self._propose_batch(uniforms)
@@ -263,10 +283,7 @@ class TruncatedNormal:
                 np.zeros_like(self.mean), np.ones_like(self.mean), self.mean, self.sd
             )
             return mean, np.diag(variance)
-        theta, psi = (array.reshape(-1, *array.shape[2:]) for array in self._points)
-        weight = np.exp(psi - logsumexp(psi))
-        mean = weight @ theta
-        return mean, (theta - mean).T @ (weight[:, None] * (theta - mean))
+        return self._estimate.mean, self._estimate.covariance
 
     def sample(self, n: int, generator: Generator | None) -> Array:
         """Exact draws (n, N)."""
@@ -279,8 +296,8 @@ class TruncatedNormal:
         rate = math.exp(min(self.log_mass - self._tilting.log_bound, 0.0))
         if rate < _LEAST_ACCEPTANCE:
             raise RuntimeError(
-                f"sample: one draw in {1 / max(rate, 1e-300):.0e} would be accepted; the covariance is too close to "
-                "singular in the tail, add a little to its diagonal"
+                f"sample: one draw in {1 / max(rate, 1e-300):.0e} would be accepted; the covariance is too "
+                "close to singular in the tail, add a little to its diagonal"
             )
         return self._accepted(n, rate, self._tilted_draws, generator)
 
@@ -304,9 +321,10 @@ class TruncatedNormal:
 
     @cached_property
     def _factor(self) -> Array:
-        return np.linalg.cholesky(self.covariance)
+        return np.asarray(np.linalg.cholesky(self.covariance), dtype=np.float64)
 
     @cached_property
     def whitening(self) -> Array:
         """W (N, N) with W C W^T = I."""
-        return solve_triangular(self._factor, np.eye(len(self.mean)), lower=True)
+        inverse: Array = solve_triangular(self._factor, np.eye(len(self.mean)), lower=True)
+        return inverse

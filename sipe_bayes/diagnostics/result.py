@@ -1,0 +1,129 @@
+"""What a calibration found, as plain data: the command prints it, the report draws it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from sipe_bayes.posterior import Posterior
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterSummary:
+    """One parameter's marginal in its unit. contraction = 1 - sd / prior sd; flags are single words: ``at_bound``,
+    ``no_effect``, ``dead_range``, ``not_determined``, ``disagrees``, ``nuisance``."""
+
+    name: str
+    unit: str
+    targets: tuple[str, ...]
+    mean: float
+    sd: float
+    q05: float
+    q50: float
+    q95: float
+    mode: float
+    default: float | None
+    contraction: float
+    flags: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**asdict(self), "targets": list(self.targets), "flags": list(self.flags)}
+
+
+@dataclass(frozen=True)
+class ChannelScore:
+    """Root-mean-square error of one channel of one log over open-loop windows from measured starts, at the posterior
+    mode and with the model as given."""
+
+    log: str
+    channel: str
+    unit: str
+    rmse: float
+    rmse_default: float
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One channel of one log for drawing. All arrays (T+1,); NaN where there is nothing.
+
+    mode: prediction at the posterior mode; low, high: 5 % and 95 % of the predictions over posterior draws, without
+    measurement noise; default: the model as given. Every window of the log starts anew at ``window_starts`` (s).
+    """
+
+    log: str
+    use: str
+    channel: str
+    unit: str
+    time: FloatArray
+    measured: FloatArray
+    mode: FloatArray
+    low: FloatArray
+    high: FloatArray
+    default: FloatArray
+    window_starts: FloatArray
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Residual (T+1,) of one fitted channel of one training log with the windows' starts at their estimates, in the
+    channel's unit; whitened: the same after the noise model, which should be white with sd 1."""
+
+    log: str
+    channel: str
+    unit: str
+    time: FloatArray
+    residual: FloatArray
+    whitened: FloatArray
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """A direction that the data leave open, in words, and the members of it by name."""
+
+    text: str
+    parameters: tuple[str, ...]
+
+
+@dataclass
+class Calibration:
+    """The outcome of ``sipe calibrate``. noise: channel -> {"sd", "tau" (s), "unit"}; mixing: {"rhat", "ess", ...} of
+    mcmc or None; logs: what was read and what was done to it; run: configuration, versions, seed, checksums."""
+
+    name: str
+    estimator: str
+    posterior: Posterior
+    prior: Posterior
+    parameters: list[ParameterSummary]
+    train: list[ChannelScore]
+    holdout: list[ChannelScore]
+    warnings: list[str]
+    signals: list[Signal] = field(default_factory=list)
+    residuals: list[Residual] = field(default_factory=list)
+    ridges: list[Ridge] = field(default_factory=list)
+    noise: dict[str, dict[str, Any]] = field(default_factory=dict)
+    mixing: dict[str, Any] | None = None
+    logs: list[dict[str, Any]] = field(default_factory=list)
+    run: dict[str, Any] = field(default_factory=dict)
+    rollouts: int = 0
+    seconds: float = 0.0
+    out: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object that ``--json`` prints."""
+        return {
+            "parameters": [p.to_dict() for p in self.parameters],
+            "holdout": [asdict(s) for s in self.holdout],
+            "train": [asdict(s) for s in self.train],
+            "warnings": list(self.warnings),
+            "noise": self.noise,
+            "mixing": self.mixing,
+            "rollouts": self.rollouts,
+            "seconds": round(self.seconds, 3),
+            "out": self.out,
+        }

@@ -1,0 +1,173 @@
+"""The Estimator contract: ``posterior = Estimator(simulator, budget=..., seed=...).fit(trajectories)``.
+
+A budget counts rollouts: one theta simulated over the horizon of one recorded log, however the log is cut into
+windows; finite differences count.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sipe_bayes.inference.state import State, load_state, save_state
+from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is being done, rollouts so far, budget)."""
+
+_CHECKPOINT_SECONDS = 1.0
+
+
+class Estimator(ABC):
+    """Infers a posterior over theta from trajectories.
+
+    simulator: what is calibrated. prior: a posterior with a density over ``simulator.space``, default the one its
+    parameters state. budget: rollouts it may use. seed: the same seed gives the same posterior. likelihood: how
+    trajectories are compared, for the methods that use one. checkpoint: a file to go on from and to keep up to date;
+    the same call after an interruption gives the posterior of an undisturbed run. progress: called along the way.
+
+    **Adding a method** takes one file and one line in ``inference.registry.ESTIMATORS``. Write three functions; the
+    base class checks, seeds, counts the budget, keeps the checkpoint and resumes:
+
+    - ``start(trajectories) -> State``: a flat dictionary of arrays, numbers and text (random generators as text),
+      with ``"done": False``.
+    - ``step(state, trajectories) -> State``: a new state, one affordable piece of work further; ``"done": True`` ends.
+      When the budget runs out in mid-step, BudgetExhausted ends the fit with the last whole state.
+    - ``posterior(state, trajectories) -> Posterior``: of any state, without simulating.
+
+    The simplest method draws from the prior and keeps the best::
+
+        class RandomSearch(Estimator):
+            def start(self, trajectories):
+                return {"theta": np.empty((0, self.n)), "loss": np.empty(0), "done": False}
+
+            def step(self, state, trajectories): ...
+
+            def posterior(self, state, trajectories):
+                return Dirac(state["theta"][state["loss"].argmin()], self.space)
+    """
+
+    name: ClassVar[str]
+    amortised: ClassVar[bool] = False
+    default_budget: ClassVar[int] = 1000
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        *,
+        prior: Posterior | None = None,
+        budget: int | None = None,
+        seed: int = 0,
+        likelihood: Segments | None = None,
+        checkpoint: str | Path | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        if budget is not None and budget < 1:
+            raise ValueError(f"budget: expected at least 1 rollout, got {budget}")
+        self.simulator, self.space = simulator, simulator.space
+        self.prior = default_prior(self.space) if prior is None else prior
+        if self.prior.space.names != self.space.names or not self.prior.has_density:
+            raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
+        self.budget = self.default_budget if budget is None else int(budget)
+        self.seed, self.likelihood = int(seed), likelihood or Segments()
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.progress = progress
+        self.rollouts = 0
+        self.warnings: list[str] = []
+        self.diagnostics: dict[str, Any] = {}
+        self._state: State | None = None
+        self._bound: tuple[Trajectories, Windows] | None = None
+
+    @abstractmethod
+    def start(self, trajectories: Trajectories) -> State: ...
+
+    @abstractmethod
+    def step(self, state: State, trajectories: Trajectories) -> State: ...
+
+    @abstractmethod
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior: ...
+
+    def fit(self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Posterior:
+        """The posterior given one or several trajectories; raises ValueError for ones that do not fit the simulator."""
+        batch = Trajectories.stack(trajectories)
+        fingerprint = self._fingerprint(batch)
+        self.warnings, self.rollouts = [], 0
+        state = None
+        if self.checkpoint is not None and self.checkpoint.exists():
+            state = load_state(self.checkpoint, fingerprint)
+            self.rollouts = self.windows(batch).rollouts = int(state["rollouts"])
+        saved = time.monotonic()
+        try:
+            if state is None:
+                state = self._counted(self.start(batch), batch)
+            while not state["done"]:
+                state = self._counted(self.step(state, batch), batch)
+                if self.checkpoint is not None and (state["done"] or time.monotonic() - saved > _CHECKPOINT_SECONDS):
+                    save_state(self.checkpoint, state, fingerprint)
+                    saved = time.monotonic()
+                if self.progress is not None:
+                    self.progress(self.describe(state), self.rollouts, self.budget)
+        except BudgetExhausted as error:
+            if state is None:
+                raise ValueError(f"budget: {error}; raise it") from None
+            self.warnings.append(f"the budget of {self.budget} rollouts ran out before the method had converged")
+        self._state = state
+        return self.posterior(state, batch)
+
+    def update_parameter_estimate(self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> None:
+        """One step of the method, as the paper's interface names it; trajectories may differ from step to step."""
+        batch = Trajectories.stack(trajectories)
+        if self._state is None:
+            self._state = self._counted(self.start(batch), batch)
+        if not self._state["done"]:
+            self._state = self._counted(self.step(self._state, batch), batch)
+
+    def get_parameter_estimate(self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Posterior:
+        """The posterior of the present state."""
+        if self._state is None:
+            raise ValueError("get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first")
+        return self.posterior(self._state, Trajectories.stack(trajectories))
+
+    def describe(self, state: State) -> str:
+        """What is being done, in a few words, for the progress bar."""
+        return self.name
+
+    def windows(self, trajectories: Trajectories) -> Windows:
+        """The trajectories bound to the likelihood, budget counted."""
+        if self._bound is None or self._bound[0] is not trajectories:
+            bound = self.likelihood.bind(self.simulator, trajectories)
+            bound.budget, bound.rollouts = self.budget, self.rollouts
+            self._bound = (trajectories, bound)
+        return self._bound[1]
+
+    def _counted(self, state: State, trajectories: Trajectories) -> State:
+        if self._bound is not None:
+            self.rollouts = self._bound[1].rollouts
+        return {**state, "rollouts": self.rollouts}
+
+    def settings(self) -> dict[str, Any]:
+        """Whatever changes the result besides the trajectories, as plain data; subclasses add theirs."""
+        return {
+            "estimator": self.name,
+            "seed": self.seed,
+            "budget": self.budget,
+            "likelihood": repr(self.likelihood),
+            "space": self.space.to_dict(),
+            "prior": repr(self.prior.gaussian_moments()),
+        }
+
+    def _fingerprint(self, trajectories: Trajectories) -> str:
+        digest = hashlib.sha256(repr(self.settings()).encode())
+        for array in (trajectories.observations, trajectories.actions, trajectories.dt):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()

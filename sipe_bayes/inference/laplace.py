@@ -1,0 +1,279 @@
+"""Laplace's approximation of the posterior by windowed least squares.
+
+Theta and the windows' starts minimise the whitened squares of the residuals plus the prior (``least_squares``), the
+noise maximises its restricted likelihood (``sipe_bayes.noise``); the two alternate, from white noise, which is plain
+least squares, to autoregressive noise. At the optimum the starts are marginalised and the curvature gives a normal in
+theta, truncated to the unit cube. Where a parameter sits at a bound, the normal's mean lies beyond it, at the optimum
+of the quadratic model: the truncated density is right up to the bound.
+
+Several starting points (the model as given and the best of a few draws from the prior) are followed; optima that are
+not the same become components of a mixture, weighted by their restricted likelihood.
+
+Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
+within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
+uncertainty of the noise parameters is not propagated (see the README for the measured coverage).
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.least_squares import Fit, QuadraticPrior, energy_of, step
+from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import Windows
+from sipe_bayes.noise import Moments, Noise, eliminate, estimate_noise, restricted
+from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+
+_FLAT_PRECISION = 0.01  # sd 10 in units of the cube
+_TOLERANCE = 1e-3  # nats
+_SAME_NOISE = 0.02  # relative
+_DROP = 10.0  # nats below the best optimum
+_MAX_ITERATIONS = 60
+
+
+class Laplace(Estimator):
+    """Mixture of truncated normals at the optima of the windowed likelihood; see the module's docstring.
+
+    restarts: starting points followed. candidates: draws from the prior among which they are chosen.
+    """
+
+    name: ClassVar[str] = "laplace"
+    default_budget: ClassVar[int] = 5000
+
+    def __init__(self, simulator: Any, *, restarts: int = 2, candidates: int = 8, **settings: Any) -> None:
+        if restarts < 1 or candidates < 0:
+            raise ValueError(f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}")
+        super().__init__(simulator, **settings)
+        self.restarts, self.candidates = restarts, candidates
+
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings(), "restarts": self.restarts, "candidates": self.candidates}
+
+    @property
+    def quadratic_prior(self) -> QuadraticPrior:
+        """The prior's normal, before truncation."""
+        mean, covariance = self.prior.gaussian_moments()
+        return QuadraticPrior(mean.numpy(), np.linalg.inv(covariance.numpy()))
+
+    def start(self, trajectories: Trajectories) -> State:
+        windows = self.windows(trajectories)
+        starts = screen(self, windows, trajectories)
+        n, w, d, c = len(self.space), windows.num_windows, windows.num_start, len(windows.channels)
+        fresh = _begin(windows, starts[0])
+        return {
+            "done": False,
+            "points": starts,
+            "point": 0,
+            **fresh,
+            "mode_theta": np.empty((0, n)),
+            "mode_starts": np.empty((0, w, d)),
+            "mode_slope": np.empty((0, w, d, n)),
+            "mode_precision": np.empty((0, n, n)),
+            "mode_gradient": np.empty((0, n)),
+            "mode_sd": np.empty((0, c)),
+            "mode_tau": np.empty((0, c)),
+            "mode_evidence": np.empty(0),
+        }
+
+    def describe(self, state: State) -> str:
+        return f"laplace: start {state['point'] + 1} of {len(state['points'])}, step {state['iteration']}"
+
+    def step(self, state: State, trajectories: Trajectories) -> State:
+        """One linearisation, one estimate of the noise, one accepted step of theta and starts."""
+        windows, prior = self.windows(trajectories), self.quadratic_prior
+        theta, starts = state["theta"], state["starts"]
+        linearisation = windows.linearise(theta, starts)
+        moments = windows.moments(linearisation)
+        before = Noise(state["sd"], state["tau"])
+        coloured = state["coloured"] and self.likelihood.noise == "ar1"
+        noise = _noise(windows, moments, before, theta, starts, prior, coloured)
+        value = energy_of(windows, noise, prior, theta, starts, linearisation.residual)
+        fit = step(windows, noise, prior, Fit(theta, starts, value, state["damping"]), moments, _TOLERANCE)
+        settled = fit.converged and _same(noise, before)
+        state = {
+            **state,
+            "theta": fit.theta,
+            "starts": fit.starts,
+            "damping": fit.damping,
+            "sd": noise.sd,
+            "tau": noise.tau,
+            "iteration": state["iteration"] + 1,
+            "coloured": state["coloured"] or settled,
+        }
+        if (settled and (coloured or self.likelihood.noise == "white")) or state["iteration"] >= _MAX_ITERATIONS:
+            state = self._finish(state, windows, moments, noise, theta, starts, prior)
+        return state
+
+    def _finish(
+        self,
+        state: State,
+        windows: Windows,
+        moments: Moments,
+        noise: Noise,
+        theta: FloatArray,
+        starts: FloatArray,
+        prior: QuadraticPrior,
+    ) -> State:
+        """Record the optimum at the last linearisation and turn to the next starting point."""
+        pull = -windows.start_precision * starts
+        arrow = eliminate(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
+        flat = _FLAT_PRECISION * np.eye(len(theta))
+        evidence = restricted(
+            moments, noise, prior.precision + flat, prior.pull(theta), windows.start_precision, pull
+        ) - prior.energy(theta)
+        found = {
+            "theta": theta,
+            "starts": starts,
+            "slope": arrow.start_slope,
+            "precision": arrow.precision,
+            "gradient": arrow.gradient,
+            "sd": noise.sd,
+            "tau": noise.tau,
+            "evidence": np.array(evidence),
+        }
+        modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in found.items()}
+        point = state["point"] + 1
+        more = point < len(state["points"])
+        fresh = _begin(windows, state["points"][point]) if more else {}
+        return {**state, **modes, "point": min(point, len(state["points"]) - 1), **fresh, "done": not more}
+
+    def posterior(self, state: State, trajectories: Trajectories) -> GaussianMixture:
+        if not len(state["mode_theta"]):
+            raise ValueError(
+                f"budget: {self.budget} rollouts were not enough for one optimum; "
+                f"one step takes {self._cost(trajectories)} rollouts, so raise the budget"
+            )
+        means, covariances, evidence = [], [], []
+        kept = distinct_modes(state)
+        for m in kept:
+            mean, covariance = self._normal(state, m)
+            means.append(mean)
+            covariances.append(covariance)
+            evidence.append(state["mode_evidence"][m])
+        self.diagnostics = {
+            "modes": len(kept),
+            "noise_sd": state["mode_sd"][kept[0]].tolist(),
+            "noise_tau": state["mode_tau"][kept[0]].tolist(),
+        }
+        if len(kept) > 1:
+            self.warnings.append(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
+        weights = torch.tensor(np.array(evidence) - np.max(evidence))
+        return GaussianMixture(weights, np.stack(means), np.stack(covariances), self.space)
+
+    def _normal(self, state: State, m: int) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance, before truncation, of optimum m."""
+        prior, theta = self.quadratic_prior, state["mode_theta"][m]
+        flat = _FLAT_PRECISION * np.eye(len(theta))
+        covariance = np.linalg.inv(state["mode_precision"][m] + prior.precision + flat)
+        pull = state["mode_gradient"][m] + prior.pull(theta) + _FLAT_PRECISION * (0.5 - theta)
+        return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
+
+    def _cost(self, trajectories: Trajectories) -> int:
+        windows = self.windows(trajectories)
+        return (windows.num_theta + windows.num_start + 2) * len(trajectories)
+
+
+def screen(estimator: Laplace, windows: Windows, trajectories: Trajectories) -> FloatArray:
+    """Starting points (R, N): the best of the model as given and ``candidates`` draws, by their plain residuals.
+
+    Raises ValueError when every one of them diverges."""
+    generator = torch.Generator().manual_seed(estimator.seed)
+    draws = estimator.prior.sample((estimator.candidates,), generator=generator).numpy()
+    points = np.concatenate([estimator.space.default_theta[None], draws])
+    still = np.tile(windows.no_starts(), (len(points), 1, 1, 1))
+    residual, valid = windows.residuals(points, still)
+    if not valid.any():
+        raise ValueError(
+            f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
+            "shorten the model's timestep or the window"
+        )
+    spread = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), 1e-12)
+    loss = np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
+    if not valid[0]:
+        estimator.warnings.append("the model as given diverges on these logs; the search started elsewhere")
+    order = np.argsort(loss, kind="stable")[: int(valid.sum())]
+    chosen = [0, *[i for i in order if i != 0]] if valid[0] else list(order)
+    return points[chosen[: estimator.restarts]]
+
+
+def _begin(windows: Windows, theta: FloatArray) -> State:
+    """A search that starts at theta, with a first guess of white noise."""
+    fixed = fixed_sd(windows)
+    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
+    sd = np.where(np.isnan(fixed), np.maximum(0.1 * spread, 1e-9), fixed)
+    return {
+        "theta": theta,
+        "starts": windows.no_starts(),
+        "damping": 1e-4,
+        "sd": sd,
+        "tau": np.zeros(len(sd)),
+        "iteration": 0,
+        "coloured": False,
+    }
+
+
+def fixed_sd(windows: Windows) -> FloatArray:
+    """Given noise sd (C,) of the fitted channels, NaN where it is estimated."""
+    given = windows.settings.noise_sd
+    if given is None:
+        return np.full(len(windows.channels), np.nan)
+    return np.array([np.nan if given[c] is None else given[c] for c in windows.channels], float)
+
+
+def _noise(
+    windows: Windows,
+    moments: Moments,
+    before: Noise,
+    theta: FloatArray,
+    starts: FloatArray,
+    prior: QuadraticPrior,
+    coloured: bool,
+) -> Noise:
+    flat = _FLAT_PRECISION * np.eye(len(theta))
+    return estimate_noise(
+        moments,
+        before,
+        fixed_sd(windows),
+        coloured,
+        float(windows.dt.min()),
+        longest_tau(windows),
+        prior.precision + flat,
+        prior.pull(theta),
+        windows.start_precision,
+        -windows.start_precision * starts,
+    )
+
+
+def longest_tau(windows: Windows) -> float:
+    """The longest correlation time that the logs could show: the longest log's duration."""
+    return float((windows.trajectories.length * windows.trajectories.dt).max())
+
+
+def _same(a: Noise, b: Noise) -> bool:
+    return bool(np.allclose(a.sd, b.sd, rtol=_SAME_NOISE) and np.allclose(a.tau, b.tau, rtol=3 * _SAME_NOISE))
+
+
+def distinct_modes(state: State) -> list[int]:
+    """Optima worth keeping, best first: within ``_DROP`` nats of the best, and not the same point twice."""
+    order = np.argsort(-state["mode_evidence"], kind="stable")
+    kept: list[int] = []
+    for m in order:
+        if state["mode_evidence"][m] < state["mode_evidence"][order[0]] - _DROP:
+            continue
+        if not any(_close(state, int(m), k) for k in kept):
+            kept.append(int(m))
+    return kept
+
+
+def _close(state: State, a: int, b: int) -> bool:
+    """Whether optimum b's normal holds optimum a well inside it."""
+    gap = state["mode_theta"][a] - state["mode_theta"][b]
+    return bool(gap @ state["mode_precision"][b] @ gap < len(gap))

@@ -1,0 +1,286 @@
+"""Markov chain Monte Carlo over theta and the noise, starts marginalised: emcee on the windowed likelihood.
+
+D. Foreman-Mackey et al. 2013, "emcee: The MCMC Hammer", PASP 125 (https://arxiv.org/abs/1202.3665); moves: differential
+evolution (ter Braak & Vrugt 2008). All walkers' proposals are simulated in one batch.
+
+Target, with r the residual at the predicted starts x(theta), V the noise covariance and J_x the starts' Jacobian:
+
+    log p(theta, sigma, tau | y) = log prior - 1/2 [log|V| + log|A| + r' V^-1 r - b' A^-1 b],
+    A = J_x' V^-1 J_x + P_x,   b = J_x' V^-1 r - P_x x,
+
+which is the likelihood with the starts integrated out, exact where the prediction is linear in the starts over their
+(narrow) conditional posterior. x(theta) = x_hat - S (theta - theta_hat) and J_x are taken from the ``laplace`` fit that
+comes first and also places the walkers; that saves D of D + 1 simulations. How far a fresh J_x would move the target
+is measured on draws of the final chain and reported as ``linearisation_error`` (sd in nats).
+
+Priors of the noise: log sigma and log tau uniform within wide bounds.
+
+Deviations: R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do;
+walkers share information, so R-hat is an optimistic diagnostic.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.laplace import Laplace, distinct_modes, fixed_sd, longest_tau
+from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetExhausted, Windows
+from sipe_bayes.noise import Marginal, Noise
+from sipe_bayes.posterior import Particles
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+
+_BLOCK = 20  # steps of the ensemble between checkpoints
+_WARM_UP = 1 / 3  # of the chain is dropped
+_MIXED_RHAT = 1.05
+_NOISE_SPREAD = 0.1  # of the walkers' first log sigma, log tau
+_DRAWS = 4000  # at most kept
+_CHECKED = 16  # draws on which the linearisation is checked
+
+
+class MCMC(Estimator):
+    """Particles of an emcee ensemble; see the module's docstring.
+
+    walkers: default twice the dimensions plus two, at least 24. effective: effective draws at which it stops early,
+    once R-hat is small too.
+    """
+
+    name: ClassVar[str] = "mcmc"
+    default_budget: ClassVar[int] = 50_000
+
+    def __init__(self, simulator: Any, *, walkers: int | None = None, effective: int = 400, **settings: Any) -> None:
+        super().__init__(simulator, **settings)
+        if walkers is not None and walkers < 2 * len(self.space) + 2:
+            raise ValueError(f"walkers: expected at least {2 * len(self.space) + 2}, got {walkers}")
+        self.walkers, self.effective = walkers, effective
+
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings(), "walkers": self.walkers, "effective": self.effective}
+
+    def start(self, trajectories: Trajectories) -> State:
+        """Fit ``laplace``, which places the walkers and supplies the starts' Jacobian."""
+        first = Laplace(
+            self.simulator, prior=self.prior, budget=self.budget, seed=self.seed, likelihood=self.likelihood
+        )
+        windows = self.windows(trajectories)
+        first._bound = (trajectories, windows)
+        found = first.fit(trajectories)
+        if not first._state or not len(first._state["mode_theta"]):
+            raise BudgetExhausted("the budget did not suffice for the first laplace fit")
+        best = distinct_modes(first._state)[0]
+        picked = {k: first._state[f"mode_{k}"][best] for k in ("theta", "starts", "slope", "sd", "tau")}
+        jacobian = windows.linearise(picked["theta"], picked["starts"], with_theta=False).jacobian
+        random = np.random.RandomState(self.seed)
+        walkers = self._place(windows, found, picked, random)
+        return {
+            "done": False,
+            **{f"fit_{k}": v for k, v in picked.items()},
+            "fit_jacobian": jacobian,
+            "walkers": walkers,
+            "log_prob": np.full(len(walkers), -np.inf),
+            "chain": np.empty((0, *walkers.shape)),
+            "chain_log_prob": np.empty((0, len(walkers))),
+            "accepted": 0,
+            **_random_state(random),
+        }
+
+    def _place(
+        self, windows: Windows, found: Any, picked: dict[str, FloatArray], random: np.random.RandomState
+    ) -> FloatArray:
+        noise = self._free_noise(windows)
+        dimensions = len(self.space) + len(noise)
+        count = self.walkers or max(24, 2 * dimensions + 2)
+        generator = torch.Generator().manual_seed(self.seed)
+        theta = found.sample((count,), generator=generator).numpy()
+        logs = np.log(np.maximum(np.concatenate([picked["sd"], picked["tau"]]), 1e-300))
+        low, high = self._noise_bounds(windows, picked)
+        spread = _NOISE_SPREAD * random.standard_normal((count, len(noise)))
+        return np.concatenate([theta, np.clip(logs[noise] + spread, low[noise] + 1e-3, high[noise] - 1e-3)], axis=1)
+
+    def _free_noise(self, windows: Windows) -> NDArray[np.int64]:
+        """Which of (log sigma (C), log tau (C)) are sampled."""
+        free = np.isnan(fixed_sd(windows))
+        coloured = np.full(len(free), self.likelihood.noise == "ar1")
+        return np.flatnonzero(np.concatenate([free, coloured]))
+
+    def _noise_bounds(self, windows: Windows, picked: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        shortest = float(windows.dt.min())
+        sd = np.log(picked["sd"])
+        low = np.concatenate([sd - 5, np.full(len(sd), np.log(0.1 * shortest))])
+        high = np.concatenate([sd + 5, np.full(len(sd), np.log(longest_tau(windows)))])
+        return low, high
+
+    def describe(self, state: State) -> str:
+        return f"mcmc: step {len(state['chain'])}"
+
+    def step(self, state: State, trajectories: Trajectories) -> State:
+        """A block of steps of the whole ensemble."""
+        import emcee
+
+        windows = self.windows(trajectories)
+        walkers, dimensions = state["walkers"].shape
+        sampler = emcee.EnsembleSampler(
+            walkers,
+            dimensions,
+            _Target(self, windows, state),
+            vectorize=True,
+            moves=[(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)],
+        )
+        log_prob = state["log_prob"] if len(state["chain"]) else None
+        begin = emcee.State(state["walkers"], log_prob=log_prob, random_state=_restore_random(state))
+        end = sampler.run_mcmc(begin, _BLOCK, skip_initial_state_check=True, progress=False)
+        random = np.random.RandomState()
+        random.set_state(end.random_state)
+        state = {
+            **state,
+            "walkers": end.coords,
+            "log_prob": end.log_prob,
+            "chain": np.concatenate([state["chain"], sampler.get_chain()]),
+            "chain_log_prob": np.concatenate([state["chain_log_prob"], sampler.get_log_prob()]),
+            "accepted": int(state["accepted"] + sampler.backend.accepted.sum()),
+            **_random_state(random),
+        }
+        mixing = self._mixing(state)
+        enough = mixing["ess"] >= self.effective and mixing["rhat"] <= _MIXED_RHAT
+        return {**state, "done": bool(enough)}
+
+    def _mixing(self, state: State) -> dict[str, float]:
+        """Worst R-hat over the parameters, effective draws and acceptance of the chain after warm-up."""
+        kept = self._kept(state)[:, :, : len(self.space)]
+        if len(kept) < 2 * _BLOCK:
+            return {"rhat": np.inf, "ess": 0.0, "acceptance": 0.0, "steps": len(state["chain"])}
+        import arviz
+        import emcee
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            rhat = max(float(arviz.rhat(kept[:, :, j].T)) for j in range(kept.shape[2]))
+            time = emcee.autocorr.integrated_time(kept, quiet=True, tol=0, has_walkers=True)
+        steps, walkers = kept.shape[:2]
+        tau = max(1.0, float(np.nanmax(time))) if np.isfinite(time).any() else float(steps)
+        return {
+            "rhat": rhat,
+            "ess": steps * walkers / tau if steps >= 10 * tau else min(steps * walkers / tau, 10.0 * walkers),
+            "autocorrelation_steps": tau,
+            "acceptance": state["accepted"] / (len(state["chain"]) * walkers),
+            "steps": len(state["chain"]),
+        }
+
+    def _kept(self, state: State) -> FloatArray:
+        """The chain after warm-up (steps, walkers, dimensions)."""
+        return state["chain"][int(_WARM_UP * len(state["chain"])) :]
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Particles:
+        if not len(state["chain"]):
+            raise ValueError(f"budget: {self.budget} rollouts were not enough for one block of steps; raise it")
+        n = len(self.space)
+        chain, log_prob = self._kept(state), state["chain_log_prob"][-len(self._kept(state)) :]
+        thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
+        theta = np.swapaxes(chain[::-thin][::-1], 0, 1)[:, :, :n]
+        density = np.swapaxes(log_prob[::-thin][::-1], 0, 1)
+        mixing = self._mixing(state)
+        mixing["linearisation_error"] = self._linearisation_error(state, trajectories)
+        self.diagnostics = {"mixing": mixing, **self._noise_summary(state, trajectories)}
+        if not (mixing["rhat"] <= _MIXED_RHAT and mixing["ess"] >= self.effective / 2):
+            self.warnings.append(
+                f"the chains have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective draws): "
+                "raise the budget before you trust the intervals"
+            )
+        if mixing["linearisation_error"] > 0.5:
+            self.warnings.append(
+                f"the windows' starts are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): "
+                "use shorter windows"
+            )
+        flat = np.clip(theta.reshape(-1, n), 0, 1)
+        return Particles(flat, self.space, chains=len(theta), log_density=density.reshape(-1))
+
+    def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
+        target = _Target(self, self.windows(trajectories), state)
+        sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
+        return {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
+
+    def _linearisation_error(self, state: State, trajectories: Trajectories) -> float:
+        """Sd, over draws, of the difference that a fresh Jacobian of the starts makes to the target (nats).
+
+        Its simulations are a check of the answer and stand outside the budget."""
+        windows = self.windows(trajectories)
+        used, budget = windows.rollouts, windows.budget
+        windows.budget = np.inf
+        target = _Target(self, windows, state)
+        flat = self._kept(state).reshape(-1, state["chain"].shape[2])
+        points = flat[np.linspace(0, len(flat) - 1, _CHECKED).astype(int)]
+        difference = [float(target(p[None])[0]) - target.refreshed(p) for p in points]
+        windows.rollouts, windows.budget = used, budget
+        return float(np.std(difference))
+
+
+class _Target:
+    """log p(theta, noise | y) of walkers (B, N + noise)."""
+
+    def __init__(self, owner: MCMC, windows: Windows, state: State) -> None:
+        self.owner, self.windows, self.n = owner, windows, len(owner.space)
+        self.fit = {k[4:]: v for k, v in state.items() if k.startswith("fit_")}
+        self.free = owner._free_noise(windows)
+        self.low, self.high = owner._noise_bounds(windows, self.fit)
+        self.marginal = Marginal(windows.sequences, self.fit["jacobian"], windows.start_precision)
+
+    def noise(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """sd and tau (B, C) of walkers."""
+        logs = np.tile(np.log(np.maximum(np.concatenate([self.fit["sd"], self.fit["tau"]]), 1e-300)), (len(points), 1))
+        logs[:, self.free] = points[:, self.n :]
+        channels = len(self.fit["sd"])
+        tau = np.exp(logs[:, channels:]) if self.owner.likelihood.noise == "ar1" else np.zeros((len(points), channels))
+        return np.exp(logs[:, :channels]), tau
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        out = np.full(len(points), -np.inf)
+        theta, logs = points[:, : self.n], points[:, self.n :]
+        inside = ((theta >= 0) & (theta <= 1)).all(1)
+        inside &= ((logs >= self.low[self.free]) & (logs <= self.high[self.free])).all(1)
+        if not inside.any():
+            return out
+        theta = theta[inside]
+        starts = self.fit["starts"] - np.einsum("wdn,bn->bwd", self.fit["slope"], theta - self.fit["theta"])
+        residual, valid = self.windows.residuals(theta, starts)
+        sd, tau = self.noise(points[inside])
+        prior = self.owner.prior.log_prob(torch.from_numpy(theta)).numpy()
+        value = prior + self.marginal(residual, starts, sd, tau)
+        out[inside] = np.where(valid & np.isfinite(value), value, -np.inf)
+        return out
+
+    def refreshed(self, point: FloatArray) -> float:
+        """The target at one point with the starts' Jacobian taken there, after one step of the starts."""
+        theta = point[: self.n]
+        starts = self.fit["starts"] - self.fit["slope"] @ (theta - self.fit["theta"])
+        sd, tau = self.noise(point[None])
+        noise = Noise(sd[0], tau[0])
+        for _ in range(2):
+            lin = self.windows.linearise(theta, starts, with_theta=False)
+            marginal = Marginal(self.windows.sequences, lin.jacobian, self.windows.start_precision)
+            value = marginal(lin.residual[None], starts[None], sd, tau)
+            starts = starts + marginal.best(lin.residual, starts, noise)
+        return float(value[0] + self.owner.prior.log_prob(torch.from_numpy(theta)))
+
+
+def _random_state(random: np.random.RandomState) -> State:
+    kind, keys, position, has_gauss, cached = random.get_state(legacy=True)
+    return {
+        "random_kind": str(kind),
+        "random_keys": np.asarray(keys),
+        "random_position": int(position),
+        "random_has_gauss": int(has_gauss),
+        "random_cached": float(cached),
+    }
+
+
+def _restore_random(state: State) -> tuple[Any, ...]:
+    names = ("kind", "keys", "position", "has_gauss", "cached")
+    return tuple(state[f"random_{n}"] for n in names)
