@@ -65,9 +65,9 @@ def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: 
     return found
 
 
-def coefficients(gaps: FloatArray, tau: float) -> FloatArray:
+def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
     """Autoregression coefficient of each gap in seconds; 0 for white noise (tau = 0) and infinite gaps."""
-    return np.exp(-gaps / tau) if tau > 0 else np.zeros_like(gaps)
+    return np.where(np.asarray(tau) > 0, np.exp(-gaps / np.maximum(tau, 1e-300)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,13 @@ class Arrow:
         return self.start_offset - self.start_slope @ step
 
 
-def eliminate(normal: FloatArray, num_theta: int, start_precision: FloatArray, start_pull: FloatArray, damping: float = 0.0) -> Arrow:
+def eliminate(
+    normal: FloatArray,
+    num_theta: int,
+    start_precision: FloatArray,
+    start_pull: FloatArray,
+    damping: float = 0.0,
+) -> Arrow:
     """Eliminate the starts from the normal equations.
 
     normal (W, K, K) as Moments.normal gives; start_precision (D,): weak prior on the starts; start_pull (W, D): its
@@ -216,14 +222,31 @@ def eliminate(normal: FloatArray, num_theta: int, start_precision: FloatArray, s
     )
 
 
-def restricted(moments: Moments, noise: Noise, prior: FloatArray, pull: FloatArray, start_precision: FloatArray, start_pull: FloatArray) -> float:
-    """Restricted log-likelihood of the noise, up to a constant; prior (N, N), pull (N,): prior precision of theta and
-    its gradient."""
-    arrow = eliminate(moments.normal(noise), moments.num_theta, start_precision, start_pull)
+@dataclass(frozen=True)
+class Pulls:
+    """What besides the data pulls at the linearisation point.
+
+    prior (N, N) and prior_pull (N,): precision of theta's prior and its negative gradient; start_precision (D,) and
+    start_pull (W, D) likewise; free (N,): parameters that may move. One held at a bound against its pull is no
+    unknown of the linear model: with it the residuals would be credited with an optimum that is not allowed.
+    """
+
+    prior: FloatArray
+    prior_pull: FloatArray
+    start_precision: FloatArray
+    start_pull: FloatArray
+    free: NDArray[np.bool_]
+
+
+def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> float:
+    """Restricted log-likelihood of the noise, up to a constant."""
+    arrow = eliminate(moments.normal(noise), moments.num_theta, pulls.start_precision, pulls.start_pull)
     value = log_determinant(moments.sequences, noise) + arrow.log_determinant + arrow.square - arrow.explained
-    if moments.num_theta:
-        factor = np.linalg.cholesky(arrow.precision + prior)
-        half = scipy.linalg.solve_triangular(factor, arrow.gradient + pull, lower=True)
+    if pulls.free.any():
+        free = np.ix_(pulls.free, pulls.free)
+        factor = np.linalg.cholesky(arrow.precision[free] + pulls.prior[free])
+        pull = (arrow.gradient + pulls.prior_pull)[pulls.free]
+        half = scipy.linalg.solve_triangular(factor, pull, lower=True)
         value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)
     return -0.5 * value
 
@@ -231,31 +254,27 @@ def restricted(moments: Moments, noise: Noise, prior: FloatArray, pull: FloatArr
 def estimate_noise(
     moments: Moments,
     noise: Noise,
+    pulls: Pulls,
     fixed_sd: FloatArray,
     coloured: bool,
     shortest: float,
     longest: float,
-    prior: FloatArray,
-    pull: FloatArray,
-    start_precision: FloatArray,
-    start_pull: FloatArray,
 ) -> Noise:
     """Noise that maximises the restricted likelihood, started from ``noise``.
 
-    fixed_sd (C,): given sds, NaN where to be estimated. coloured: whether tau is estimated, within [shortest, longest]
-    seconds. Each channel's (log innovation sd, log tau) is searched by L-BFGS with numerical gradients.
+    fixed_sd (C,): given sds, NaN where to be estimated. coloured: whether tau is estimated, from a tenth of
+    ``shortest`` to ``longest`` seconds. (log innovation sd, log tau) of all channels are searched by L-BFGS.
     """
-    channels = len(noise.sd)
-    free_sd = np.isnan(fixed_sd)
+    channels, estimated = len(noise.sd), np.isnan(fixed_sd)
 
     def unpack(x: FloatArray) -> Noise:
         tau = np.exp(x[channels:]) if coloured else np.zeros(channels)
-        step = 1 - np.exp(-2 * shortest / np.maximum(tau, 1e-300)) if coloured else np.ones(channels)
-        return Noise(np.where(free_sd, np.exp(x[:channels]) / np.sqrt(step), fixed_sd), tau)
+        innovation = 1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
+        return Noise(np.where(estimated, np.exp(x[:channels]) / np.sqrt(innovation), fixed_sd), tau)
 
     def loss(x: FloatArray) -> float:
         try:
-            value = -restricted(moments, unpack(x), prior, pull, start_precision, start_pull)
+            value = -restricted(moments, unpack(x), pulls)
         except np.linalg.LinAlgError:
             return 1e12
         return value if np.isfinite(value) else 1e12
@@ -263,10 +282,10 @@ def estimate_noise(
     low, high = np.log(_SHORTEST_TAU * shortest), np.log(longest)
     tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
     if coloured and (noise.tau <= 0).all():
-        tau = np.full(channels, np.log(10 * shortest))
-    step = 1 - np.exp(-2 * shortest / np.exp(tau)) if coloured else np.ones(channels)
-    x0 = np.concatenate([np.log(noise.sd * np.sqrt(step)), tau if coloured else []])
-    bounds = [(x0[i] - 12, x0[i] + 12) for i in range(channels)] + [(low, high)] * (channels if coloured else 0)
+        tau = np.full(channels, np.clip(np.log(10 * shortest), low, high))
+    innovation = 1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
+    x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation)), tau if coloured else []])
+    bounds = [(x - 12, x + 12) for x in x0[:channels]] + [(low, high)] * (channels if coloured else 0)
     result = scipy.optimize.minimize(loss, x0, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4, "ftol": 1e-9})
     return unpack(result.x)
 

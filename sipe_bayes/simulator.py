@@ -2,14 +2,20 @@
 
 Every model runs with MuJoCo's warm start disabled, so the state is Markov: a lane's bits depend on its own theta,
 start and actions alone, whatever the threads, the batch or what ran before. A rollout that diverges is data: MuJoCo
-resets such a lane, which shows as a time that stalls; ``valid`` is False from the first such sample on.
+resets such a lane and ``mujoco.rollout`` repeats its last state, which shows as a time that is not t0 + k dt; ``valid``
+is False from the first such sample on. A step that raised any other warning (out of contact memory, singular inertia)
+is the one before the first repeated state. MuJoCo's own messages are held back meanwhile: nothing on the terminal, no
+MUJOCO_LOG.TXT; ``Simulator.diverged`` counts the lanes.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import os
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -25,14 +31,42 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _CHUNK = 2**24  # numbers of state and sensor output held at once, 128 MiB
+_POOL = 2**29  # bytes of models held at once
 _TIME_TOLERANCE = 0.5  # of a physics step
+_HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
+
+
+class _Quiet:
+    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the GIL."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = threading.Lock(), 0, mujoco.MjLogConfig.get()
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self._lock:
+            if not self._inside:
+                self._before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+                silent.logto_console = silent.logto_file = False
+                silent.set()
+            self._inside += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside:
+                    self._before.set()
+
+
+_quiet = _Quiet()
 
 
 class Simulator:
     """Simulates an Environment for batches of theta.
 
-    num_threads: native threads; default the processor's cores. ``rollouts`` counts control steps simulated over the
-    horizon of the recorded logs by whoever uses the engine; ``warnings`` counts lanes that diverged.
+    num_threads: native threads; default the processor's cores. ``control_steps`` counts what was simulated,
+    ``diverged`` the lanes that are not valid to their end. Not for two Python threads at a time.
     """
 
     def __init__(self, environment: Environment, num_threads: int | None = None) -> None:
@@ -40,7 +74,9 @@ class Simulator:
             raise ValueError(f"num_threads: expected at least 1, got {num_threads}")
         self.environment = environment
         self.num_threads = num_threads or os.cpu_count() or 1
-        self.model = self._new_model()
+        self.model = environment.compile()
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        self.model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET  # divergence must show
         self.diverged = 0
         self.control_steps = 0
         self._pool: list[Any] = []
@@ -83,31 +119,29 @@ class Simulator:
 
         theta (B, N), actions (B, T, A) and initial_state (B, S), each also with B = 1 for all lanes; dt: seconds per
         control step, (B,) or one number, default the model's timestep; logs: the log that each lane belongs to, for
-        parameters that differ between logs. Returns Trajectories with observations, states and ``valid``.
-        Raises ValueError for shapes that do not fit, theta outside the unit cube or numbers that are not finite.
+        parameters that differ between logs. Returns Trajectories with observations, states and ``valid``. A lane whose
+        parameters are unphysical or whose start is not finite is never simulated: NaN, and not valid from sample 0.
+        Raises ValueError for shapes that do not fit, theta outside the unit cube, or actions that are not finite.
         """
         theta, actions, initial_state = self._check(theta, actions, initial_state, allow_outside)
         batch = max(len(theta), len(actions), len(initial_state))
+        dts, names = self._check_lanes(batch, dt, logs)
         theta, actions, initial_state = (
             np.broadcast_to(a, (batch, *a.shape[1:])) for a in (theta, actions, initial_state)
         )
-        dts = np.broadcast_to(np.asarray(self.model.opt.timestep if dt is None else dt, float), (batch,))
-        names = list(logs) if logs is not None else [None] * batch
-        steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(float(d)) for d in dts), strict=True))
-        lanes, biases = self._models(theta, timesteps, names)
+        steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(d) for d in dts), strict=True))
         horizon = actions.shape[1]
         states = np.empty((batch, horizon + 1, self.state_size))
         observations = np.empty((batch, horizon + 1, len(self.environment.channels)))
+        good = np.empty((batch, horizon + 1), bool)
         for skip in np.unique(steps):
             group = np.flatnonzero(steps == skip)
-            width = (horizon * int(skip) + 1) * (self.state_size + self.model.nsensordata + self.model.nu)
-            size = max(self.num_threads, _CHUNK // width)
-            for chunk in np.array_split(group, math.ceil(len(group) / size)):
-                self._run(chunk, int(skip), lanes, actions, initial_state, states, observations)
-        observations += biases[:, None]
-        expected = initial_state[:, :1] + np.arange(horizon + 1) * dts[:, None]
-        on_time = np.abs(states[:, :, 0] - expected) < _TIME_TOLERANCE * timesteps[:, None]
-        good = on_time & np.isfinite(states).all(-1) & self._lane_physical(lanes)[:, None]
+            for chunk in np.array_split(
+                group, math.ceil(len(group) / self._lanes_at_once(horizon * int(skip)))
+            ):
+                lanes, biases = self._models(theta[chunk], timesteps[chunk], [names[i] for i in chunk])
+                out = self._run(int(skip), lanes, timesteps[chunk], actions[chunk], initial_state[chunk])
+                states[chunk], observations[chunk], good[chunk] = out[0], out[1] + biases[:, None], out[2]
         valid = np.logical_and.accumulate(good, axis=1)
         self.diverged += int((~valid[:, -1]).sum())
         self.control_steps += batch * horizon
@@ -118,6 +152,8 @@ class Simulator:
         self, theta: FloatArray, actions: FloatArray, initial_state: FloatArray, allow_outside: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         theta = np.atleast_2d(self.space.check_shape(theta))
+        if not np.isfinite(theta).all():
+            raise ValueError("theta: expected finite numbers, got NaN or infinity")
         if not allow_outside and not ((theta >= 0) & (theta <= 1)).all():
             raise ValueError(
                 f"theta: expected values in [0, 1], got {theta.min():.4g} to {theta.max():.4g}; "
@@ -128,8 +164,12 @@ class Simulator:
             actions = actions[None]
         if actions.ndim != 3 or actions.shape[-1] != self.environment.num_actions or not actions.shape[0]:
             raise ValueError(f"actions: expected (B, T, {self.environment.num_actions}), got {actions.shape}")
-        if not np.isfinite(actions).all():
-            raise ValueError("actions: expected finite numbers, got NaN or infinity; mask or hold them first")
+        if not actions.shape[1]:
+            raise ValueError("actions: expected at least one control step, got none")
+        if not (np.abs(actions) <= _HUGE).all():
+            raise ValueError(
+                "actions: expected finite numbers, got NaN, infinity or above 1e10; mask or hold them first"
+            )
         initial_state = np.atleast_2d(np.asarray(initial_state, float))
         if initial_state.shape[-1] != self.state_size:
             raise ValueError(f"initial_state: expected (B, {self.state_size}), got {initial_state.shape}")
@@ -140,72 +180,105 @@ class Simulator:
             )
         return theta, actions, initial_state
 
-    def _new_model(self) -> Any:
-        model = self.environment.compile()
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
-        return model
+    def _check_lanes(
+        self, batch: int, dt: FloatArray | float | None, logs: Sequence[str | None] | None
+    ) -> tuple[FloatArray, list[str | None]]:
+        dts = np.asarray(self.model.opt.timestep if dt is None else dt, float)
+        if dts.shape not in ((), (1,), (batch,)):
+            raise ValueError(
+                f"dt: expected one number or ({batch},), one for each lane, got shape {dts.shape}"
+            )
+        if not (np.isfinite(dts) & (dts > 0)).all():
+            raise ValueError(f"dt: expected seconds above zero, got {float(dts.min()):g}")
+        names = [None] * batch if logs is None else list(logs)
+        if len(names) != batch:
+            raise ValueError(f"logs: expected {batch} names, one for each lane, got {len(names)}")
+        return np.broadcast_to(dts, (batch,)), names
+
+    def _lanes_at_once(self, physics_steps: int) -> int:
+        """How many lanes fit the memory that ``_CHUNK`` and ``_POOL`` allow."""
+        width = (physics_steps + 1) * (self.state_size + self.model.nsensordata + self.model.nu)
+        return max(self.num_threads, min(_CHUNK // width, _POOL // mujoco.mj_sizeModel(self.model)))
 
     def _models(
         self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]
     ) -> tuple[NDArray[np.int64], FloatArray]:
         """Which pooled model each lane uses, written in place, and the lanes' sensor bias (B, O)."""
         lanes, index, biases = np.empty(len(theta), int), {}, []
-        for lane, row in enumerate(theta):
-            key = row.tobytes() + float(timesteps[lane]).hex().encode() + str(logs[lane]).encode()
+        for lane, (row, timestep) in enumerate(zip(theta, timesteps.tolist(), strict=True)):
+            key = row.tobytes() + timestep.hex().encode() + str(logs[lane]).encode()
             if key not in index:
                 index[key] = len(index)
-                values = self.space.values(row)
-                self._write(index[key], key, values, float(timesteps[lane]), logs[lane])
+                # a row at a time: vectorised exponentials differ in their last bit with the length of the batch
+                values = np.array([p.value(t) for p, t in zip(self.space, row.tolist(), strict=True)])
+                self._write(index[key], key, values, timestep, logs[lane])
                 biases.append(self.environment.bias(values, logs[lane]))
             lanes[lane] = index[key]
         return lanes, np.stack(biases)[lanes]
 
     def _write(self, slot: int, key: bytes, values: FloatArray, timestep: float, log: str | None) -> None:
         if slot == len(self._pool):
-            self._pool.append(self._new_model())
+            self._pool.append(copy.copy(self.model))
             self._keys.append(b"")
             self._physical.append(False)
         if self._keys[slot] == key:
             return
-        model = self._pool[slot]
+        model, self._keys[slot] = self._pool[slot], b""
         self._physical[slot] = self.environment.write(model, values, log)
         model.opt.timestep = timestep
         if self._physical[slot] and self.environment.needs_constants:
-            mujoco.mj_setConst(model, self._scratch)
+            with _quiet():
+                mujoco.mj_setConst(model, self._scratch)
         self._keys[slot] = key
-
-    def _lane_physical(self, lanes: NDArray[np.int64]) -> BoolArray:
-        return np.array(self._physical)[lanes]
 
     def _run(
         self,
-        chunk: NDArray[np.int64],
         skip: int,
         lanes: NDArray[np.int64],
+        timesteps: FloatArray,
         actions: FloatArray,
         initial_state: FloatArray,
-        states: FloatArray,
-        observations: FloatArray,
-    ) -> None:
-        """Simulate the lanes of ``chunk`` and fill their rows of states and observations."""
-        environment = self.environment
-        physical = chunk[self._lane_physical(lanes[chunk])]
-        states[chunk], observations[chunk] = np.nan, np.nan
-        if not len(physical):
-            return
-        start = initial_state[physical]
-        controls = np.repeat(environment.control(self.model, start, actions[physical]), skip, axis=1)
-        if environment.needs_derived:  # one more step: sensordata belongs to the state before it
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """States (B, T+1, S), observations (B, T+1, O) without bias and which samples (B, T+1) are sound."""
+        environment, (batch, horizon, _) = self.environment, actions.shape
+        states = np.full((batch, horizon + 1, self.state_size), np.nan)
+        observations = np.full((batch, horizon + 1, len(environment.channels)), np.nan)
+        sound = np.zeros((batch, horizon + 1), bool)
+        run = np.array(self._physical)[lanes] & np.isfinite(initial_state).all(1)
+        if not run.any():
+            return states, observations, sound
+        start = initial_state[run]
+        controls = np.repeat(environment.control(self.model, start, actions[run]), skip, axis=1)
+        # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one shows it.
+        # Sensordata belongs to the state before the step, so the last sample's comes with the next step as well.
+        if environment.needs_derived or (horizon * skip == 1 and not start[:, 0].all()):
             controls = np.concatenate([controls, controls[:, -1:]], axis=1)
-        out, sensors = mujoco.rollout.rollout(
-            [self._pool[k] for k in lanes[physical]],
-            self._datas,
-            initial_state=start,
-            control=controls,
-            skip_checks=False,
-            persistent_pool=True,
-        )
-        kept = np.concatenate([start[:, None], out[:, skip - 1 : actions.shape[1] * skip : skip]], axis=1)
-        derived = sensors[:, ::skip][:, : actions.shape[1] + 1] if environment.needs_derived else None
-        states[physical] = kept
-        observations[physical] = environment.observe(self.model, kept, derived)
+        with _quiet():
+            out, sensors = mujoco.rollout.rollout(
+                [self._pool[k] for k in lanes[run]],
+                self._datas,
+                initial_state=start,
+                control=controls,
+                persistent_pool=True,
+            )
+        kept = np.concatenate([start[:, None], out[:, skip - 1 : horizon * skip : skip]], axis=1)
+        derived = sensors[:, ::skip][:, : horizon + 1] if environment.needs_derived else None
+        states[run], observations[run] = kept, environment.observe(self.model, kept, derived)
+        sound[run] = _sound(kept, out, skip, timesteps[run, None], environment.needs_derived)
+        return states, observations, sound
+
+
+def _sound(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:
+    """Which samples ``kept`` (B, T+1, S) of the physics steps ``out`` (B, P, S) are neither reset, repeated nor huge;
+    with ``derived`` the step that filled their sensordata must have been as well."""
+    count = kept.shape[1]
+    expected = kept[:, :1, 0] + np.arange(count) * skip * timestep
+    sound = (np.abs(kept[..., 0] - expected) < _TIME_TOLERANCE * timestep) & (np.abs(kept) <= _HUGE).all(-1)
+    after = out[:, ::skip][:, :count]  # the physics step that follows sample 0, 1, ...
+    number = after.shape[1]
+    repeated = after[..., 0] == kept[:, :number, 0]
+    if repeated.any():
+        sound[:, :number] &= ~(repeated & (after == kept[:, :number]).all(-1))
+    if derived:
+        sound &= np.abs(after[..., 0] - expected - timestep) < _TIME_TOLERANCE * timestep
+    return sound

@@ -8,7 +8,8 @@ invented.
 from __future__ import annotations
 
 import os
-import tempfile
+import uuid
+import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,16 +47,22 @@ class Trajectory:
             )
         if not len(actions):
             raise ValueError(f"{label}: expected at least one control step, got none")
-        if not self.dt > 0:
+        if not 0 < self.dt < np.inf:
             raise ValueError(f"{label}: dt must be positive, got {self.dt}")
         if not np.isfinite(actions).all():
-            raise ValueError(f"{label}: actions must be finite, got {int((~np.isfinite(actions)).sum())} that are not")
-        if self.states is not None and len(self.states) != len(observations):
-            raise ValueError(f"{label}: expected states ({len(observations)}, S), got {self.states.shape}")
+            raise ValueError(
+                f"{label}: actions must be finite, got {int((~np.isfinite(actions)).sum())} that are not"
+            )
+        states = None if self.states is None else np.asarray(self.states, dtype=np.float64)
+        if states is not None and (states.ndim != 2 or len(states) != len(observations)):
+            raise ValueError(f"{label}: expected states ({len(observations)}, S), got {states.shape}")
         if self.channels and len(self.channels) != observations.shape[1]:
-            raise ValueError(f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels")
+            raise ValueError(
+                f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels"
+            )
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "actions", actions)
+        object.__setattr__(self, "states", states)
 
     def __len__(self) -> int:
         """Control steps T."""
@@ -67,10 +74,19 @@ class Trajectory:
         return np.arange(len(self) + 1) * self.dt
 
     def slice(self, start: int, stop: int) -> Trajectory:
-        """Control steps start..stop, with both end samples."""
+        """Control steps start..stop, with both end samples; 0 <= start < stop <= T."""
+        if not 0 <= start < stop <= len(self):
+            raise ValueError(
+                f"trajectory {self.name!r}: expected 0 <= start < stop <= {len(self)}, got {start} and {stop}"
+            )
         states = None if self.states is None else self.states[start : stop + 1]
         return Trajectory(
-            self.observations[start : stop + 1], self.actions[start:stop], self.dt, states, self.name, self.channels
+            self.observations[start : stop + 1],
+            self.actions[start:stop],
+            self.dt,
+            states,
+            self.name,
+            self.channels,
         )
 
 
@@ -79,7 +95,8 @@ class Trajectories(Sequence[Trajectory]):
     """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,), length (B,).
 
     Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first sample
-    of a diverged simulation on, and on padding; it is all True on recorded samples. Indexing gives a Trajectory.
+    of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index gives a
+    Trajectory, a slice or an array of them Trajectories that keep ``valid``.
     """
 
     observations: FloatArray
@@ -102,6 +119,12 @@ class Trajectories(Sequence[Trajectory]):
         sizes = {(t.observations.shape[1], t.actions.shape[1]) for t in items}
         if len(sizes) > 1:
             raise ValueError(f"trajectories differ in (observation, action) sizes: {sorted(sizes)}")
+        channels = {t.channels for t in items if t.channels}
+        if len(channels) > 1:
+            raise ValueError(f"trajectories differ in their channels: {sorted(channels)}")
+        state_sizes = {t.states.shape[1] for t in items if t.states is not None}
+        if len(state_sizes) > 1:
+            raise ValueError(f"trajectories differ in the size of their states: {sorted(state_sizes)}")
         batch, steps = len(items), max(len(t) for t in items)
         (n_obs, n_act), with_states = sizes.pop(), all(t.states is not None for t in items)
         observations = np.full((batch, steps + 1, n_obs), np.nan)
@@ -117,25 +140,44 @@ class Trajectories(Sequence[Trajectory]):
         valid = np.arange(steps + 1)[None] <= length[:, None]
         names = tuple(t.name or str(i) for i, t in enumerate(items))
         dt = np.array([t.dt for t in items])
-        return cls(observations, actions, dt, length, valid, states, names, items[0].channels)
+        names_of_channels = channels.pop() if channels else ()
+        return cls(observations, actions, dt, length, valid, states, names, names_of_channels)
 
     def __len__(self) -> int:
         return len(self.actions)
 
     def __getitem__(self, key: Any) -> Any:
-        if isinstance(key, slice):
-            return Trajectories.stack([self[i] for i in range(len(self))[key]])
+        if isinstance(key, (slice, Sequence, np.ndarray)):
+            return self._subset(np.arange(len(self))[key])
         n = int(self.length[key])
         states = None if self.states is None else self.states[key, : n + 1]
         name = self.names[key] if self.names else ""
         dt = float(self.dt[key])
-        return Trajectory(self.observations[key, : n + 1], self.actions[key, :n], dt, states, name, self.channels)
+        return Trajectory(
+            self.observations[key, : n + 1], self.actions[key, :n], dt, states, name, self.channels
+        )
+
+    def _subset(self, chosen: NDArray[np.int64]) -> Trajectories:
+        if not len(chosen):
+            raise ValueError(f"trajectories: expected to choose at least one of {len(self)}, got none")
+        length = self.length[chosen]
+        steps = int(length.max())
+        return Trajectories(
+            self.observations[chosen, : steps + 1],
+            self.actions[chosen, :steps],
+            self.dt[chosen],
+            length,
+            self.valid[chosen, : steps + 1],
+            None if self.states is None else self.states[chosen, : steps + 1],
+            tuple(self.names[i] for i in chosen) if self.names else (),
+            self.channels,
+        )
 
     def __iter__(self) -> Iterator[Trajectory]:
         return (self[i] for i in range(len(self)))
 
     def save(self, path: str | Path) -> None:
-        """Write to an npz file, atomically."""
+        """Write to an npz file, under exactly this name and atomically."""
         arrays: dict[str, Any] = {
             "observations": self.observations,
             "actions": self.actions,
@@ -148,14 +190,24 @@ class Trajectories(Sequence[Trajectory]):
         if self.states is not None:
             arrays["states"] = self.states
         path = Path(path)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npz", delete=False) as file:
-            np.savez_compressed(file, **arrays)
-        os.replace(file.name, path)
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+        try:
+            with temporary.open("xb") as file:
+                np.savez_compressed(file, **arrays)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | Path) -> Trajectories:
-        """Read what ``save`` wrote; runs no code from the file."""
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}
+        """Read what ``save`` wrote; runs no code from the file. Raises ValueError for another file."""
+        needed = {"observations", "actions", "dt", "length", "valid", "names", "channels"}
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {key: data[key] for key in data.files}
+        except (ValueError, zipfile.BadZipFile, AttributeError, TypeError) as error:
+            raise ValueError(f"{path}: expected an npz file of trajectories, got {error}") from None
+        if arrays.keys() - {"states"} != needed:
+            raise ValueError(f"{path}: expected the arrays {sorted(needed)}, got {sorted(arrays)}")
         names, channels = (tuple(str(s) for s in arrays.pop(key)) for key in ("names", "channels"))
         return cls(**arrays, names=names, channels=channels)

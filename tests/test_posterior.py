@@ -1,7 +1,7 @@
 """Posterior families: densities integrate to one, samples agree with them, files read back exactly.
 
-Statistical tests use fixed seeds and five standard errors (false alarms 6e-7 each over reseeding, were the errors
-normal) unless they say otherwise; Kolmogorov-Smirnov tests reject below p = 1e-5.
+Statistical tests use fixed seeds and five standard errors (false alarms 6e-7 each over reseeding, were the
+errors normal) unless they say otherwise; Kolmogorov-Smirnov tests reject below p = 1e-5.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def random_mixture(n: int, components: int = 3, seed: int = 0) -> GaussianMixture:
-    """Correlated components, some of their means outside the cube."""
+    """Correlated components, some means outside the cube."""
     rng = np.random.default_rng(seed)
     factors = rng.standard_normal((components, n, n)) * 0.25
     covariances = factors @ factors.transpose(0, 2, 1) + 0.02 * np.eye(n)
@@ -132,7 +132,7 @@ def test_density_reproduces_the_moments(posterior: Posterior) -> None:
 
 
 def test_quantiles_agree_with_samples(posterior: Posterior) -> None:
-    """The share of draws below a quantile is its level, up to binomial error and the step of a discrete law."""
+    """The share of draws below a quantile is its level, up to binomial error and a discrete law's step."""
     levels, n = torch.tensor([0.05, 0.5, 0.9], dtype=torch.float64), 20_000
     quantiles = posterior.quantile(levels)
     assert quantiles.shape == (3, len(posterior.space))
@@ -356,7 +356,7 @@ def test_components_keep_their_truncated_share() -> None:
 
 
 def test_mode_on_the_boundary() -> None:
-    """With the mean outside, the mode is not the clipped mean: given theta_1 = 1, theta_2 is its regression."""
+    """With the mean outside, the mode is not the clipped mean: theta_2 is its regression on theta_1 = 1."""
     covariance = np.array([[0.04, 0.03], [0.03, 0.04]])
     mode = single([1.2, 0.5], covariance).mode
     torch.testing.assert_close(mode, torch.tensor([1.0, 0.5 - 0.75 * 0.2], dtype=torch.float64))
@@ -376,7 +376,7 @@ def test_mode_of_overlapping_components() -> None:
 
 
 def test_exact_marginals_of_mixtures() -> None:
-    """Dropping an uncorrelated parameter moves its mass into the weights; dropping an interior one adds nothing."""
+    """Dropping an uncorrelated parameter moves its mass into the weights; an interior one adds nothing."""
     block = np.diag([0.04, 0.04, 0.04])
     block[0, 1] = block[1, 0] = 0.03
     mixture = GaussianMixture([0.0, 0.0], [[0.4, 0.6, 0.5], [0.6, 0.4, 1.3]], [block, block], space_of(3))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import io
 import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -44,6 +45,7 @@ MAX_PAIRS = 8
 MAX_LAG = 200
 _PANELS, _CHANNELS, _RESIDUALS, _TRACES = 21, 6, 8, 10  # per figure
 _LONG_WINDOWS, _LONG_SAMPLES = 24, 4000  # beyond either, a signal also gets a close-up
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _STYLE: dict[str, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -99,7 +101,7 @@ def density(theta: FloatArray, grid: FloatArray) -> FloatArray:
     bounds, so that nothing leaks past them and an edge is not rounded off."""
     q25, q75 = np.quantile(theta, (0.25, 0.75))
     sd = float(theta.std())
-    width = 0.9 * (min(sd, (q75 - q25) / 1.349) or sd) * len(theta) ** -0.2
+    width = 0.9 * (min(sd, (q75 - q25) / 1.349) or sd) * len(np.unique(theta)) ** -0.2
     low, high = theta[theta < 5 * width], theta[theta > 1 - 5 * width]
     points = np.concatenate([theta, -low, 2 - high])
     kernels = np.exp(-(((grid[:, None] - points) / width) ** 2) / 2)
@@ -160,6 +162,11 @@ def _view(theta: FloatArray, default: float | None = None) -> tuple[float, float
     return max(view_low, 0.0), min(view_high, 1.0)
 
 
+def _scale(parameter: Parameter, view: tuple[float, float]) -> str:
+    wide = parameter.scale == "log" and parameter.value(view[1]) > 5 * parameter.value(view[0])
+    return "log" if wide else "linear"
+
+
 def _prior_density(prior: Posterior, name: str, grid: FloatArray) -> FloatArray:
     marginal = prior.marginal([name])
     if marginal.has_density:
@@ -196,18 +203,31 @@ class _Plain(Formatter):
         return next((d for d in range(12) if abs(round(step, d) / step - 1) < 1e-6), 12)
 
 
+def _compact(x: float) -> str:
+    """``x`` with few letters: 0.05, 2e-5."""
+    mantissa, exponent = f"{x:.3e}".split("e")
+    return f"{x:g}" if -3 <= int(exponent) < 5 else f"{float(mantissa):g}e{int(exponent)}"
+
+
 def _ticks(axis: Axis, count: int) -> None:
     if axis.get_scale() == "log":
-        axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0), numticks=count + 1))
-        axis.set_major_formatter(lambda x, _: f"{x:g}")
+        low, high = np.log10(axis.get_view_interval())
+        subs = (1.0,) if high - low > 1.5 else (1.0, 3.0) if high - low > 1 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(LogLocator(base=10, subs=subs, numticks=count))
+        axis.set_major_formatter(lambda x, _: _compact(x))
         axis.set_minor_formatter(NullFormatter())
         return
     axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10], min_n_ticks=2))
     axis.set_major_formatter(_Plain())
 
 
+def unit_text(unit: str) -> str:
+    """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1"."""
+    return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_RAISED), unit)
+
+
 def _label(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
+    return f"{name} [{unit_text(unit)}]" if unit else name
 
 
 def _short(text: str, length: int) -> str:
@@ -276,8 +296,7 @@ def _marginal(
 ) -> None:
     default = None if summary.default is None else float(parameter.normalise(summary.default))
     low, high = _view(theta, default)
-    if parameter.scale == "log" and parameter.value(high) > 5 * parameter.value(low):
-        ax.set_xscale("log")
+    ax.set_xscale(_scale(parameter, (low, high)))
     grid = np.linspace(low, high, 300)
     x = parameter.value(grid)
     ax.fill_between(x, _prior_density(prior, summary.name, grid), color=PRIOR, alpha=0.35, lw=0.8)
@@ -296,8 +315,8 @@ def _marginal(
     _ticks(ax.xaxis, 5)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
-    ax.set_xlabel(parameter.unit or "no unit", labelpad=1)
-    ax.set_title(_short(summary.name, 40), pad=13, fontweight="bold")
+    ax.set_xlabel(unit_text(parameter.unit) or "no unit", labelpad=1)
+    ax.set_title(_short(summary.name, 40), pad=15, fontweight="bold")
     _prior_strip(ax, interval, default)
 
 
@@ -349,18 +368,19 @@ def pairs(calibration: Calibration, names: Sequence[str] | None = None) -> list[
     return [figure]
 
 
-def _limits(parameter: Parameter, theta: FloatArray) -> tuple[float, float]:
-    low, high = _view(theta)
-    return float(parameter.value(low)), float(parameter.value(high))
+def _axis_range(parameter: Parameter, theta: FloatArray) -> tuple[str, tuple[float, float]]:
+    """Scale and limits of an axis that shows the draws."""
+    view = _view(theta)
+    return _scale(parameter, view), (float(parameter.value(view[0])), float(parameter.value(view[1])))
 
 
 def _pair(
     ax: Axes, parameters: tuple[Parameter, Parameter], theta: FloatArray, default: list[float | None]
 ) -> None:
-    x, y = (p.value(theta[:2500, k]) for k, p in enumerate(parameters))
+    x, y = (p.value(theta[:2000, k]) for k, p in enumerate(parameters))
     ax.scatter(x, y, s=3, color=POSTERIOR, alpha=0.2, lw=0)
-    ax.set_xlim(_limits(parameters[0], theta[:, 0]))
-    ax.set_ylim(_limits(parameters[1], theta[:, 1]))
+    (x_scale, x_limits), (y_scale, y_limits) = (_axis_range(p, theta[:, k]) for k, p in enumerate(parameters))
+    ax.set(xscale=x_scale, yscale=y_scale, xlim=x_limits, ylim=y_limits)
     if default[0] is not None and default[1] is not None:
         ax.plot(default[0], default[1], "+", color=DEFAULT, ms=9, mew=1.8)
 
@@ -374,12 +394,13 @@ def _diagonal(ax: Axes, parameter: Parameter, theta: FloatArray) -> None:
         ax.fill_between(parameter.value(grid), height, color=POSTERIOR, alpha=0.3, lw=0)
         ax.plot(parameter.value(grid), height, color=POSTERIOR, lw=1.2)
         ax.set_ylim(0, 1.08 * height.max())
-    ax.set_xlim(_limits(parameter, theta))
+    scale, limits = _axis_range(parameter, theta)
+    ax.set(xscale=scale, xlim=limits)
 
 
 def _pair_in_prior(ax: Axes, theta: FloatArray, before: FloatArray, strength: float) -> None:
     ax.scatter(before[:, 0], before[:, 1], s=4, color=PRIOR, alpha=0.35, lw=0)
-    ax.scatter(theta[:1500, 0], theta[:1500, 1], s=3, color=POSTERIOR, alpha=0.3, lw=0)
+    ax.scatter(theta[:1000, 0], theta[:1000, 1], s=3, color=POSTERIOR, alpha=0.3, lw=0)
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1)
     box = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
@@ -396,24 +417,26 @@ def _pair_frame(ax: Axes, parameters: tuple[Parameter, Parameter], i: int, j: in
         ax.spines[:].set_visible(True)
         ax.spines[:].set_color(PRIOR)
         return
-    length = 30 if size < 5 else 20
+    length, font = (26, 9.0) if size < 6 else (15, 8.0) if size < 8 else (14, 7.5)
     _ticks(ax.xaxis, 3)
     if i > j:
         _ticks(ax.yaxis, 3)
     else:
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
-    ax.tick_params(axis="x", rotation=40, labelbottom=i == size - 1)
+    ax.tick_params(axis="x", rotation=90 if size > 4 else 0, labelbottom=i == size - 1)
     ax.tick_params(axis="y", labelleft=j == 0 and i > j)
     if i == size - 1:
-        ax.set_xlabel(_axis_name(parameters[0], length))
+        ax.set_xlabel(_axis_name(parameters[0], length), fontsize=font)
     if j == 0 and i > 0:
-        ax.set_ylabel(_axis_name(parameters[1], length))
+        ax.set_ylabel(_axis_name(parameters[1], length), fontsize=font)
 
 
 def _axis_name(parameter: Parameter, length: int) -> str:
-    unit = f"\n[{parameter.unit}]" if parameter.unit else ""
-    return _short(parameter.name, length) + unit
+    """Name, log of a nuisance parameter and unit, each on its own line."""
+    name, bracket, log = parameter.name.partition("[")
+    unit = f"\n[{unit_text(parameter.unit)}]" if parameter.unit else ""
+    return _short(name, length) + (f"\n{_short(bracket + log, length)}" if bracket else "") + unit
 
 
 # Signals
@@ -490,7 +513,7 @@ def _channel_labels(
     below.set_ylabel("error")
     scores = rmse.get((signal.log, signal.channel))
     if scores is not None:
-        text = f"RMSE {scores[0]:.3g} {signal.unit}, with the model as given {scores[1]:.3g}"
+        text = f"RMSE {scores[0]:.3g} {unit_text(signal.unit)}, with the model as given {scores[1]:.3g}"
         above.set_title(text, loc="right", color="#444444", fontsize=8.5)
 
 
@@ -587,7 +610,7 @@ def _residual_figure(rows: Sequence[Residual]) -> Figure:
         left.plot(row.time, row.residual, color=MEASURED, lw=0.7)
         left.axhline(0, color=PRIOR, lw=0.7)
         left.set_xlim(row.time[0], row.time[-1])
-        left.set_ylabel(f"residual [{row.unit}]" if row.unit else "residual")
+        left.set_ylabel(_label("residual", row.unit))
         left.set_title(f"{_short(row.log, 36)}: {_short(row.channel, 24)}", loc="left")
         _ticks(left.yaxis, 4)
         _autocorrelation(right, row)
@@ -610,7 +633,7 @@ def _autocorrelation(ax: Axes, row: Residual) -> None:
     ax.axhspan(-band, band, color=PRIOR, alpha=0.35, lw=0)
     ax.vlines(np.arange(1, lags + 1), 0, values[1:], color=POSTERIOR, lw=min(1.6, 160 / lags))
     outside = float(np.mean(np.abs(values[1:]) > band))
-    ax.set_title(f"{outside:.0%} of lags outside the band (5 % if white)", loc="left", fontsize=8.5)
+    ax.set_title(f"{100 * outside:.0f} % of lags outside the band (5 % if white)", loc="left", fontsize=8.5)
     ax.set_xlim(0, lags + 0.5)
     reach = max(2.5 * band, 1.15 * float(np.nanmax(np.abs(values[1:]), initial=0.0)))
     ax.set_ylim(-reach, reach)
@@ -670,7 +693,8 @@ def _chain_figure(
             if name in found
         ]
         ax.set_title(", ".join([_short(name, 50), *texts]), loc="left")
-        ax.set_ylabel(space[j].unit or "no unit")
+        ax.set_yscale(_scale(space[j], _view(space[j].normalise(values[:, :, j]).ravel())))
+        ax.set_ylabel(unit_text(space[j].unit) or "no unit")
         ax.set_xlim(0, max(draw[-1], 1))
         _ticks(ax.yaxis, 3)
     axes[-1, 0].set_xlabel(f"draw of each of {len(values)} chains")

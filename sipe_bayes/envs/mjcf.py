@@ -20,11 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.envs.base import Environment
-from sipe_bayes.envs.targets import Target, TargetError, bind, check_inertia, named, split
+from sipe_bayes.envs.targets import Target, TargetError, bind, check_inertia, named, restore_inertia, split
 from sipe_bayes.parameters import Parameter, ParameterSpace
 
 FloatArray = NDArray[np.float64]
-_CHANNEL = re.compile(r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity)|sensor:(?P<sensor>[^\[\]]+)(?:\[(?P<item>\d+)\])?)$")
+_CHANNEL = re.compile(
+    r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity)|sensor:(?P<sensor>[^\[\]]+)(?:\[(?P<item>\d+)\])?)$"
+)
 _BIAS = re.compile(r"^sensor:(.+)\.bias$")
 _LINEAR_INTERPOLATION = 1
 
@@ -110,7 +112,9 @@ class MjcfEnvironment(Environment):
         twice = sorted({c.label for c in channels if [d.label for d in channels].count(c.label) > 1})
         if twice:
             raise ValueError(f"measurements: names must differ, but {twice} appear more than once")
+        _check_sensors(model, channels)
         space = ParameterSpace(_with_model_values(model, p, channels) for p in parameters)
+        _check_conflicts(space)
         return cls(str(source), tuple(actuators), channels, space)
 
     @property
@@ -134,7 +138,8 @@ class MjcfEnvironment(Environment):
         return any(r.derived for r in self._readers)
 
     def spec(self) -> Any:
-        """A fresh MjSpec, with a command history for each actuator whose delay is a parameter."""
+        """A fresh MjSpec, with a command history for each actuator whose delay is a parameter, and without MuJoCo's
+        short cut for bodies whose centre of mass lies in their origin where that may change."""
         spec = load_spec(self.source)
         timestep = spec.option.timestep
         for parameter in self.parameters:
@@ -142,6 +147,8 @@ class MjcfEnvironment(Environment):
                 if _BIAS.match(target):
                     continue
                 kind, name, attribute = split(target)
+                if kind == "body" and attribute != "mass":
+                    spec.body(name).simple = False
                 if kind == "actuator" and attribute == "delay":
                     actuator = spec.actuator(name)
                     # the physics step may be refined to half the model's own
@@ -209,27 +216,33 @@ class MjcfEnvironment(Environment):
         return self._shares[log]
 
     def write(self, model: Any, values: FloatArray, log: str | None = None) -> bool:
-        table = self._resolve(log)
+        table, bodies = self._resolve(log), self._inertial_bodies
         physical = True
+        if bodies:
+            restore_inertia(model, self._model, bodies)
         for j, multiplier, target in self._targets:
             if j in table:
-                value = multiplier * float(np.mean(values[table[j]]))
+                value = multiplier * _mean(values, table[j])
                 physical &= value >= target.minimum
                 target.write(model, value)
-        return physical and (not self._inertial_bodies or check_inertia(model, self._inertial_bodies))
+        return physical and (not bodies or check_inertia(model, bodies))
 
     @property
     def needs_constants(self) -> bool:
         return any(t.constants for _, _, t in self._targets)
 
     def bias(self, values: FloatArray, log: str | None = None) -> FloatArray:
-        found = np.zeros(len(self.measurements))
-        for j, members in self._resolve(log).items():
-            for target in self.parameters[j].targets:
-                match = _BIAS.match(target)
-                if match:
-                    found[_bias_channels(self.measurements, match.group(1))] += float(np.mean(values[members]))
+        found, table = np.zeros(len(self.measurements)), self._resolve(log)
+        for j, channels in self._biases:
+            if j in table:
+                found[channels] += _mean(values, table[j])
         return found
+
+    @cached_property
+    def _biases(self) -> list[tuple[int, list[int]]]:
+        """(parameter, channels that it shifts) of all sensor biases."""
+        targets = [(j, _BIAS.match(t)) for j, p in enumerate(self.parameters) for t in p.targets]
+        return [(j, _bias_channels(self.measurements, m.group(1))) for j, m in targets if m]
 
     @cached_property
     def _controls(self) -> list[int]:
@@ -252,23 +265,75 @@ class MjcfEnvironment(Environment):
     def state_columns(self, model: Any) -> tuple[int | None, ...]:
         return tuple(_state_column(model, r) for r in self._readers)
 
-    def history(self, model: Any, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray) -> FloatArray:
+    def history(
+        self, model: Any, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
+    ) -> FloatArray:
         if model.nhistory == 0:
             return states
-        states = states.copy()
+        states, timestep = states.copy(), np.asarray(timestep)
         start = 1 + model.nq + model.nv + model.na
         for column, actuator in enumerate(self.actuators):
             index = named(model, "actuator", actuator, "actuator")
             address, samples = int(model.actuator_historyadr[index]), int(model.actuator_history[index, 0])
             if address < 0:
                 continue
+            self._check_history(actuator, samples, float(timestep.min()))
             block = states[:, start + address : start + address + 2 + 2 * samples]
             block[:, 0], block[:, 1] = 0.0, samples - 1
-            block[:, 2 : 2 + samples] = states[:, :1] + np.arange(-samples, 0) * np.asarray(timestep)[:, None]
+            block[:, 2 : 2 + samples] = states[:, :1] + np.arange(-samples, 0) * timestep[:, None]
             for lane, past in enumerate(actions):
                 tail = past[-samples:, column]
                 block[lane, 2 + samples :] = np.concatenate([np.full(samples - len(tail), tail[0]), tail])
         return states
+
+    def _check_history(self, actuator: str, samples: int, timestep: float) -> None:
+        longest = max(
+            (p.high for p in self.parameters if f"actuator:{actuator}.delay" in p.targets), default=0.0
+        )
+        if longest > (samples - 1) * timestep * (1 + 1e-9):
+            raise ValueError(
+                f"actuator:{actuator}.delay: {longest:g} s do not fit the history of {samples} physics steps of "
+                f"{timestep:g} s; set the model's timestep no longer than the log's"
+            )
+
+
+def _mean(values: FloatArray, members: list[int]) -> float:
+    return float(values[members[0]] if len(members) == 1 else np.mean(values[members]))
+
+
+def _check_sensors(model: Any, channels: Sequence[Channel]) -> None:
+    """Raises TargetError for sensors that do not read the present state, which no window could start from."""
+    for channel in channels:
+        match = _CHANNEL.match(channel.target)
+        if match and match["sensor"]:
+            sensor = named(model, "sensor", match["sensor"], f"measurement {channel.label!r}")
+            if model.sensor_delay[sensor] > 0 or model.sensor_interval[sensor, 0] > 0:
+                raise TargetError(
+                    f"measurement {channel.label!r}: sensor {match['sensor']!r} has a delay or an interval; remove it "
+                    "and shift the log instead"
+                )
+
+
+# the numbers that a target writes, where they are not its own
+_WRITES = {"kp": ("gain", "bias_position"), "kv": ("bias_velocity",), "offset": ("bias_force",)}
+
+
+def _check_conflicts(space: ParameterSpace) -> None:
+    """Raises TargetError when two targets write the same number in the same log: one would overrule the other."""
+    owners: dict[str, list[tuple[str, str | None]]] = {}
+    for parameter in space:
+        for spec in parameter.targets:
+            head, _, attribute = spec.rpartition(".")
+            if attribute == "bias":  # they add up
+                continue
+            numbers = _WRITES.get(attribute, (attribute,)) if head.startswith("actuator:") else (attribute,)
+            for number in numbers:
+                for other, log in owners.setdefault(f"{head}.{number}", []):
+                    if log is None or parameter.log is None or log == parameter.log:
+                        raise TargetError(
+                            f"parameter {parameter.name!r}: target {spec!r} writes what {other!r} writes too; keep one"
+                        )
+                owners[f"{head}.{number}"].append((parameter.name, parameter.log))
 
 
 def _single_control(model: Any, actuator: str) -> int:
@@ -289,21 +354,27 @@ def _reader(model: Any, channel: Channel) -> _Reader:
         joint = named(model, "joint", match["joint"], where)
         hinge = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
         if not hinge and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_SLIDE):
-            raise TargetError(f"{where}: joint {match['joint']!r} is neither hinge nor slide; measure it by a sensor")
+            raise TargetError(
+                f"{where}: joint {match['joint']!r} is neither hinge nor slide; measure it by a sensor"
+            )
         if match["what"] == "position":
             return _Reader(1 + int(model.jnt_qposadr[joint]), False, "rad" if hinge else "m")
         return _Reader(1 + model.nq + int(model.jnt_dofadr[joint]), False, "rad/s" if hinge else "m/s")
     sensor = named(model, "sensor", match["sensor"], where)
     size, item = int(model.sensor_dim[sensor]), int(match["item"] or 0)
     if (size > 1 and match["item"] is None) or item >= size:
-        raise TargetError(f"{where}: sensor {match['sensor']!r} has {size} components; write sensor:NAME[i], i < {size}")
+        raise TargetError(
+            f"{where}: sensor {match['sensor']!r} has {size} components; write sensor:NAME[i], i < {size}"
+        )
     return _Reader(int(model.sensor_adr[sensor]) + item, True, _sensor_unit(int(model.sensor_type[sensor])))
 
 
 def _state_column(model: Any, reader: _Reader) -> int | None:
     if not reader.derived:
         return reader.index
-    sensor = int(np.flatnonzero(model.sensor_adr == reader.index)[0]) if reader.index in model.sensor_adr else -1
+    sensor = (
+        int(np.flatnonzero(model.sensor_adr == reader.index)[0]) if reader.index in model.sensor_adr else -1
+    )
     kind, joint = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
     if sensor >= 0 and kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
         return 1 + int(model.jnt_qposadr[joint])
@@ -335,7 +406,9 @@ def _bias_channels(channels: Sequence[Channel], name: str) -> list[int]:
 def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Channel]) -> Parameter:
     """The parameter with the unit and the default that the model gives it."""
     if not parameter.targets:
-        raise TargetError(f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass")
+        raise TargetError(
+            f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass"
+        )
     units, values = [], []
     for spec in parameter.targets:
         match = _BIAS.match(spec)
@@ -345,7 +418,9 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
                 names = [c.label for c in channels]
                 close = difflib.get_close_matches(match.group(1), names, 1)
                 hint = f"did you mean {close[0]!r}?" if close else f"measured are {names}"
-                raise TargetError(f"parameter {parameter.name!r}: target {spec!r} names no measured sensor or channel; {hint}")
+                raise TargetError(
+                    f"parameter {parameter.name!r}: target {spec!r} names no measured sensor or channel; {hint}"
+                )
             units.append(channels[found[0]].unit)
             values.append(0.0)
         else:

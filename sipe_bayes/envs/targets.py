@@ -4,7 +4,8 @@ A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's option
 model and returns a ``Target`` that knows its unit, its present value and how to write another one into any copy of
 that model. Writing is always relative to the model the target was bound to, so it may be repeated in any order of
 values. Mass scales the inertia with it; an inertia component is set in the body's own frame, about its centre of
-mass, and must stay physical: no principal moment may exceed the sum of the other two.
+mass, and must stay physical: no principal moment may exceed the sum of the other two. Several inertia components of
+a body compose, each leaving the others as they stand; ``restore_inertia`` brings back the model's own before them.
 """
 
 from __future__ import annotations
@@ -106,7 +107,9 @@ def _scalar_joint(model: Any, joint: int, spec: str) -> int:
 def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) -> Callable[..., Target]:
     def make(model: Any, spec: str, joint: int, attribute: str) -> Target:
         start = int(model.jnt_dofadr[joint])
-        size = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(int(model.jnt_type[joint]), 1)
+        size = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(
+            int(model.jnt_type[joint]), 1
+        )
         unit = hinge_unit if _hinge(model, joint) else slide_unit
         value = float(getattr(model, field)[start])
 
@@ -135,7 +138,9 @@ def _actuator_gear(model: Any, spec: str, actuator: int, attribute: str) -> Targ
 
 def _fixed_gain(model: Any, actuator: int, spec: str) -> None:
     if int(model.actuator_gaintype[actuator]) != int(mujoco.mjtGain.mjGAIN_FIXED):
-        raise TargetError(f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)")
+        raise TargetError(
+            f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)"
+        )
 
 
 def _affine_bias(model: Any, actuator: int, spec: str) -> None:
@@ -185,7 +190,7 @@ def _actuator_kv(model: Any, spec: str, actuator: int, attribute: str) -> Target
 
 
 def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Target:
-    """A constant added to the command behind its limits and dynamics: gain * offset joins the bias force."""
+    """A constant added to the command behind its limits and dynamics: gain * offset joins the model's bias force."""
     _fixed_gain(model, actuator, spec)
     _affine_bias(model, actuator, spec)
     base = float(model.actuator_biasprm[actuator, 0])
@@ -198,6 +203,9 @@ def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Ta
 
 
 def _actuator_delay(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+    """MuJoCo reads a delayed command before it stores the present one: any delay above zero up to one physics step
+    acts as one physics step, and zero as none; beyond one step it is interpolated between steps."""
+
     def write(other: Any, value: float) -> None:
         other.actuator_delay[actuator] = value
 
@@ -213,12 +221,15 @@ def _geom_friction(slot: int, unit: str) -> Callable[..., Target]:
 
 def _body_mass(model: Any, spec: str, body: int, attribute: str) -> Target:
     mass, inertia = float(model.body_mass[body]), model.body_inertia[body].copy()
+    axes = model.body_iquat[body].copy()
     if mass <= 0:
-        raise TargetError(f"target {spec!r}: the body has no mass of its own to scale; give it one in the MJCF")
+        raise TargetError(
+            f"target {spec!r}: the body has no mass of its own to scale; give it one in the MJCF"
+        )
 
     def write(other: Any, value: float) -> None:
         other.body_mass[body] = value
-        other.body_inertia[body] = inertia * (value / mass)
+        other.body_inertia[body], other.body_iquat[body] = inertia * (value / mass), axes
 
     return Target(spec, "kg", mass, write, constants=True, minimum=0.0)
 
@@ -247,13 +258,9 @@ def _body_inertia(row: int, column: int) -> Callable[..., Target]:
         def write(other: Any, value: float) -> None:
             matrix = body_frame_inertia(other, body)
             matrix[row, column] = matrix[column, row] = value
-            if np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0:
-                moments, axes = np.diag(matrix), np.eye(3)
-            else:
-                moments, axes = np.linalg.eigh(matrix)
-                axes = axes * np.sign(np.linalg.det(axes))
-            quaternion = np.empty(4)
-            mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(axes).ravel())
+            moments, quaternion = np.diag(matrix).copy(), np.array([1.0, 0, 0, 0])
+            if np.count_nonzero(matrix - np.diag(moments)):
+                mujoco.mju_eig3(moments, np.empty(9), quaternion, np.ascontiguousarray(matrix).ravel())
             other.body_inertia[body], other.body_iquat[body] = moments, quaternion
 
         value = float(body_frame_inertia(model, body)[row, column])
@@ -261,6 +268,14 @@ def _body_inertia(row: int, column: int) -> Callable[..., Target]:
         return Target(spec, "kg m^2", value, write, order=2, constants=True, minimum=minimum)
 
     return make
+
+
+def restore_inertia(model: Any, original: Any, bodies: list[int]) -> None:
+    """Give the bodies the inertia that they have in the model ``original``."""
+    model.body_inertia[bodies], model.body_iquat[bodies] = (
+        original.body_inertia[bodies],
+        original.body_iquat[bodies],
+    )
 
 
 def check_inertia(model: Any, bodies: list[int]) -> bool:

@@ -16,6 +16,7 @@ uncertainty of the noise parameters is not propagated (see the README for the me
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,7 +27,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.least_squares import Fit, QuadraticPrior, energy_of, step
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Moments, Noise, eliminate, estimate_noise, restricted
+from sipe_bayes.noise import Moments, Noise, Pulls, eliminate, estimate_noise, restricted
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.trajectory import Trajectories
 
@@ -125,10 +126,8 @@ class Laplace(Estimator):
         """Record the optimum at the last linearisation and turn to the next starting point."""
         pull = -windows.start_precision * starts
         arrow = eliminate(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
-        flat = _FLAT_PRECISION * np.eye(len(theta))
-        evidence = restricted(
-            moments, noise, prior.precision + flat, prior.pull(theta), windows.start_precision, pull
-        ) - prior.energy(theta)
+        everything = replace(pulls(windows, prior, theta, starts, arrow.gradient), free=np.full(len(theta), True))
+        evidence = restricted(moments, noise, everything) - prior.energy(theta)
         found = {
             "theta": theta,
             "starts": starts,
@@ -228,6 +227,16 @@ def fixed_sd(windows: Windows) -> FloatArray:
     return np.array([np.nan if given[c] is None else given[c] for c in windows.channels], float)
 
 
+def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
+    """Prior and bounds at (theta, starts); ``force`` (N,): the data's pull on theta, which holds it at a bound."""
+    flat = _FLAT_PRECISION * np.eye(len(theta))
+    total = force + prior.pull(theta)
+    held = ((theta <= 0) & (total < 0)) | ((theta >= 1) & (total > 0))
+    return Pulls(
+        prior.precision + flat, prior.pull(theta), windows.start_precision, -windows.start_precision * starts, ~held
+    )
+
+
 def _noise(
     windows: Windows,
     moments: Moments,
@@ -237,19 +246,11 @@ def _noise(
     prior: QuadraticPrior,
     coloured: bool,
 ) -> Noise:
-    flat = _FLAT_PRECISION * np.eye(len(theta))
-    return estimate_noise(
-        moments,
-        before,
-        fixed_sd(windows),
-        coloured,
-        float(windows.dt.min()),
-        longest_tau(windows),
-        prior.precision + flat,
-        prior.pull(theta),
-        windows.start_precision,
-        -windows.start_precision * starts,
-    )
+    start_pull = -windows.start_precision * starts
+    arrow = eliminate(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
+    context = pulls(windows, prior, theta, starts, arrow.gradient)
+    shortest, longest = float(windows.dt.min()), longest_tau(windows)
+    return estimate_noise(moments, before, context, fixed_sd(windows), coloured, shortest, longest)
 
 
 def longest_tau(windows: Windows) -> float:

@@ -1,7 +1,8 @@
 """Markov chain Monte Carlo over theta and the noise, starts marginalised: emcee on the windowed likelihood.
 
-D. Foreman-Mackey et al. 2013, "emcee: The MCMC Hammer", PASP 125 (https://arxiv.org/abs/1202.3665); moves: differential
-evolution (ter Braak & Vrugt 2008). All walkers' proposals are simulated in one batch.
+D. Foreman-Mackey et al. 2013, "emcee: The MCMC Hammer", PASP 125 (https://arxiv.org/abs/1202.3665). Moves: an independent
+Metropolis-Hastings proposal from the widened ``laplace`` posterior (all walkers in one batch, nearly independent draws
+where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008), which finds its way where it is not.
 
 Target, with r the residual at the predicted starts x(theta), V the noise covariance and J_x the starts' Jacobian:
 
@@ -32,8 +33,8 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace import Laplace, distinct_modes, fixed_sd, longest_tau
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Windows
-from sipe_bayes.noise import Marginal, Noise
-from sipe_bayes.posterior import Particles
+from sipe_bayes.noise import Marginal, Moments, Noise, Pulls, restricted
+from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +42,7 @@ FloatArray = NDArray[np.float64]
 _BLOCK = 20  # steps of the ensemble between checkpoints
 _WARM_UP = 1 / 3  # of the chain is dropped
 _MIXED_RHAT = 1.05
-_NOISE_SPREAD = 0.1  # of the walkers' first log sigma, log tau
+_WIDER = 1.2  # of the sds of the independent proposal against laplace's
 _DRAWS = 4000  # at most kept
 _CHECKED = 16  # draws on which the linearisation is checked
 
@@ -77,33 +78,57 @@ class MCMC(Estimator):
             raise BudgetExhausted("the budget did not suffice for the first laplace fit")
         best = distinct_modes(first._state)[0]
         picked = {k: first._state[f"mode_{k}"][best] for k in ("theta", "starts", "slope", "sd", "tau")}
-        jacobian = windows.linearise(picked["theta"], picked["starts"], with_theta=False).jacobian
+        linearisation = windows.linearise(picked["theta"], picked["starts"])
+        spread = self._noise_covariance(windows, windows.moments(linearisation), picked)
         random = np.random.RandomState(self.seed)
-        walkers = self._place(windows, found, picked, random)
-        return {
+        state = {
             "done": False,
             **{f"fit_{k}": v for k, v in picked.items()},
-            "fit_jacobian": jacobian,
-            "walkers": walkers,
-            "log_prob": np.full(len(walkers), -np.inf),
-            "chain": np.empty((0, *walkers.shape)),
-            "chain_log_prob": np.empty((0, len(walkers))),
+            "fit_jacobian": np.ascontiguousarray(linearisation.jacobian[..., len(self.space) :]),
+            "proposal_weights": found.log_weights.numpy(),
+            "proposal_means": found.means.numpy(),
+            "proposal_covariances": _WIDER**2 * found.covariances.numpy(),
+            "proposal_noise": _WIDER**2 * spread,
             "accepted": 0,
+        }
+        dimensions = len(self.space) + len(spread)
+        count = self.walkers or max(24, 2 * dimensions + 2)
+        walkers = _Proposal(self, windows, state).draw(count, random)
+        return {
+            **state,
+            "walkers": walkers,
+            "log_prob": np.full(count, -np.inf),
+            "chain": np.empty((0, *walkers.shape)),
+            "chain_log_prob": np.empty((0, count)),
             **_random_state(random),
         }
 
-    def _place(
-        self, windows: Windows, found: Any, picked: dict[str, FloatArray], random: np.random.RandomState
-    ) -> FloatArray:
-        noise = self._free_noise(windows)
-        dimensions = len(self.space) + len(noise)
-        count = self.walkers or max(24, 2 * dimensions + 2)
-        generator = torch.Generator().manual_seed(self.seed)
-        theta = found.sample((count,), generator=generator).numpy()
-        logs = np.log(np.maximum(np.concatenate([picked["sd"], picked["tau"]]), 1e-300))
-        low, high = self._noise_bounds(windows, picked)
-        spread = _NOISE_SPREAD * random.standard_normal((count, len(noise)))
-        return np.concatenate([theta, np.clip(logs[noise] + spread, low[noise] + 1e-3, high[noise] - 1e-3)], axis=1)
+    def _noise_covariance(self, windows: Windows, moments: Moments, picked: dict[str, FloatArray]) -> FloatArray:
+        """Covariance of the free (log sigma, log tau): inverse curvature of the restricted likelihood at its optimum."""
+        free, held = self._free_noise(windows), (picked["theta"] <= 0) | (picked["theta"] >= 1)
+        prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
+        centre = np.log(np.maximum(np.concatenate([picked["sd"], picked["tau"]]), 1e-300))
+        channels, start_pull = len(picked["sd"]), -windows.start_precision * picked["starts"]
+        context = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
+
+        def value(x: FloatArray) -> float:
+            logs = centre.copy()
+            logs[free] += x
+            tau = np.exp(logs[channels:]) if self.likelihood.noise == "ar1" else np.zeros(channels)
+            return restricted(moments, Noise(np.exp(logs[:channels]), tau), context)
+
+        unit, step = np.eye(len(free)), 0.05
+        curvature = np.array(
+            [
+                [
+                    value(step * (a + b)) - value(step * (a - b)) - value(step * (b - a)) + value(-step * (a + b))
+                    for b in unit
+                ]
+                for a in unit
+            ]
+        )
+        moments_, axes = np.linalg.eigh(-curvature.reshape(len(free), len(free)) / (4 * step**2))
+        return (axes / np.clip(moments_, 1.0, 1e4)) @ axes.T  # sds between 0.01 and 1
 
     def _free_noise(self, windows: Windows) -> NDArray[np.int64]:
         """Which of (log sigma (C), log tau (C)) are sampled."""
@@ -127,16 +152,24 @@ class MCMC(Estimator):
 
         windows = self.windows(trajectories)
         walkers, dimensions = state["walkers"].shape
+        steps = min(_BLOCK, (self.budget - windows.rollouts) // (walkers * len(trajectories)))
+        if steps < 1:
+            raise BudgetExhausted("the next step of the chain does not fit")
+        proposal = _Proposal(self, windows, state)
         sampler = emcee.EnsembleSampler(
             walkers,
             dimensions,
             _Target(self, windows, state),
             vectorize=True,
-            moves=[(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)],
+            moves=[
+                (emcee.moves.MHMove(proposal), 0.6),
+                (emcee.moves.DEMove(), 0.3),
+                (emcee.moves.DESnookerMove(), 0.1),
+            ],
         )
         log_prob = state["log_prob"] if len(state["chain"]) else None
         begin = emcee.State(state["walkers"], log_prob=log_prob, random_state=_restore_random(state))
-        end = sampler.run_mcmc(begin, _BLOCK, skip_initial_state_check=True, progress=False)
+        end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
         random = np.random.RandomState()
         random.set_state(end.random_state)
         state = {
@@ -220,6 +253,41 @@ class MCMC(Estimator):
         difference = [float(target(p[None])[0]) - target.refreshed(p) for p in points]
         windows.rollouts, windows.budget = used, budget
         return float(np.std(difference))
+
+
+class _Proposal:
+    """Independent draws of (theta, free noise), and the log density ratio that Metropolis-Hastings needs."""
+
+    def __init__(self, owner: MCMC, windows: Windows, state: State) -> None:
+        self.n = len(owner.space)
+        self.theta = GaussianMixture(
+            state["proposal_weights"], state["proposal_means"], state["proposal_covariances"], owner.space
+        )
+        free = owner._free_noise(windows)
+        logs = np.log(np.maximum(np.concatenate([state["fit_sd"], state["fit_tau"]]), 1e-300))
+        low, high = owner._noise_bounds(windows, {k: state[f"fit_{k}"] for k in ("sd", "tau")})
+        self.centre = np.clip(logs, low + 0.1, high - 0.1)[free]
+        self.factor = np.linalg.cholesky(state["proposal_noise"]) if len(free) else np.zeros((0, 0))
+
+    def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
+        """(count, N + noise)."""
+        generator = torch.Generator().manual_seed(int(random.randint(2**31)))
+        theta = self.theta.sample((count,), generator=generator).numpy()
+        return np.concatenate(
+            [theta, self.centre + random.standard_normal((count, len(self.centre))) @ self.factor.T], axis=1
+        )
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """(count,), up to a constant."""
+        theta = self.theta.log_prob(torch.from_numpy(np.clip(points[:, : self.n], 0, 1))).numpy()
+        if not len(self.centre):
+            return theta
+        half = np.linalg.solve(self.factor, (points[:, self.n :] - self.centre).T)
+        return theta - 0.5 * (half**2).sum(0)
+
+    def __call__(self, coords: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
+        proposed = self.draw(len(coords), random)
+        return proposed, self.log_density(coords) - self.log_density(proposed)
 
 
 class _Target:

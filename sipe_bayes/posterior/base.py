@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from pyro.distributions import TorchDistribution
@@ -30,7 +31,8 @@ class NoDensityError(RuntimeError):
 def as_float64(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
     """``value`` as a finite float64 tensor of ``shape`` (None: any length); ValueError names ``name``."""
     try:
-        tensor = torch.as_tensor(value, dtype=torch.float64).detach()
+        array = value if isinstance(value, Tensor) else np.asarray(value, dtype=np.float64)
+        tensor = torch.as_tensor(array, dtype=torch.float64).detach()
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
             f"{name}: expected an array of numbers, got {type(value).__name__} ({error})"

@@ -50,7 +50,7 @@ class GaussianMixture(Posterior):
     log_weights (K,), normalised or not; means (K, N), inside the cube or not; covariances (K, N, N), positive
     definite. Components of weight zero are dropped. ``mean``, ``covariance`` and ``quantile`` are closed-form
     where every covariance is diagonal (or no component is truncated); otherwise the moments come from at
-    least 4,096 fixed-seed quasi-random points per component and the quantiles from 20,000 fixed-seed draws.
+    least 16,384 fixed-seed quasi-random points per component and the quantiles from 20,000 fixed-seed draws.
     """
 
     has_density: ClassVar[bool] = True
