@@ -211,12 +211,14 @@ class Measurement(Table):
 
 
 class LogEntry(Table):
-    """One log, or one ``span`` (start, stop) of it in seconds from its first sample."""
+    """One log, or one ``span`` (start, stop) of it in seconds from its first sample; ``window`` overrides the
+    configuration's for this log."""
 
     file: Location
     name: Text = ""
     use: Use = "train"
     span: Pair | None = None
+    window: Annotated[float | Literal["log"] | None, BeforeValidator(lambda v: None if v is None else _window(v))] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -360,6 +362,11 @@ class Config(Table):
     def logs_for(self, use: Use) -> tuple[LogEntry, ...]:
         """The logs that train, or those held out."""
         return tuple(log for log in self.logs if log.use == use)
+
+    def window_of(self, log: LogEntry) -> float | None:
+        """Seconds of a window of ``log``; None for the whole log as one."""
+        window = self.window if log.window is None else log.window
+        return None if window == "log" else window
 
     @model_validator(mode="after")
     def _check(self) -> Self:

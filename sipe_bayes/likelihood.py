@@ -41,7 +41,7 @@ class BudgetExhausted(RuntimeError):
 class Segments:
     """Multiple shooting with white or autoregressive noise.
 
-    window: seconds, or None for each log as one window. noise: "ar1" or "white". fit: names of the channels whose
+    window: seconds, or None for each log as one window; ``windows`` overrides it for logs by name. noise: "ar1" or "white". fit: names of the channels whose
     residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated.
     """
 
@@ -49,16 +49,21 @@ class Segments:
     noise: str = "ar1"
     fit: tuple[str, ...] | None = None
     noise_sd: tuple[float | None, ...] | None = None
+    windows: tuple[tuple[str, float | None], ...] = ()
 
     def __post_init__(self) -> None:
         if self.noise not in ("ar1", "white"):
             raise ValueError(f"noise: expected 'ar1' or 'white', got {self.noise!r}")
-        if self.window is not None and not self.window > 0:
+        if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
 
     def bind(self, simulator: Simulator, trajectories: Trajectories) -> Windows:
         """Cut the trajectories into windows; raises ValueError for logs that do not fit the simulator."""
-        return Windows(self, simulator, trajectories)
+        windows = Windows(self, simulator, trajectories)
+        for name, seen in zip(windows.fitted, windows.observed.any(axis=(0, 1)), strict=True):
+            if not seen:
+                raise ValueError(f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`")
+        return windows
 
 
 def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
@@ -119,7 +124,7 @@ class Windows:
         if trajectories.actions.shape[2] != environment.num_actions:
             raise ValueError(f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}")
         self.channels = self._fitted(environment.channels)
-        self._cut(trajectories, settings.window)
+        self._cut(trajectories)
         self._read_samples(trajectories)
 
     def _fitted(self, names: SequenceOf[str]) -> list[int]:
@@ -129,9 +134,15 @@ class Windows:
             raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
         return [list(names).index(n) for n in fit]
 
-    def _cut(self, trajectories: Trajectories, window: float | None) -> None:
-        pieces = []
+    @property
+    def fitted(self) -> list[str]:
+        """Names of the C fitted channels."""
+        return [self.simulator.environment.channels[c] for c in self.channels]
+
+    def _cut(self, trajectories: Trajectories) -> None:
+        pieces, overrides = [], dict(self.settings.windows)
         for k, trajectory in enumerate(trajectories):
+            window = overrides.get(trajectory.name, self.settings.window)
             steps = len(trajectory) if window is None else max(1, round(window / trajectory.dt))
             if window is not None and steps > len(trajectory):
                 raise ValueError(
@@ -153,8 +164,6 @@ class Windows:
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
         self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
-        if not self.observed.any(axis=(0, 1)).all():
-            raise ValueError("trajectories: a fitted channel has no sample at all; leave it out of `fit`")
         self.actions = trajectories.actions[self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)][:, :-1]
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
         guesses = [estimate_states(simulator, t) for t in trajectories]

@@ -357,9 +357,10 @@ def _check_length(config: Config, log: LogEntry, grid: _Grid, time: FloatArray) 
             f"log {log.name!r}: {len(time)} samples in {duration:g} s leave a {1 / grid.dt:g} Hz grid empty; "
             "choose a `span` without the pause, or correct the time unit"
         )
-    if config.window != "log" and duration < config.window - grid.dt / 2:
+    window = config.window_of(log)
+    if window is not None and duration < window - grid.dt / 2:
         raise LogError(
-            f"log {log.name!r}: lasts {duration:g} s, shorter than a window of {config.window:g} s; "
+            f"log {log.name!r}: lasts {duration:g} s, shorter than a window of {window:g} s; "
             "lower `window` or use a longer log"
         )
 

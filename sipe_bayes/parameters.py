@@ -22,12 +22,13 @@ FloatArray = NDArray[np.float64]
 class Parameter:
     """One unknown of a simulator.
 
-    name: unique within its space. low, high: bounds in ``unit``. default: the model's own value, if it has one
-    within the bounds. scale: how theta in [0, 1] maps to the value. targets: what the value is written to, in the
-    words of the environment. relative: until the environment has filled in the model's own value, the bounds are
-    factors of it; several targets then keep their proportions. log: set when the value holds for that log alone (a nuisance parameter).
-    prior_mean, prior_sd: a normal prior in ``unit`` truncated to the bounds; without them the prior is uniform
-    in theta. On a log scale the normal is one of the logarithm, with relative sd ``prior_sd / prior_mean``.
+    name: unique within its space. low, high: bounds in ``unit``. default: the model's own value, if it has
+    one within the bounds. scale: how theta in [0, 1] maps to the value. targets: what the value is written
+    to, in the words of the environment. relative: until the environment has filled in the model's own value,
+    the bounds are factors of it; several targets then keep their proportions. log: set when the value holds
+    for that log alone (a nuisance parameter). prior_mean, prior_sd: a normal prior in ``unit`` truncated to
+    the bounds; without them the prior is uniform in theta. On a log scale the normal is one of the logarithm,
+    with relative sd ``prior_sd / prior_mean``.
     """
 
     name: str
@@ -51,13 +52,15 @@ class Parameter:
             raise ValueError(f"{where}: bounds must be finite, got [{self.low}, {self.high}]")
         if self.low >= self.high:
             raise ValueError(
-                f"{where}: bounds are reversed or empty, got [{self.low:g}, {self.high:g}]; give [low, high] with low < high"
+                f"{where}: bounds are reversed or empty, got [{self.low:g}, {self.high:g}]; "
+                "give [low, high] with low < high"
             )
         if self.scale not in ("linear", "log"):
             raise ValueError(f"{where}: scale must be 'linear' or 'log', got {self.scale!r}")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(
-                f"{where}: a log scale needs bounds above zero, got low = {self.low:g}; raise it or use scale = 'linear'"
+                f"{where}: a log scale needs bounds above zero, got low = {self.low:g}; "
+                "raise it or use scale = 'linear'"
             )
         if self.default is not None and not self.low <= self.default <= self.high:
             raise ValueError(
@@ -132,7 +135,7 @@ class ParameterSpace(Sequence[Parameter]):
     def units(self) -> tuple[str, ...]:
         return tuple(p.unit for p in self._parameters)
 
-    def index(self, name: str, *_: Any) -> int:  # type: ignore[override]
+    def index(self, name: str, *_: Any) -> int:
         """Position of the parameter called ``name``."""
         try:
             return self.names.index(name)

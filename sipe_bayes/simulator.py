@@ -1,11 +1,11 @@
 """The one batch engine: many parameter values, many lanes, native threads, on ``mujoco.rollout``.
 
-Every model runs with MuJoCo's warm start disabled, so the state is Markov: a lane's bits depend on its own theta,
-start and actions alone, whatever the threads, the batch or what ran before. A rollout that diverges is data: MuJoCo
-resets such a lane and ``mujoco.rollout`` repeats its last state, which shows as a time that is not t0 + k dt; ``valid``
-is False from the first such sample on. A step that raised any other warning (out of contact memory, singular inertia)
-is the one before the first repeated state. MuJoCo's own messages are held back meanwhile: nothing on the terminal, no
-MUJOCO_LOG.TXT; ``Simulator.diverged`` counts the lanes.
+Every model runs with MuJoCo's warm start disabled, so the state is Markov: a lane's bits depend on its own
+theta, start and actions alone, whatever the threads, the batch or what ran before. A rollout that diverges is
+data: MuJoCo resets such a lane and ``mujoco.rollout`` repeats its last state, which shows as a time that is
+not t0 + k dt; ``valid`` is False from the first such sample on. A step that raised any other warning (out of
+contact memory, singular inertia) is the one before the first repeated state. MuJoCo's own messages are held
+back meanwhile: nothing on the terminal, no MUJOCO_LOG.TXT; ``Simulator.diverged`` counts the lanes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged
 
 
 class _Quiet:
-    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the GIL."""
+    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the
+    GIL."""
 
     def __init__(self) -> None:
         self._lock, self._inside, self._before = threading.Lock(), 0, mujoco.MjLogConfig.get()
@@ -76,7 +77,7 @@ class Simulator:
         self.num_threads = num_threads or os.cpu_count() or 1
         self.model = environment.compile()
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
-        self.model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET  # divergence must show
+        self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show
         self.diverged = 0
         self.control_steps = 0
         self._pool: list[Any] = []
@@ -84,6 +85,7 @@ class Simulator:
         self._scratch = mujoco.MjData(self.model)
         self._datas = [mujoco.MjData(self.model) for _ in range(self.num_threads)]
         self._physical: list[bool] = []
+        self._biases: list[FloatArray] = []
 
     @property
     def space(self) -> ParameterSpace:
@@ -101,8 +103,8 @@ class Simulator:
         return state
 
     def physics_steps(self, dt: float) -> tuple[int, float]:
-        """How many physics steps make one control step of ``dt`` seconds, and how long each is; never longer than the
-        model's own."""
+        """How many physics steps make one control step of ``dt`` seconds, and how long each is; never longer
+        than the model's own."""
         steps = max(1, math.ceil(dt / self.model.opt.timestep - 1e-3))
         return steps, dt / steps
 
@@ -117,11 +119,12 @@ class Simulator:
     ) -> Trajectories:
         """Open loop, whole horizon.
 
-        theta (B, N), actions (B, T, A) and initial_state (B, S), each also with B = 1 for all lanes; dt: seconds per
-        control step, (B,) or one number, default the model's timestep; logs: the log that each lane belongs to, for
-        parameters that differ between logs. Returns Trajectories with observations, states and ``valid``. A lane whose
-        parameters are unphysical or whose start is not finite is never simulated: NaN, and not valid from sample 0.
-        Raises ValueError for shapes that do not fit, theta outside the unit cube, or actions that are not finite.
+        theta (B, N), actions (B, T, A) and initial_state (B, S), each also with B = 1 for all lanes; dt:
+        seconds per control step, (B,) or one number, default the model's timestep; logs: the log that each
+        lane belongs to, for parameters that differ between logs. Returns Trajectories with observations,
+        states and ``valid``. A lane whose parameters are unphysical or whose start is not finite is never
+        simulated: NaN, and not valid from sample 0. Raises ValueError for shapes that do not fit, theta
+        outside the unit cube, or actions that are not finite.
         """
         theta, actions, initial_state = self._check(theta, actions, initial_state, allow_outside)
         batch = max(len(theta), len(actions), len(initial_state))
@@ -129,20 +132,20 @@ class Simulator:
         theta, actions, initial_state = (
             np.broadcast_to(a, (batch, *a.shape[1:])) for a in (theta, actions, initial_state)
         )
-        steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(d) for d in dts), strict=True))
+        steps, timesteps = (
+            np.array(x) for x in zip(*(self.physics_steps(d) for d in dts.tolist()), strict=True)
+        )
         horizon = actions.shape[1]
         states = np.empty((batch, horizon + 1, self.state_size))
         observations = np.empty((batch, horizon + 1, len(self.environment.channels)))
-        good = np.empty((batch, horizon + 1), bool)
-        for skip in np.unique(steps):
-            group = np.flatnonzero(steps == skip)
-            for chunk in np.array_split(
-                group, math.ceil(len(group) / self._lanes_at_once(horizon * int(skip)))
-            ):
-                lanes, biases = self._models(theta[chunk], timesteps[chunk], [names[i] for i in chunk])
-                out = self._run(int(skip), lanes, timesteps[chunk], actions[chunk], initial_state[chunk])
-                states[chunk], observations[chunk], good[chunk] = out[0], out[1] + biases[:, None], out[2]
-        valid = np.logical_and.accumulate(good, axis=1)
+        sound = np.empty((batch, horizon + 1), bool)
+        with _quiet():
+            for skip, chunk in self._chunks(steps, horizon):
+                lanes = self._models(theta[chunk], timesteps[chunk], [names[i] for i in chunk])
+                states[chunk], observations[chunk], sound[chunk] = self._run(
+                    skip, lanes, timesteps[chunk], actions[chunk], initial_state[chunk]
+                )
+        valid = np.logical_and.accumulate(sound, axis=1)
         self.diverged += int((~valid[:, -1]).sum())
         self.control_steps += batch * horizon
         length = np.full(batch, horizon)
@@ -176,7 +179,8 @@ class Simulator:
         sizes = {len(theta), len(actions), len(initial_state)} - {1}
         if len(sizes) > 1:
             raise ValueError(
-                f"batch sizes differ: theta {len(theta)}, actions {len(actions)}, initial_state {len(initial_state)}"
+                f"batch sizes differ: theta {len(theta)}, actions {len(actions)}, "
+                f"initial_state {len(initial_state)}"
             )
         return theta, actions, initial_state
 
@@ -190,45 +194,50 @@ class Simulator:
             )
         if not (np.isfinite(dts) & (dts > 0)).all():
             raise ValueError(f"dt: expected seconds above zero, got {float(dts.min()):g}")
-        names = [None] * batch if logs is None else list(logs)
+        names: list[str | None] = [None] * batch if logs is None else list(logs)
         if len(names) != batch:
             raise ValueError(f"logs: expected {batch} names, one for each lane, got {len(names)}")
         return np.broadcast_to(dts, (batch,)), names
 
-    def _lanes_at_once(self, physics_steps: int) -> int:
-        """How many lanes fit the memory that ``_CHUNK`` and ``_POOL`` allow."""
-        width = (physics_steps + 1) * (self.state_size + self.model.nsensordata + self.model.nu)
-        return max(self.num_threads, min(_CHUNK // width, _POOL // mujoco.mj_sizeModel(self.model)))
+    def _chunks(self, steps: NDArray[np.int64], horizon: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
+        """Lanes with as many physics ``steps`` (B,) per control step, no more than the memory set aside holds."""
+        for skip in np.unique(steps).tolist():
+            group = np.flatnonzero(steps == skip)
+            width = (horizon * skip + 1) * (self.state_size + self.model.nsensordata + self.model.nu)
+            most = max(self.num_threads, min(_CHUNK // width, _POOL // mujoco.mj_sizeModel(self.model)))
+            for chunk in np.array_split(group, math.ceil(len(group) / most)):
+                yield skip, chunk
 
     def _models(
         self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]
-    ) -> tuple[NDArray[np.int64], FloatArray]:
-        """Which pooled model each lane uses, written in place, and the lanes' sensor bias (B, O)."""
-        lanes, index, biases = np.empty(len(theta), int), {}, []
-        for lane, (row, timestep) in enumerate(zip(theta, timesteps.tolist(), strict=True)):
-            key = row.tobytes() + timestep.hex().encode() + str(logs[lane]).encode()
+    ) -> NDArray[np.int64]:
+        """Which pooled model each lane uses, written in place."""
+        index: dict[bytes, int] = {}
+        lanes = np.empty(len(theta), int)
+        for lane, (row, timestep, log) in enumerate(zip(theta, timesteps.tolist(), logs, strict=True)):
+            key = row.tobytes() + timestep.hex().encode() + str(log).encode()
             if key not in index:
                 index[key] = len(index)
-                # a row at a time: vectorised exponentials differ in their last bit with the length of the batch
-                values = np.array([p.value(t) for p, t in zip(self.space, row.tolist(), strict=True)])
-                self._write(index[key], key, values, timestep, logs[lane])
-                biases.append(self.environment.bias(values, logs[lane]))
+                self._write(index[key], key, row, timestep, log)
             lanes[lane] = index[key]
-        return lanes, np.stack(biases)[lanes]
+        return lanes
 
-    def _write(self, slot: int, key: bytes, values: FloatArray, timestep: float, log: str | None) -> None:
+    def _write(self, slot: int, key: bytes, theta: FloatArray, timestep: float, log: str | None) -> None:
         if slot == len(self._pool):
             self._pool.append(copy.copy(self.model))
             self._keys.append(b"")
             self._physical.append(False)
+            self._biases.append(np.zeros(len(self.environment.channels)))
         if self._keys[slot] == key:
             return
         model, self._keys[slot] = self._pool[slot], b""
+        # a number at a time: the last bit of a vectorised exponential may depend on the length of the batch
+        values = np.array([p.value(t) for p, t in zip(self.space, theta.tolist(), strict=True)])
         self._physical[slot] = self.environment.write(model, values, log)
+        self._biases[slot] = self.environment.bias(values, log)
         model.opt.timestep = timestep
         if self._physical[slot] and self.environment.needs_constants:
-            with _quiet():
-                mujoco.mj_setConst(model, self._scratch)
+            mujoco.mj_setConst(model, self._scratch)
         self._keys[slot] = key
 
     def _run(
@@ -239,7 +248,7 @@ class Simulator:
         actions: FloatArray,
         initial_state: FloatArray,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """States (B, T+1, S), observations (B, T+1, O) without bias and which samples (B, T+1) are sound."""
+        """States (B, T+1, S), observations (B, T+1, O) and which samples (B, T+1) are sound."""
         environment, (batch, horizon, _) = self.environment, actions.shape
         states = np.full((batch, horizon + 1, self.state_size), np.nan)
         observations = np.full((batch, horizon + 1, len(environment.channels)), np.nan)
@@ -249,28 +258,32 @@ class Simulator:
             return states, observations, sound
         start = initial_state[run]
         controls = np.repeat(environment.control(self.model, start, actions[run]), skip, axis=1)
-        # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one shows it.
-        # Sensordata belongs to the state before the step, so the last sample's comes with the next step as well.
+        # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one
+        # shows it. Sensordata belongs to the state before the step, so the last sample's comes with the next
+        # step as well.
         if environment.needs_derived or (horizon * skip == 1 and not start[:, 0].all()):
             controls = np.concatenate([controls, controls[:, -1:]], axis=1)
-        with _quiet():
-            out, sensors = mujoco.rollout.rollout(
-                [self._pool[k] for k in lanes[run]],
-                self._datas,
-                initial_state=start,
-                control=controls,
-                persistent_pool=True,
-            )
+        out, sensors = mujoco.rollout.rollout(
+            [self._pool[k] for k in lanes[run]],
+            self._datas,
+            initial_state=start,
+            control=controls,
+            persistent_pool=True,
+        )
         kept = np.concatenate([start[:, None], out[:, skip - 1 : horizon * skip : skip]], axis=1)
         derived = sensors[:, ::skip][:, : horizon + 1] if environment.needs_derived else None
-        states[run], observations[run] = kept, environment.observe(self.model, kept, derived)
+        biases = np.stack([self._biases[k] for k in lanes[run]])
+        states[run], observations[run] = (
+            kept,
+            environment.observe(self.model, kept, derived) + biases[:, None],
+        )
         sound[run] = _sound(kept, out, skip, timesteps[run, None], environment.needs_derived)
         return states, observations, sound
 
 
 def _sound(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:
-    """Which samples ``kept`` (B, T+1, S) of the physics steps ``out`` (B, P, S) are neither reset, repeated nor huge;
-    with ``derived`` the step that filled their sensordata must have been as well."""
+    """Which samples ``kept`` (B, T+1, S) of the physics steps ``out`` (B, P, S) are neither reset, repeated
+    nor huge; with ``derived`` the step that filled their sensordata must have been as well."""
     count = kept.shape[1]
     expected = kept[:, :1, 0] + np.arange(count) * skip * timestep
     sound = (np.abs(kept[..., 0] - expected) < _TIME_TOLERANCE * timestep) & (np.abs(kept) <= _HUGE).all(-1)

@@ -1,8 +1,8 @@
 """Recorded or simulated motion: one ``Trajectory``, or a padded batch ``Trajectories``.
 
-Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state); dt in seconds. Action t
-is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``: masked, never
-invented.
+Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state); dt in seconds.
+Action t is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``:
+masked, never invented.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class Trajectory:
         actions = np.asarray(self.actions, dtype=np.float64)
         if observations.ndim != 2 or actions.ndim != 2 or len(observations) != len(actions) + 1:
             raise ValueError(
-                f"{label}: expected observations (T+1, O) and actions (T, A), got {observations.shape} and {actions.shape}"
+                f"{label}: expected observations (T+1, O) and actions (T, A), "
+                f"got {observations.shape} and {actions.shape}"
             )
         if not len(actions):
             raise ValueError(f"{label}: expected at least one control step, got none")
@@ -71,7 +72,7 @@ class Trajectory:
     @property
     def time(self) -> FloatArray:
         """Sample times (T+1,) in seconds from the start."""
-        return np.arange(len(self) + 1) * self.dt
+        return np.arange(len(self) + 1, dtype=np.float64) * self.dt
 
     def slice(self, start: int, stop: int) -> Trajectory:
         """Control steps start..stop, with both end samples; 0 <= start < stop <= T."""
@@ -92,11 +93,12 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Trajectories(Sequence[Trajectory]):
-    """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,), length (B,).
+    """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,),
+    length (B,).
 
-    Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first sample
-    of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index gives a
-    Trajectory, a slice or an array of them Trajectories that keep ``valid``.
+    Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first
+    sample of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index
+    gives a Trajectory, a slice or an array of them Trajectories that keep ``valid``.
     """
 
     observations: FloatArray

@@ -433,10 +433,19 @@ def _pair_frame(ax: Axes, parameters: tuple[Parameter, Parameter], i: int, j: in
 
 
 def _axis_name(parameter: Parameter, length: int) -> str:
-    """Name, log of a nuisance parameter and unit, each on its own line."""
+    """Name, log of a nuisance parameter and unit, each on lines of its own."""
     name, bracket, log = parameter.name.partition("[")
-    unit = f"\n[{unit_text(parameter.unit)}]" if parameter.unit else ""
-    return _short(name, length) + (f"\n{_short(bracket + log, length)}" if bracket else "") + unit
+    unit = unit_text(parameter.unit)
+    parts = [_wrapped(name, length), _wrapped(bracket + log, length), f"[{unit}]" if unit else ""]
+    return "\n".join(part for part in parts if part)
+
+
+def _wrapped(name: str, length: int) -> str:
+    """``name`` on at most two lines, broken after an underscore where one comes late enough."""
+    if len(name) <= length:
+        return name
+    cut = name.rfind("_", length // 3, length) + 1 or length
+    return f"{name[:cut]}\n{_short(name[cut:], length)}"
 
 
 # Signals
@@ -572,7 +581,9 @@ def _error(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
     _window_ticks(ax, signal, 0.1)
     shown = np.abs(error[(signal.time >= span[0]) & (signal.time <= span[1]) & np.isfinite(error)])
     if len(shown) and shown.max() > 0:
-        ax.set_ylim(-1.2 * shown.max(), 1.2 * shown.max())
+        band = np.nanmax(np.abs([signal.low - signal.mode, signal.high - signal.mode]), initial=0.0)
+        reach = 1.2 * max(shown.max(), min(band, 3 * shown.max()))
+        ax.set_ylim(-reach, reach)
     _ticks(ax.yaxis, 2)
 
 

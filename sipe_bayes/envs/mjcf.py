@@ -1,7 +1,7 @@
 """The user's own MJCF as an Environment: which actuators the log drives and which quantities it measures.
 
-Observations are read aligned: joint positions and velocities from the state itself, sensors from the sensordata that
-belongs to that state (MuJoCo's own belong to the state one physics step earlier).
+Observations are read aligned: joint positions and velocities from the state itself, sensors from the
+sensordata that belongs to that state (MuJoCo's own belong to the state one physics step earlier).
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True)
 class Channel:
-    """One measured quantity. target: ``joint:NAME.position``, ``joint:NAME.velocity`` or ``sensor:NAME[i]``."""
+    """One measured quantity. target: ``joint:NAME.position``, ``joint:NAME.velocity`` or
+    ``sensor:NAME[i]``."""
 
     target: str
     name: str = ""
@@ -101,8 +102,9 @@ class MjcfEnvironment(Environment):
     ) -> MjcfEnvironment:
         """Check everything against the model and fill in units and defaults.
 
-        parameters: their ``targets`` name what they write; several targets of one parameter are all set to its value,
-        or, where it is ``relative``, keep their proportions. Raises ModelError, TargetError or ValueError.
+        parameters: their ``targets`` name what they write; several targets of one parameter are all set to
+        its value, or, where it is ``relative``, keep their proportions. Raises ModelError, TargetError or
+        ValueError.
         """
         channels = tuple(c if isinstance(c, Channel) else Channel(c) for c in measurements)
         model = compile_spec(load_spec(str(source)), str(source))
@@ -138,8 +140,8 @@ class MjcfEnvironment(Environment):
         return any(r.derived for r in self._readers)
 
     def spec(self) -> Any:
-        """A fresh MjSpec, with a command history for each actuator whose delay is a parameter, and without MuJoCo's
-        short cut for bodies whose centre of mass lies in their origin where that may change."""
+        """A fresh MjSpec, with a command history for each actuator whose delay is a parameter, and without
+        MuJoCo's short cut for bodies whose centre of mass lies in their origin where that may change."""
         spec = load_spec(self.source)
         timestep = spec.option.timestep
         for parameter in self.parameters:
@@ -292,8 +294,8 @@ class MjcfEnvironment(Environment):
         )
         if longest > (samples - 1) * timestep * (1 + 1e-9):
             raise ValueError(
-                f"actuator:{actuator}.delay: {longest:g} s do not fit the history of {samples} physics steps of "
-                f"{timestep:g} s; set the model's timestep no longer than the log's"
+                f"actuator:{actuator}.delay: {longest:g} s do not fit the history of {samples} physics steps "
+                f"of {timestep:g} s; set the model's timestep no longer than the log's"
             )
 
 
@@ -309,8 +311,8 @@ def _check_sensors(model: Any, channels: Sequence[Channel]) -> None:
             sensor = named(model, "sensor", match["sensor"], f"measurement {channel.label!r}")
             if model.sensor_delay[sensor] > 0 or model.sensor_interval[sensor, 0] > 0:
                 raise TargetError(
-                    f"measurement {channel.label!r}: sensor {match['sensor']!r} has a delay or an interval; remove it "
-                    "and shift the log instead"
+                    f"measurement {channel.label!r}: sensor {match['sensor']!r} has a delay or an interval; "
+                    "remove it and shift the log instead"
                 )
 
 
@@ -319,7 +321,8 @@ _WRITES = {"kp": ("gain", "bias_position"), "kv": ("bias_velocity",), "offset": 
 
 
 def _check_conflicts(space: ParameterSpace) -> None:
-    """Raises TargetError when two targets write the same number in the same log: one would overrule the other."""
+    """Raises TargetError when two targets write the same number in the same log: one would overrule the
+    other."""
     owners: dict[str, list[tuple[str, str | None]]] = {}
     for parameter in space:
         for spec in parameter.targets:
@@ -331,7 +334,8 @@ def _check_conflicts(space: ParameterSpace) -> None:
                 for other, log in owners.setdefault(f"{head}.{number}", []):
                     if log is None or parameter.log is None or log == parameter.log:
                         raise TargetError(
-                            f"parameter {parameter.name!r}: target {spec!r} writes what {other!r} writes too; keep one"
+                            f"parameter {parameter.name!r}: target {spec!r} writes what parameter {other!r} "
+                            "writes too; keep one"
                         )
                 owners[f"{head}.{number}"].append((parameter.name, parameter.log))
 
@@ -348,7 +352,8 @@ def _reader(model: Any, channel: Channel) -> _Reader:
     match = _CHANNEL.match(channel.target)
     if not match:
         raise TargetError(
-            f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, sensor:NAME[i]"
+            f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, "
+            "sensor:NAME[i]"
         )
     if match["joint"]:
         joint = named(model, "joint", match["joint"], where)
@@ -398,7 +403,8 @@ def _sensor_unit(kind: int) -> str:
 
 
 def _bias_channels(channels: Sequence[Channel], name: str) -> list[int]:
-    """The channels that ``sensor:NAME.bias`` shifts: those called NAME, or those that read the sensor NAME."""
+    """The channels that ``sensor:NAME.bias`` shifts: those called NAME, or those that read the sensor
+    NAME."""
     sensor = re.compile(rf"^sensor:{re.escape(name)}(\[\d+\])?$")
     return [k for k, c in enumerate(channels) if c.label == name or sensor.match(c.target)]
 
@@ -419,7 +425,8 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
                 close = difflib.get_close_matches(match.group(1), names, 1)
                 hint = f"did you mean {close[0]!r}?" if close else f"measured are {names}"
                 raise TargetError(
-                    f"parameter {parameter.name!r}: target {spec!r} names no measured sensor or channel; {hint}"
+                    f"parameter {parameter.name!r}: target {spec!r} names no measured sensor or channel; "
+                    f"{hint}"
                 )
             units.append(channels[found[0]].unit)
             values.append(0.0)
@@ -433,8 +440,8 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
     if parameter.relative and parameter.default is None:
         if not values[0]:
             raise TargetError(
-                f"parameter {parameter.name!r}: {parameter.targets[0]} is 0 in the model, so a factor of it says nothing; "
-                "give absolute bounds"
+                f"parameter {parameter.name!r}: {parameter.targets[0]} is 0 in the model, so a factor of it "
+                "says nothing; give absolute bounds"
             )
         low, high = sorted((parameter.low * values[0], parameter.high * values[0]))
         mean, sd = parameter.prior_mean, parameter.prior_sd

@@ -1,11 +1,13 @@
-"""What a parameter may change in a MuJoCo model: targets such as ``"body:rod.mass"``, read and written in place.
+"""What a parameter may change in a MuJoCo model: targets such as ``"body:rod.mass"``, read and written in
+place.
 
-A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's options). ``bind`` looks it up in a compiled
-model and returns a ``Target`` that knows its unit, its present value and how to write another one into any copy of
-that model. Writing is always relative to the model the target was bound to, so it may be repeated in any order of
-values. Mass scales the inertia with it; an inertia component is set in the body's own frame, about its centre of
-mass, and must stay physical: no principal moment may exceed the sum of the other two. Several inertia components of
-a body compose, each leaving the others as they stand; ``restore_inertia`` brings back the model's own before them.
+A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's options). ``bind`` looks it up in a
+compiled model and returns a ``Target`` that knows its unit, its present value and how to write another one
+into any copy of that model. Writing is always relative to the model the target was bound to, so it may be
+repeated in any order of values. Mass scales the inertia with it; an inertia component is set in the body's
+own frame, about its centre of mass, and must stay physical: no principal moment may exceed the sum of the
+other two. Several inertia components of a body compose, each leaving the others as they stand;
+``restore_inertia`` brings back the model's own before them.
 """
 
 from __future__ import annotations
@@ -39,8 +41,9 @@ class TargetError(ValueError):
 
 @dataclass(frozen=True)
 class Target:
-    """One number of a compiled model. ``order``: writes with a smaller order come first. ``constants``: MuJoCo's
-    derived constants depend on it, so mj_setConst follows a write. ``minimum``: the smallest physical value."""
+    """One number of a compiled model. ``order``: writes with a smaller order come first. ``constants``:
+    MuJoCo's derived constants depend on it, so mj_setConst follows a write. ``minimum``: the smallest
+    physical value."""
 
     spec: str
     unit: str
@@ -69,7 +72,8 @@ def split(spec: str) -> tuple[str, str, str]:
     match = _PATTERN.match(spec)
     if not match:
         raise TargetError(
-            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {sorted(_OBJECTS)}, or option.ATTRIBUTE"
+            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {sorted(_OBJECTS)}, "
+            "or option.ATTRIBUTE"
         )
     kind, name, option, attribute = match.groups()
     return (option or kind, name or "", attribute)
@@ -190,7 +194,8 @@ def _actuator_kv(model: Any, spec: str, actuator: int, attribute: str) -> Target
 
 
 def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Target:
-    """A constant added to the command behind its limits and dynamics: gain * offset joins the model's bias force."""
+    """A constant added to the command behind its limits and dynamics: gain * offset joins the model's bias
+    force."""
     _fixed_gain(model, actuator, spec)
     _affine_bias(model, actuator, spec)
     base = float(model.actuator_biasprm[actuator, 0])
@@ -203,8 +208,8 @@ def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Ta
 
 
 def _actuator_delay(model: Any, spec: str, actuator: int, attribute: str) -> Target:
-    """MuJoCo reads a delayed command before it stores the present one: any delay above zero up to one physics step
-    acts as one physics step, and zero as none; beyond one step it is interpolated between steps."""
+    """MuJoCo reads a delayed command before it stores the present one: any delay above zero up to one physics
+    step acts as one physics step, and zero as none; beyond one step it is interpolated between steps."""
 
     def write(other: Any, value: float) -> None:
         other.actuator_delay[actuator] = value

@@ -43,20 +43,31 @@ _MAX_ITERATIONS = 60
 class Laplace(Estimator):
     """Mixture of truncated normals at the optima of the windowed likelihood; see the module's docstring.
 
-    restarts: starting points followed. candidates: draws from the prior among which they are chosen.
+    restarts: starting points followed. candidates: draws from the prior among which they are chosen. initial (R, N):
+    the starting points themselves instead.
     """
 
     name: ClassVar[str] = "laplace"
     default_budget: ClassVar[int] = 5000
 
-    def __init__(self, simulator: Any, *, restarts: int = 2, candidates: int = 8, **settings: Any) -> None:
+    def __init__(
+        self,
+        simulator: Any,
+        *,
+        restarts: int = 2,
+        candidates: int = 8,
+        initial: FloatArray | None = None,
+        **settings: Any,
+    ) -> None:
         if restarts < 1 or candidates < 0:
             raise ValueError(f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}")
         super().__init__(simulator, **settings)
         self.restarts, self.candidates = restarts, candidates
+        self.initial = None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
 
     def settings(self) -> dict[str, Any]:
-        return {**super().settings(), "restarts": self.restarts, "candidates": self.candidates}
+        initial = None if self.initial is None else self.initial.tolist()
+        return {**super().settings(), "restarts": self.restarts, "candidates": self.candidates, "initial": initial}
 
     @property
     def quadratic_prior(self) -> QuadraticPrior:
@@ -66,7 +77,7 @@ class Laplace(Estimator):
 
     def start(self, trajectories: Trajectories) -> State:
         windows = self.windows(trajectories)
-        starts = screen(self, windows, trajectories)
+        starts = screen(self, windows, trajectories) if self.initial is None else self.initial
         n, w, d, c = len(self.space), windows.num_windows, windows.num_start, len(windows.channels)
         fresh = _begin(windows, starts[0])
         return {
@@ -174,6 +185,16 @@ class Laplace(Estimator):
         covariance = np.linalg.inv(state["mode_precision"][m] + prior.precision + flat)
         pull = state["mode_gradient"][m] + prior.pull(theta) + _FLAT_PRECISION * (0.5 - theta)
         return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
+
+    def information(self) -> tuple[FloatArray, FloatArray]:
+        """Optimum (N,) of the quadratic model of the data alone and its information (N, N), after ``fit``.
+
+        The optimum may lie outside the cube; along directions without information it is the best point found."""
+        if self._state is None or not len(self._state["mode_theta"]):
+            raise ValueError("information: nothing has been fitted yet; call fit first")
+        best = distinct_modes(self._state)[0]
+        precision, gradient = self._state["mode_precision"][best], self._state["mode_gradient"][best]
+        return self._state["mode_theta"][best] + np.linalg.pinv(precision, rcond=1e-12) @ gradient, precision
 
     def _cost(self, trajectories: Trajectories) -> int:
         windows = self.windows(trajectories)

@@ -1,0 +1,41 @@
+"""sipe_bayes: calibrate robot simulators with honest uncertainty.
+
+``import sipe_bayes as sipe``. Public names are imported when first used, so the import itself is instant.
+"""
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "Parameter": "sipe_bayes.parameters",
+    "ParameterSpace": "sipe_bayes.parameters",
+    "Trajectory": "sipe_bayes.trajectory",
+    "Trajectories": "sipe_bayes.trajectory",
+    "Channel": "sipe_bayes.envs.mjcf",
+    "MjcfEnvironment": "sipe_bayes.envs.mjcf",
+    "Simulator": "sipe_bayes.simulator",
+    "Segments": "sipe_bayes.likelihood",
+    "Posterior": "sipe_bayes.posterior",
+    "Dirac": "sipe_bayes.posterior",
+    "Particles": "sipe_bayes.posterior",
+    "GaussianMixture": "sipe_bayes.posterior",
+    "load_posterior": "sipe_bayes.posterior",
+    "get_estimator": "sipe_bayes.inference",
+    "load_config": "sipe_bayes.config",
+    "prepare": "sipe_bayes.calibration",
+    "calibrate": "sipe_bayes.calibration",
+}
+
+__all__ = ["__version__", *_PUBLIC]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'sipe_bayes' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

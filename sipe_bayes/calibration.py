@@ -1,0 +1,326 @@
+"""A configuration in, a calibration out: what ``sipe calibrate`` does, step by step, also from Python."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config
+from sipe_bayes.diagnostics.agreement import Disagreement, LogEstimate, disagreement
+from sipe_bayes.diagnostics.evaluate import channel_scores, fitted_residuals, signals
+from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
+from sipe_bayes.diagnostics.result import Calibration, ParameterSummary, Ridge
+from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
+from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.base import Estimator, Progress
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
+from sipe_bayes.logs import LogReport, load_log
+from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
+from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.units import find_unit
+
+FloatArray = NDArray[np.float64]
+
+_DRAWS = 4000  # of the posterior, for summaries
+_NOT_DETERMINED = 0.5  # contraction below which a parameter is not determined
+_AT_BOUND = 0.02  # of the prior's range: how near to a bound the mode counts as at it
+_FLAT_SD = 1e3  # stands for a uniform prior beside an earlier posterior
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A configuration read and bound: what an Estimator needs, and the logs behind it."""
+
+    config: Config
+    environment: MjcfEnvironment
+    simulator: Simulator
+    likelihood: Segments
+    prior: Posterior
+    train: Trajectories
+    holdout: Trajectories | None
+    reports: tuple[LogReport, ...]
+
+
+def prepare(config: Config | str | Path, num_threads: int | None = None) -> Problem:
+    """Read the model and the logs of a configuration; raises ConfigError, LogError, ModelError or TargetError."""
+    config = config if isinstance(config, Config) else load_config(config)
+    train_logs, held_logs = config.logs_for("train"), config.logs_for("holdout")
+    environment = _environment(config, train_logs)
+    dimensions = {m.target: _dimension(u) for m, u in zip(config.measurements, environment.channel_units, strict=True)}
+    dimensions = {target: d for target, d in dimensions.items() if d}
+    check_dimensions(config, dimensions)
+    read = [load_log(config, log, dimensions) for log in (*train_logs, *held_logs)]
+    trajectories = [t for t, _ in read]
+    held = trajectories[len(train_logs) :]
+    return Problem(
+        config,
+        environment,
+        Simulator(environment, num_threads),
+        _likelihood(config),
+        _prior(config, environment.space),
+        Trajectories.stack(trajectories[: len(train_logs)]),
+        Trajectories.stack(held) if held else None,
+        tuple(report for _, report in read),
+    )
+
+
+def _dimension(unit: str) -> str:
+    try:
+        return find_unit(unit).dimension
+    except ValueError:
+        return ""
+
+
+def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
+    parameters: list[Parameter] = []
+    for i, entry in enumerate(config.parameters):
+        low, high = entry.bounds or entry.factor or (0.0, 1.0)
+        try:
+            one = Parameter(
+                entry.name,
+                low,
+                high,
+                scale=entry.scale,
+                targets=entry.targets,
+                relative=entry.factor is not None,
+                prior_mean=entry.prior.mean if entry.prior else None,
+                prior_sd=entry.prior.sd if entry.prior else None,
+                description=entry.description,
+            )
+        except ValueError as error:
+            raise ConfigError(f"{config.path}: key `parameters[{i}]`: {error}") from None
+        logs = [log.name for log in train] if entry.per_log else []
+        parameters += [replace(one, name=f"{one.name}[{log}]", log=log) for log in logs] or [one]
+    channels = [Channel(m.target, m.name) for m in config.measurements]
+    try:
+        return MjcfEnvironment.build(config.model, parameters, [c.actuator for c in config.commands], channels)
+    except (TargetError, ModelError):
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{config.path}: {error}") from None
+
+
+def _likelihood(config: Config) -> Segments:
+    window = None if config.window == "log" else config.window
+    return Segments(
+        window=window,
+        noise=config.noise.model,
+        fit=tuple(m.name for m in config.measurements if m.fit),
+        noise_sd=tuple(m.noise_sd for m in config.measurements),
+        windows=tuple((log.name, config.window_of(log)) for log in config.logs if log.window is not None),
+    )
+
+
+def _prior(config: Config, space: ParameterSpace) -> Posterior:
+    """The parameters' own priors, or an earlier posterior for the parameters that it knows, matched by name."""
+    own = default_prior(space)
+    if config.prior is None:
+        return own
+    earlier = load_posterior(config.prior.source)
+    shared = [n for n in space.names if n in earlier.space.names]
+    if not shared:
+        raise ConfigError(
+            f"{config.path}: key `prior.from`: the posterior knows {list(earlier.space.names)}, none of them is asked for "
+            f"here ({list(space.names)}); rename the parameters or drop the key"
+        )
+    mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
+    covariance[np.isinf(covariance)] = _FLAT_SD**2
+    old_mean, old_covariance = (x.numpy() for x in earlier.gaussian_moments())
+    new, old = [space.index(n) for n in shared], [earlier.space.index(n) for n in shared]
+    slope, shift = np.empty(len(shared)), np.empty(len(shared))
+    for k, (i, j) in enumerate(zip(new, old, strict=True)):
+        if space[i].scale != earlier.space[j].scale:
+            raise ConfigError(
+                f"{config.path}: key `prior.from`: {space[i].name!r} was on a {earlier.space[j].scale} scale there and is on "
+                f"a {space[i].scale} scale here; use the same"
+            )
+        ends = space[i].normalise(earlier.space[j].value(np.array([0.0, 1.0])))
+        slope[k], shift[k] = ends[1] - ends[0], ends[0]
+    mean[new] = shift + slope * old_mean[old]
+    covariance[np.ix_(new, new)] = slope[:, None] * old_covariance[np.ix_(old, old)] * slope
+    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
+
+
+def calibrate(
+    problem: Problem,
+    estimator: str | None = None,
+    seed: int | None = None,
+    budget: int | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Fit, check and summarise. Estimator, seed and budget override the configuration's."""
+    config, began = problem.config, time.monotonic()
+    name = estimator or config.estimator
+    method = get_estimator(
+        problem.simulator,
+        name,
+        prior=problem.prior,
+        likelihood=problem.likelihood,
+        seed=config.seed if seed is None else seed,
+        budget=config.budget if budget is None else budget,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+    posterior = method.fit(problem.train)
+    tell = progress or (lambda *_: None)
+    tell("checking", method.rollouts, method.budget)
+    theta = posterior.mode.numpy()
+    train = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.train)
+    fitted = problem.likelihood.bind(problem.simulator, problem.train)
+    dead = dead_ranges(fitted, theta)
+    conflict = _compare_logs(problem, posterior, method.seed)
+    draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(method.seed))
+    summaries = _summaries(problem, posterior, draws, dead, conflict)
+    found = ridges(problem.environment.space, draws, [p.contraction for p in summaries])
+    bound = {"train": train}
+    if problem.holdout is not None:
+        bound["holdout"] = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.holdout)
+    scores = {use: channel_scores(w, theta) for use, w in bound.items()}
+    return Calibration(
+        name=_run_name(config),
+        estimator=name,
+        posterior=posterior,
+        prior=problem.prior,
+        parameters=summaries,
+        train=scores["train"],
+        holdout=scores.get("holdout", []),
+        warnings=_warnings(problem, method, summaries, dead, found, conflict, scores.get("holdout", [])),
+        signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
+        residuals=fitted_residuals(fitted, theta, method.diagnostics["noise_sd"], method.diagnostics["noise_tau"]),
+        ridges=found,
+        noise=_noise(fitted, method),
+        mixing=method.diagnostics.get("mixing"),
+        logs=[r.to_dict() for r in problem.reports],
+        rollouts=method.rollouts,
+        seconds=time.monotonic() - began,
+    )
+
+
+def _run_name(config: Config) -> str:
+    stem = config.path.stem
+    return config.path.resolve().parent.name if stem in ("calibrate", "config") else stem
+
+
+def _compare_logs(problem: Problem, posterior: Posterior, seed: int) -> Disagreement | None:
+    """Fit each training log by itself, from the joint mode, and compare."""
+    if len(problem.train) < 2:
+        return None
+    estimates = []
+    for trajectory in problem.train:
+        alone = Laplace(
+            problem.simulator,
+            likelihood=problem.likelihood,
+            seed=seed,
+            initial=posterior.mode.numpy(),
+            budget=10**6,
+        )
+        try:
+            alone.fit(trajectory)
+        except (ValueError, BudgetExhausted, np.linalg.LinAlgError):
+            continue
+        estimates.append(LogEstimate(trajectory.name, *alone.information()))
+    return disagreement(problem.environment.space, estimates)
+
+
+def _summaries(
+    problem: Problem,
+    posterior: Posterior,
+    draws: FloatArray,
+    dead: dict[str, list[tuple[float, float]]],
+    conflict: Disagreement | None,
+) -> list[ParameterSummary]:
+    space = problem.environment.space
+    theta = posterior.mode.numpy()
+    mode = space.values(theta)
+    prior_sd, sd = problem.prior.stddev.numpy(), posterior.stddev.numpy()
+    contraction = 1 - sd / np.maximum(prior_sd, 1e-300)
+    quantiles = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
+    rows = []
+    for j, p in enumerate(space):
+        flags = []
+        if any(low <= 0 and high >= 1 for low, high in dead.get(p.name, [])):
+            flags.append("no_effect")
+        elif p.name in dead:
+            flags.append("dead_range")
+        if contraction[j] < _NOT_DETERMINED:
+            flags.append("not_determined")
+        elif min(theta[j], 1 - theta[j]) < _AT_BOUND * min(1.0, 10 * sd[j]):
+            flags.append("at_bound")
+        if conflict is not None and conflict.parameter == p.name:
+            flags.append("disagrees")
+        if p.log is not None:
+            flags.append("nuisance")
+        rows.append(
+            ParameterSummary(
+                p.name,
+                p.unit,
+                p.targets,
+                float(draws[:, j].mean()),
+                float(draws[:, j].std()),
+                *(float(q) for q in quantiles[:, j]),
+                float(mode[j]),
+                p.default,
+                float(contraction[j]),
+                tuple(flags),
+            )
+        )
+    return rows
+
+
+def _warnings(
+    problem: Problem,
+    method: Estimator,
+    summaries: Sequence[ParameterSummary],
+    dead: dict[str, list[tuple[float, float]]],
+    found: Sequence[Ridge],
+    conflict: Disagreement | None,
+    holdout: Sequence[Any],
+) -> list[str]:
+    words = list(method.warnings)
+    if conflict is not None:
+        unit = problem.environment.space[problem.environment.space.index(conflict.parameter)].unit
+        words.append(conflict.text(unit))
+    words += [f"{ridge.text}: fix one of them at a measured value" for ridge in found]
+    in_ridge = {name for ridge in found for name in ridge.parameters}
+    for p in summaries:
+        space = problem.environment.space[problem.environment.space.index(p.name)]
+        if "no_effect" in p.flags:
+            words.append(f"{p.name} changes nothing in these logs; its posterior is its prior")
+        elif "dead_range" in p.flags:
+            ranges = ", ".join(f"{space.value(a):.4g} to {space.value(b):.4g}" for a, b in dead[p.name])
+            words.append(f"{p.name} changes nothing between {ranges} {p.unit}")
+        if "not_determined" in p.flags and "no_effect" not in p.flags and p.name not in in_ridge:
+            words.append(f"{p.name} is not determined by these logs (contraction {p.contraction:.2f})")
+        if "at_bound" in p.flags:
+            bound = space.low if p.mode - space.low < space.high - p.mode else space.high
+            words.append(f"{p.name} is at its bound {bound:.4g} {p.unit}: widen it, unless the bound is physical")
+    worse = [s for s in holdout if not s.rmse < s.rmse_default]
+    words += [
+        f"held-out {s.log}, {s.channel}: {s.rmse:.3g} {s.unit} is not better than the model as given ({s.rmse_default:.3g})"
+        for s in worse
+    ]
+    words += [f"log {r.name}: {note}" for r in problem.reports for note in r.notes if r.gaps or r.resampled]
+    return words
+
+
+def _noise(windows: Windows, method: Estimator) -> dict[str, dict[str, Any]]:
+    units = dict(zip(windows.simulator.environment.channels, _units(windows), strict=True))
+    rows = zip(windows.fitted, method.diagnostics["noise_sd"], method.diagnostics["noise_tau"], strict=True)
+    return {name: {"sd": sd, "tau": tau, "unit": units[name]} for name, sd, tau in rows}
+
+
+def _units(windows: Windows) -> tuple[str, ...]:
+    return tuple(getattr(windows.simulator.environment, "channel_units", ("",) * len(windows.channels)))

@@ -1,0 +1,111 @@
+"""Do the logs agree? Each is fitted by itself; estimates that differ by more than their uncertainty are an alarm.
+
+With m_k and L_k the optimum and information of log k (starts and its own nuisance parameters marginalised) and mu the
+combined estimate, Q = sum_k (m_k - mu)' L_k (m_k - mu) is chi-square with (K - 1) x (determined directions) degrees of
+freedom when the logs agree (Cochran's test). The parameter named is the one whose freedom to differ between logs lowers
+Q most: the most economical explanation, not merely the largest shift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from sipe_bayes.parameters import ParameterSpace
+
+FloatArray = NDArray[np.float64]
+
+LEVEL = 0.01  # false alarms where logs agree
+_DETERMINED = 12.0  # information of a uniform prior: directions with less are not tested
+
+
+@dataclass(frozen=True)
+class LogEstimate:
+    """One log by itself: mean (N,) and information (N, N) in theta."""
+
+    name: str
+    mean: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """p: of Cochran's Q under agreement; parameter: its most economical explanation; per_log: (log, value, sd) in the
+    parameter's unit."""
+
+    p: float
+    parameter: str
+    per_log: tuple[tuple[str, float, float], ...]
+
+    def text(self, unit: str) -> str:
+        """In words."""
+        parts = ", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log)
+        return (
+            f"the logs disagree about {self.parameter} (p = {self.p:.1g}): {parts} {unit}; "
+            "give it per_log = true, model what changed, or leave a log out"
+        )
+
+
+def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
+    """The disagreement of two or more logs, or None. Only parameters shared by all logs are compared."""
+    shared = [j for j, p in enumerate(space) if p.log is None]
+    if len(logs) < 2 or not shared:
+        return None
+    means = [log.mean[shared] for log in logs]
+    informations = [_marginal(log.information, shared) for log in logs]
+    q, _ = _scatter(means, informations, None)
+    total = sum(informations)
+    directions = [int((np.linalg.eigvalsh(i) > _DETERMINED).sum()) for i in [*informations, total]]
+    freedom = sum(directions[:-1]) - directions[-1]
+    if freedom < 1:
+        return None
+    p = float(scipy.stats.chi2.sf(q, freedom))
+    if p > LEVEL:
+        return None
+    gains = [q - _scatter(means, informations, j)[0] for j in range(len(shared))]
+    worst = int(np.argmax(gains))
+    values = _scatter(means, informations, worst)[1]
+    parameter = space[shared[worst]]
+    per_log = []
+    for log, (theta, sd) in zip(logs, values, strict=True):
+        slope = float(parameter.value(theta + 1e-6) - parameter.value(theta - 1e-6)) / 2e-6
+        per_log.append((log.name, float(parameter.value(theta)), sd * slope))
+    return Disagreement(p, parameter.name, tuple(per_log))
+
+
+def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
+    """Information about ``kept`` with the other parameters marginalised."""
+    other = [j for j in range(len(information)) if j not in kept]
+    block = information[np.ix_(kept, kept)]
+    if not other:
+        return block
+    cross = information[np.ix_(kept, other)]
+    ridge = 1e-9 * np.eye(len(other))
+    return block - cross @ np.linalg.solve(information[np.ix_(other, other)] + ridge, cross.T)
+
+
+def _scatter(
+    means: list[FloatArray], informations: list[FloatArray], own: int | None
+) -> tuple[float, list[tuple[float, float]]]:
+    """Smallest Q with all parameters common but ``own``, and (estimate, sd) of ``own`` in each log."""
+    n, k = len(means[0]), len(means)
+    common = [j for j in range(n) if j != own]
+    size = len(common) + (k if own is not None else 0)
+    matrix, right, square = 1e-9 * np.eye(size), np.zeros(size), 0.0
+    for i, (mean, information) in enumerate(zip(means, informations, strict=True)):
+        design = np.zeros((n, size))
+        design[common, np.arange(len(common))] = 1.0
+        if own is not None:
+            design[own, len(common) + i] = 1.0
+        matrix += design.T @ information @ design
+        right += design.T @ information @ mean
+        square += float(mean @ information @ mean)
+    covariance = np.linalg.inv(matrix)
+    solution = covariance @ right
+    q = square - float(right @ solution)
+    if own is None:
+        return q, []
+    return q, [(float(solution[len(common) + i]), float(np.sqrt(covariance[len(common) + i, len(common) + i]))) for i in range(k)]

@@ -1,0 +1,119 @@
+"""How well simulations follow logs: errors over open-loop windows, signals with their band, residuals.
+
+Windows start from the measured state (``likelihood.estimate_states``), so a held-out log needs no fit of its own; a
+parameter that differs between logs takes the mean of the calibrated ones there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.diagnostics.result import ChannelScore, Residual, Signal
+from sipe_bayes.likelihood import Windows
+from sipe_bayes.noise import Marginal, Noise, whiten
+from sipe_bayes.posterior import Posterior
+
+FloatArray = NDArray[np.float64]
+
+_BAND_DRAWS = 64
+
+
+def errors(windows: Windows, theta: FloatArray) -> FloatArray:
+    """RMSE (B, logs, C) of theta (B, N) over the windows of each log from measured starts; NaN where it diverges."""
+    starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
+    residual, valid = windows.residuals(theta, starts)
+    out = np.full((len(theta), len(windows.trajectories), len(windows.channels)), np.nan)
+    for k in range(len(windows.trajectories)):
+        mine = windows.log == k
+        count = windows.observed[mine].sum(axis=(0, 1))
+        out[:, k] = np.sqrt((residual[:, mine] ** 2).sum(axis=(1, 2)) / np.maximum(count, 1))
+        out[:, k, count == 0] = np.nan
+    out[~valid] = np.nan
+    return out
+
+
+def _unit(windows: Windows, channel: int) -> str:
+    units = getattr(windows.simulator.environment, "channel_units", None)
+    return "" if units is None else units[windows.channels[channel]]
+
+
+def channel_scores(windows: Windows, theta: FloatArray) -> list[ChannelScore]:
+    """One row for each log and channel, theta (N,) beside the model as given."""
+    found = errors(windows, np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)]))
+    return [
+        ChannelScore(log, name, _unit(windows, c), float(found[0, k, c]), float(found[1, k, c]))
+        for k, log in enumerate(windows.trajectories.names)
+        for c, name in enumerate(windows.fitted)
+        if np.isfinite(found[0, k, c])
+    ]
+
+
+def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
+    """Predictions (B, T+1, C) of one log, window after window, of predicted (B, W, L, C)."""
+    mine = np.flatnonzero(windows.log == log)
+    return np.concatenate([predicted[:, w][:, windows.owned[w]] for w in mine], axis=1)
+
+
+def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior, seed: int) -> list[Signal]:
+    """What the report draws of each log and channel."""
+    space = windows.simulator.space
+    draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
+    thetas = np.concatenate([theta[None], np.clip(space.default_theta, 0, 1)[None], draws])
+    predicted, _ = windows.predict(thetas, np.tile(windows.no_starts(), (len(thetas), 1, 1)))
+    out = []
+    for k, trajectory in enumerate(windows.trajectories):
+        lines = _stitched(windows, predicted, k)
+        low, high = np.nanquantile(lines[2:], [0.05, 0.95], axis=0)
+        begins = windows.start[windows.log == k] * trajectory.dt
+        for c, name in enumerate(windows.fitted):
+            measured = trajectory.observations[:, windows.channels[c]]
+            out.append(
+                Signal(
+                    trajectory.name,
+                    use,
+                    name,
+                    _unit(windows, c),
+                    trajectory.time,
+                    measured,
+                    lines[0, :, c],
+                    low[:, c],
+                    high[:, c],
+                    lines[1, :, c],
+                    begins,
+                )
+            )
+    return out
+
+
+def fitted_residuals(windows: Windows, theta: FloatArray, sd: list[float], tau: list[float]) -> list[Residual]:
+    """Residuals at theta (N,) with the windows' starts at their best."""
+    noise = Noise(np.array(sd), np.array(tau))
+    starts = best_starts(windows, theta, noise)
+    residual = windows.residuals(theta[None], starts[None])[0][0]
+    white = np.full((*residual.shape[:2], residual.shape[2]), np.nan)
+    for c, s in enumerate(windows.sequences):
+        flat = white[:, :, c].reshape(-1)
+        flat[s.index] = whiten(residual[:, :, c].reshape(-1), s, float(sd[c]), float(tau[c]))
+        white[:, :, c] = flat.reshape(residual.shape[:2])
+    shown = np.where(windows.observed, residual, np.nan)
+    out = []
+    for k, trajectory in enumerate(windows.trajectories):
+        lines = (_stitched(windows, x[None], k)[0] for x in (shown, white))
+        raw, whitened = lines
+        for c, name in enumerate(windows.fitted):
+            out.append(Residual(trajectory.name, name, _unit(windows, c), trajectory.time, raw[:, c], whitened[:, c]))
+    return out
+
+
+def best_starts(windows: Windows, theta: FloatArray, noise: Noise, iterations: int = 4) -> FloatArray:
+    """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,)."""
+    starts = windows.no_starts()
+    for _ in range(iterations):
+        linearisation = windows.linearise(theta, starts, with_theta=False)
+        if not linearisation.valid:
+            break
+        marginal = Marginal(windows.sequences, linearisation.jacobian, windows.start_precision)
+        starts = starts + marginal.best(linearisation.residual, starts, noise)
+    return starts

@@ -1,0 +1,116 @@
+"""What the data cannot say: parameters that change nothing, ranges that are dead, directions left open.
+
+A ridge is a direction of small posterior variance in a space where the parameters one by one have large variance: the
+smallest principal components of the posterior's correlation matrix. Where all members are positive it is taken in
+logarithms, which turns products and quotients (gear / mass, mass * length^2) into straight lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.diagnostics.result import Ridge
+from sipe_bayes.likelihood import Windows
+from sipe_bayes.parameters import ParameterSpace
+
+FloatArray = NDArray[np.float64]
+
+GRID = (0.0, 0.25, 0.5, 0.75, 1.0)
+_NO_EFFECT = 1e-7  # of the signal's own spread
+_NARROW = 0.03  # eigenvalue of the correlation matrix below which a combination is far better known than its members
+_MEMBER = 0.2  # loading from which a parameter belongs to a ridge
+_DETERMINED = 0.8  # contraction from which all members are well known anyway
+
+
+def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
+    """Parameter -> pieces [a, b] of [0, 1] over which it changes no fitted channel, the others at theta (N,).
+
+    Costs five rollouts a parameter and log; a piece whose simulation diverges is not called dead."""
+    space = windows.simulator.space
+    points = np.tile(theta, (len(space) * len(GRID), 1))
+    for j in range(len(space)):
+        points[j * len(GRID) : (j + 1) * len(GRID), j] = GRID
+    dead: dict[str, list[tuple[float, float]]] = {}
+    scale = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), 1e-12)
+    for j, name in enumerate(space.names):
+        batch = points[j * len(GRID) : (j + 1) * len(GRID)]
+        predicted, valid = windows.predict(batch, np.tile(windows.no_starts(), (len(GRID), 1, 1)))
+        for k in range(len(GRID) - 1):
+            if valid[k] and valid[k + 1]:
+                change = np.abs(predicted[k + 1] - predicted[k]) / scale
+                if np.where(windows.observed, change, 0.0).max() < _NO_EFFECT:
+                    dead.setdefault(name, []).append((GRID[k], GRID[k + 1]))
+    return {name: _joined(pieces) for name, pieces in dead.items()}
+
+
+def _joined(pieces: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    out: list[tuple[float, float]] = []
+    for low, high in pieces:
+        if out and out[-1][1] == low:
+            out[-1] = (out[-1][0], high)
+        else:
+            out.append((low, high))
+    return out
+
+
+def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float]) -> list[Ridge]:
+    """Combinations that are determined while their members are not, from posterior draws (n, N) in units."""
+    spread = draws.std(0)
+    moving = np.flatnonzero(spread > 1e-12 * np.maximum(np.abs(draws.mean(0)), 1e-300))
+    if len(moving) < 2:
+        return []
+    found, used = [], set()
+    eigenvalues, vectors = np.linalg.eigh(np.corrcoef(draws[:, moving].T))
+    for value, vector in zip(eigenvalues, vectors.T, strict=True):
+        members = [int(moving[i]) for i in np.flatnonzero(np.abs(vector) > _MEMBER)]
+        if value > 3 * _NARROW or len(members) < 2 or used & set(members):
+            continue
+        if all(contraction[j] > _DETERMINED for j in members):
+            continue
+        ridge = _describe(space, draws, members)
+        if ridge is not None:
+            used |= set(members)
+            found.append(ridge)
+    return found
+
+
+def _describe(space: ParameterSpace, draws: FloatArray, members: list[int]) -> Ridge | None:
+    """The best determined combination of the members, in words; None when it is not far better known than they."""
+    positive = all(space[j].low > 0 or (draws[:, j] > 0).all() for j in members)
+    x = np.log(draws[:, members]) if positive else draws[:, members]
+    centre, sd = x.mean(0), x.std(0)
+    eigenvalues, vectors = np.linalg.eigh(np.corrcoef(((x - centre) / sd).T))
+    if eigenvalues[0] > _NARROW:
+        return None
+    weights = vectors[:, 0] / sd
+    lead = int(np.argmax(np.abs(vectors[:, 0])))
+    weights = weights / weights[lead]
+    kept = [k for k in range(len(members)) if abs(vectors[k, 0]) > _MEMBER]
+    names = [space[members[k]].name for k in kept]
+    combined = x[:, kept] @ weights[kept]
+    if positive:
+        value, width = float(np.exp(combined.mean())), float(np.exp(combined.mean()) * combined.std())
+        text = _product(names, weights[kept])
+    else:
+        value, width = float(combined.mean()), float(combined.std())
+        text = _sum(names, weights[kept])
+    alone = " and ".join(names) if len(names) == 2 else ", ".join(names[:-1]) + " and " + names[-1]
+    return Ridge(f"{text} = {value:.4g} ± {width:.1g} is determined; {alone} alone are not", tuple(names))
+
+
+def _product(names: Sequence[str], weights: FloatArray) -> str:
+    def factor(name: str, power: float) -> str:
+        return name if abs(power - 1) < 0.05 else f"{name}^{power:.2g}"
+
+    above = [factor(n, w) for n, w in zip(names, weights, strict=True) if w > 0]
+    below = [factor(n, -w) for n, w in zip(names, weights, strict=True) if w < 0]
+    text = " * ".join(above) or "1"
+    return f"{text} / {below[0] if len(below) == 1 else '(' + ' * '.join(below) + ')'}" if below else text
+
+
+def _sum(names: Sequence[str], weights: FloatArray) -> str:
+    terms = [f"{'+' if w > 0 else '-'} {abs(w):.3g} {n}" for n, w in zip(names, weights, strict=True)]
+    return " ".join(terms).removeprefix("+ ")

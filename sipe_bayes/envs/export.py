@@ -1,0 +1,130 @@
+"""Write a model with calibrated values back out as MJCF.
+
+MuJoCo's writer keeps six significant digits. The file is compiled again and compared with the model in memory field by
+field before it gets its name, so what is written is what was calibrated.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.envs.targets import split
+
+FloatArray = NDArray[np.float64]
+
+_INERTIA_FROM_GEOMS, _INERTIA_AUTO = 1, 2
+_RELATIVE = 1e-4  # of what a six-digit file may change in derived fields
+
+
+class ExportError(RuntimeError):
+    """The written model is not the calibrated one."""
+
+
+def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Path) -> list[str]:
+    """Write the MJCF at ``values`` (N,) to ``path``; returns remarks in words. Parameters that differ between logs
+    take their mean; sensor biases have no place in a model and are named. Raises ExportError."""
+    model = environment.compile()
+    environment.write(model, values)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    spec = environment.spec()
+    _absolute_assets(spec, environment.source)
+    for parameter in environment.parameters:
+        for target in parameter.targets:
+            if not target.startswith("sensor:"):
+                _copy(spec, model, target)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.xml")
+    try:
+        spec.compile()
+        temporary.write_text(spec.to_xml())
+        differing = differing_fields(model, mujoco.MjModel.from_xml_path(str(temporary)))
+        if differing:
+            raise ExportError(f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
+    return [f"identified.xml has no place for the sensor bias {name!r}; subtract it from the measurement" for name in biased]
+
+
+def differing_fields(a: Any, b: Any) -> list[str]:
+    """Names of the numeric fields in which two models differ by more than six digits explain."""
+    found = []
+    for name in sorted(n for n in dir(a) if not n.startswith(("_", "bvh", "oct", "tex", "name", "path"))):
+        x, y = getattr(a, name), getattr(b, name)
+        if isinstance(x, np.ndarray) and x.dtype.kind == "f" and x.size:
+            scale = float(np.abs(x).max())
+            if x.shape != y.shape or not np.allclose(x, y, rtol=_RELATIVE, atol=1e-5 * scale + 1e-10):
+                found.append(name)
+    return found
+
+
+def _absolute_assets(spec: Any, source: str) -> None:
+    """Let the written file find meshes and textures from any folder."""
+    if source.lstrip().startswith("<"):
+        return
+    folder = Path(source).resolve().parent
+    for attribute in ("meshdir", "texturedir"):
+        if spec.meshes or spec.textures:
+            setattr(spec, attribute, str(folder / getattr(spec, attribute)))
+
+
+def _copy(spec: Any, model: Any, target: str) -> None:
+    kind, name, attribute = split(target)
+    if kind == "body":
+        _copy_inertial(spec, model, name)
+    elif kind == "joint":
+        _copy_joint(spec, model, name, attribute)
+    elif kind == "actuator":
+        _copy_actuator(spec, model, name)
+    elif kind == "geom":
+        spec.geom(name).friction[:] = model.geom(name).friction
+    else:
+        for field in ("gravity", "wind"):
+            getattr(spec.option, field)[:] = getattr(model.opt, field)
+        spec.option.density, spec.option.viscosity = model.opt.density, model.opt.viscosity
+
+
+def _copy_inertial(spec: Any, model: Any, name: str) -> None:
+    compiler = spec.compiler
+    everything = compiler.inertiafromgeom == _INERTIA_FROM_GEOMS or compiler.settotalmass > 0
+    if everything:  # both would overrule an inertial that is written down
+        compiler.inertiafromgeom, compiler.settotalmass = _INERTIA_AUTO, -1
+    for body in spec.bodies:
+        index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body.name) if body.name else body.id
+        if body.name == name or (everything and index > 0 and model.body_mass[index] > 0):
+            body.explicitinertial = True
+            body.mass = model.body_mass[index]
+            body.ipos[:], body.iquat[:] = model.body_ipos[index], model.body_iquat[index]
+            body.inertia[:] = model.body_inertia[index]
+            body.fullinertia[:] = np.nan
+
+
+def _copy_joint(spec: Any, model: Any, name: str, attribute: str) -> None:
+    joint, index = spec.joint(name), model.joint(name).id
+    dof = int(model.jnt_dofadr[index])
+    if attribute == "damping":
+        joint.damping[0] = model.dof_damping[dof]
+    elif attribute == "stiffness":
+        joint.stiffness[0] = model.jnt_stiffness[index]
+    elif attribute == "springref":
+        value = float(model.qpos_spring[int(model.jnt_qposadr[index])])
+        hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+        joint.springref = np.degrees(value) if hinge and spec.compiler.degree else value
+    else:
+        setattr(joint, attribute, float(getattr(model, f"dof_{attribute}")[dof]))
+
+
+def _copy_actuator(spec: Any, model: Any, name: str) -> None:
+    actuator, index = spec.actuator(name), model.actuator(name).id
+    actuator.gear[:] = model.actuator_gear[index]
+    actuator.gainprm[:] = model.actuator_gainprm[index]
+    actuator.biasprm[:] = model.actuator_biasprm[index]
+    actuator.biastype = mujoco.mjtBias(int(model.actuator_biastype[index]))
+    actuator.delay = float(model.actuator_delay[index])
