@@ -19,11 +19,12 @@ from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary, Ridge
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
-from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference import estimator_class, get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
+from sipe_bayes.output import CHECKPOINT, claim, describe_run, write_all
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
@@ -324,3 +325,31 @@ def _noise(windows: Windows, method: Estimator) -> dict[str, dict[str, Any]]:
 
 def _units(windows: Windows) -> tuple[str, ...]:
     return tuple(getattr(windows.simulator.environment, "channel_units", ("",) * len(windows.channels)))
+
+
+def run(
+    config: Path,
+    estimator: str | None = None,
+    seed: int | None = None,
+    budget: int | None = None,
+    out: Path | None = None,
+    num_threads: int | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """What the command does: read, claim the output folder, fit with a checkpoint, write everything.
+
+    Every input is checked before the folder is touched. The same call after an interruption resumes."""
+    problem = prepare(config, num_threads)
+    name = estimator or problem.config.estimator
+    estimator_class(name)
+    chosen_seed = problem.config.seed if seed is None else seed
+    chosen_budget = problem.config.budget if budget is None else budget
+    folder = Path("runs") / f"{_run_name(problem.config)}-{name}" if out is None else out
+    record = describe_run(problem, name, chosen_seed, chosen_budget)
+    claim(folder, record)
+    found = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
+    found.run, found.out = record, str(folder)
+    if progress is not None:
+        progress("writing the report", found.rollouts, found.rollouts)
+    write_all(found, problem, folder)
+    return found

@@ -171,7 +171,8 @@ class Simulator:
             raise ValueError("actions: expected at least one control step, got none")
         if not (np.abs(actions) <= _HUGE).all():
             raise ValueError(
-                "actions: expected finite numbers, got NaN, infinity or above 1e10; mask or hold them first"
+                "actions: expected finite numbers up to 1e10, got NaN, infinity or more; "
+                "mask or hold them first"
             )
         initial_state = np.atleast_2d(np.asarray(initial_state, float))
         if initial_state.shape[-1] != self.state_size:
@@ -200,7 +201,7 @@ class Simulator:
         return np.broadcast_to(dts, (batch,)), names
 
     def _chunks(self, steps: NDArray[np.int64], horizon: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Lanes with as many physics ``steps`` (B,) per control step, no more than the memory set aside holds."""
+        """Lanes with as many physics ``steps`` (B,) per control step, no more than the memory holds."""
         for skip in np.unique(steps).tolist():
             group = np.flatnonzero(steps == skip)
             width = (horizon * skip + 1) * (self.state_size + self.model.nsensordata + self.model.nu)
@@ -288,10 +289,18 @@ def _sound(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, d
     expected = kept[:, :1, 0] + np.arange(count) * skip * timestep
     sound = (np.abs(kept[..., 0] - expected) < _TIME_TOLERANCE * timestep) & (np.abs(kept) <= _HUGE).all(-1)
     after = out[:, ::skip][:, :count]  # the physics step that follows sample 0, 1, ...
-    number = after.shape[1]
-    repeated = after[..., 0] == kept[:, :number, 0]
-    if repeated.any():
-        sound[:, :number] &= ~(repeated & (after == kept[:, :number]).all(-1))
+    sound &= _not_repeated(kept, after)
     if derived:
         sound &= np.abs(after[..., 0] - expected - timestep) < _TIME_TOLERANCE * timestep
+        sound &= _not_repeated(after, out[:, 1::skip])
     return sound
+
+
+def _not_repeated(states: FloatArray, following: FloatArray) -> BoolArray:
+    """Which ``states`` (B, T, S) differ from those ``following`` them, as far as there are any."""
+    different = np.ones(states.shape[:2], bool)
+    number = min(states.shape[1], following.shape[1])
+    different[:, :number] = following[:, :number, 0] != states[:, :number, 0]
+    if not different.all():
+        different[:, :number] |= (following[:, :number] != states[:, :number]).any(-1)
+    return different

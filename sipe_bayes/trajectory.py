@@ -207,7 +207,7 @@ class Trajectories(Sequence[Trajectory]):
         try:
             with np.load(path, allow_pickle=False) as data:
                 arrays = {key: data[key] for key in data.files}
-        except (ValueError, zipfile.BadZipFile, AttributeError, TypeError) as error:
+        except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as error:
             raise ValueError(f"{path}: expected an npz file of trajectories, got {error}") from None
         if arrays.keys() - {"states"} != needed:
             raise ValueError(f"{path}: expected the arrays {sorted(needed)}, got {sorted(arrays)}")

@@ -371,7 +371,7 @@ def _reader(model: Any, channel: Channel) -> _Reader:
         raise TargetError(
             f"{where}: sensor {match['sensor']!r} has {size} components; write sensor:NAME[i], i < {size}"
         )
-    return _Reader(int(model.sensor_adr[sensor]) + item, True, _sensor_unit(int(model.sensor_type[sensor])))
+    return _Reader(int(model.sensor_adr[sensor]) + item, True, _sensor_unit(model, sensor))
 
 
 def _state_column(model: Any, reader: _Reader) -> int | None:
@@ -388,18 +388,28 @@ def _state_column(model: Any, reader: _Reader) -> int | None:
     return None
 
 
-def _sensor_unit(kind: int) -> str:
-    sensor = mujoco.mjtSensor
+def _sensor_unit(model: Any, sensor: int) -> str:
+    kinds, kind, joint = mujoco.mjtSensor, int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
     units = {
-        "rad": (sensor.mjSENS_JOINTPOS, sensor.mjSENS_BALLQUAT),
-        "rad/s": (sensor.mjSENS_JOINTVEL, sensor.mjSENS_GYRO, sensor.mjSENS_FRAMEANGVEL),
-        "m/s^2": (sensor.mjSENS_ACCELEROMETER, sensor.mjSENS_FRAMELINACC),
-        "m/s": (sensor.mjSENS_VELOCIMETER, sensor.mjSENS_FRAMELINVEL),
-        "m": (sensor.mjSENS_FRAMEPOS,),
-        "N": (sensor.mjSENS_FORCE, sensor.mjSENS_TOUCH, sensor.mjSENS_ACTUATORFRC),
-        "N m": (sensor.mjSENS_TORQUE, sensor.mjSENS_JOINTACTFRC),
+        "rad": (kinds.mjSENS_JOINTPOS,),
+        "rad/s": (
+            kinds.mjSENS_JOINTVEL,
+            kinds.mjSENS_GYRO,
+            kinds.mjSENS_FRAMEANGVEL,
+            kinds.mjSENS_BALLANGVEL,
+        ),
+        "rad/s^2": (kinds.mjSENS_FRAMEANGACC,),
+        "m/s^2": (kinds.mjSENS_ACCELEROMETER, kinds.mjSENS_FRAMELINACC),
+        "m/s": (kinds.mjSENS_VELOCIMETER, kinds.mjSENS_FRAMELINVEL, kinds.mjSENS_SUBTREELINVEL),
+        "m": (kinds.mjSENS_FRAMEPOS, kinds.mjSENS_SUBTREECOM, kinds.mjSENS_RANGEFINDER),
+        "N": (kinds.mjSENS_FORCE, kinds.mjSENS_TOUCH),
+        "N m": (kinds.mjSENS_TORQUE, kinds.mjSENS_JOINTACTFRC),
     }
-    return next((unit for unit, kinds in units.items() if kind in [int(k) for k in kinds]), "")
+    unit = next((unit for unit, members in units.items() if kind in [int(k) for k in members]), "")
+    of_joint = (kinds.mjSENS_JOINTPOS, kinds.mjSENS_JOINTVEL, kinds.mjSENS_JOINTACTFRC)
+    if kind in [int(k) for k in of_joint] and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE):
+        return {"rad": "m", "rad/s": "m/s", "N m": "N"}[unit]
+    return unit
 
 
 def _bias_channels(channels: Sequence[Channel], name: str) -> list[int]:

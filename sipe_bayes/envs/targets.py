@@ -84,9 +84,9 @@ def bind(model: Any, spec: str) -> Target:
     kind, name, attribute = split(spec)
     legal = _ATTRIBUTES[kind]
     if attribute not in legal:
-        close = difflib.get_close_matches(attribute, legal, 1)
+        article, close = "an" if kind[0] in "ao" else "a", difflib.get_close_matches(attribute, legal, 1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(sorted(legal))}"
-        raise TargetError(f"target {spec!r}: a {kind} has no attribute {attribute!r}; {hint}")
+        raise TargetError(f"target {spec!r}: {article} {kind} has no attribute {attribute!r}; {hint}")
     index = 0 if kind == "option" else named(model, kind, name, f"target {spec!r}")
     return legal[attribute](model, spec, index, attribute)
 
@@ -174,13 +174,19 @@ def _actuator_bias(slot: int, unit: str) -> Callable[..., Target]:
 def _actuator_kp(model: Any, spec: str, actuator: int, attribute: str) -> Target:
     _fixed_gain(model, actuator, spec)
     _affine_bias(model, actuator, spec)
+    gain, position = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_biasprm[actuator, 1])
+    if gain != -position:
+        raise TargetError(
+            f"target {spec!r}: needs a position actuator, whose bias_position {position:g} is minus its gain "
+            f"{gain:g}; give gain and bias_position instead"
+        )
 
     def write(other: Any, value: float) -> None:
         other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
         other.actuator_gainprm[actuator, 0] = value
         other.actuator_biasprm[actuator, 1] = -value
 
-    return Target(spec, "force/position", float(model.actuator_gainprm[actuator, 0]), write, minimum=0.0)
+    return Target(spec, "force/position", gain, write, minimum=0.0)
 
 
 def _actuator_kv(model: Any, spec: str, actuator: int, attribute: str) -> Target:

@@ -1,8 +1,8 @@
 """Laplace's approximation of the posterior by windowed least squares.
 
 Theta and the windows' starts minimise the whitened squares of the residuals plus the prior (``least_squares``), the
-noise maximises its restricted likelihood (``sipe_bayes.noise``); the two alternate, from white noise, which is plain
-least squares, to autoregressive noise. At the optimum the starts are marginalised and the curvature gives a normal in
+noise maximises its restricted likelihood (``sipe_bayes.noise``); the two alternate, after a rough search with white
+noise of the size of the present residuals. At the optimum the starts are marginalised and the curvature gives a normal in
 theta, truncated to the unit cube. Where a parameter sits at a bound, the normal's mean lies beyond it, at the optimum
 of the quadratic model: the truncated density is right up to the bound.
 
@@ -34,10 +34,11 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 _FLAT_PRECISION = 0.01  # sd 10 in units of the cube
-_TOLERANCE = 1e-3  # nats
-_SAME_NOISE = 0.02  # relative
+_TOLERANCE = 0.02  # nats
+_ROUGH = 1e-4  # of the energy
+_SAME_NOISE = 0.03  # relative
 _DROP = 10.0  # nats below the best optimum
-_MAX_ITERATIONS = 60
+_MAX_ITERATIONS = 80
 
 
 class Laplace(Estimator):
@@ -99,17 +100,23 @@ class Laplace(Estimator):
         return f"laplace: start {state['point'] + 1} of {len(state['points'])}, step {state['iteration']}"
 
     def step(self, state: State, trajectories: Trajectories) -> State:
-        """One linearisation, one estimate of the noise, one accepted step of theta and starts."""
+        """One linearisation and one accepted step of theta and starts; at an optimum, the noise is estimated anew.
+
+        Rough search first: white noise with the sd of the present residuals, to a relative tolerance."""
         windows, prior = self.windows(trajectories), self.quadratic_prior
-        theta, starts = state["theta"], state["starts"]
+        theta, starts, rough = state["theta"], state["starts"], state["rough"]
         linearisation = windows.linearise(theta, starts)
         moments = windows.moments(linearisation)
-        before = Noise(state["sd"], state["tau"])
-        coloured = state["coloured"] and self.likelihood.noise == "ar1"
-        noise = _noise(windows, moments, before, theta, starts, prior, coloured)
+        noise = before = Noise(state["sd"], state["tau"])
+        if rough:
+            noise = _present_noise(windows, linearisation.residual)
+        elif state["due"]:
+            noise = _noise(windows, moments, before, theta, starts, prior, self.likelihood.noise == "ar1")
         value = energy_of(windows, noise, prior, theta, starts, linearisation.residual)
-        fit = step(windows, noise, prior, Fit(theta, starts, value, state["damping"]), moments, _TOLERANCE)
-        settled = fit.converged and _same(noise, before)
+        tolerance = max(_TOLERANCE, _ROUGH * value) if rough else _TOLERANCE
+        fit = step(windows, noise, prior, Fit(theta, starts, value, state["damping"]), moments, tolerance)
+        iteration = state["iteration"] + 1
+        settled = fit.converged and not rough and state["due"] and _same(noise, before)
         state = {
             **state,
             "theta": fit.theta,
@@ -117,10 +124,11 @@ class Laplace(Estimator):
             "damping": fit.damping,
             "sd": noise.sd,
             "tau": noise.tau,
-            "iteration": state["iteration"] + 1,
-            "coloured": state["coloured"] or settled,
+            "iteration": iteration,
+            "rough": rough and not fit.converged and iteration < _MAX_ITERATIONS // 2,
+            "due": fit.converged,
         }
-        if (settled and (coloured or self.likelihood.noise == "white")) or state["iteration"] >= _MAX_ITERATIONS:
+        if settled or iteration >= _MAX_ITERATIONS:
             state = self._finish(state, windows, moments, noise, theta, starts, prior)
         return state
 
@@ -236,7 +244,8 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "sd": sd,
         "tau": np.zeros(len(sd)),
         "iteration": 0,
-        "coloured": False,
+        "rough": True,
+        "due": False,
     }
 
 
@@ -256,6 +265,13 @@ def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: Fl
     return Pulls(
         prior.precision + flat, prior.pull(theta), windows.start_precision, -windows.start_precision * starts, ~held
     )
+
+
+def _present_noise(windows: Windows, residual: FloatArray) -> Noise:
+    """White noise with the root-mean-square of a residual (W, L, C), or the given sds."""
+    fixed, counts = fixed_sd(windows), windows.observed.sum(axis=(0, 1))
+    size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1))
+    return Noise(np.where(np.isnan(fixed), np.maximum(size, 1e-12), fixed), np.zeros(len(size)))
 
 
 def _noise(

@@ -1,0 +1,134 @@
+"""The command ``sipe``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from sipe_bayes.diagnostics.result import Calibration
+
+app = typer.Typer(
+    name="sipe",
+    help="Calibrate robot simulators with honest uncertainty.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+BAD_INPUT = 2
+
+
+def main() -> None:
+    """Entry point: input errors are one line on standard error and exit code 2."""
+    app()
+
+
+@app.callback()
+def _root() -> None:
+    """Calibrate robot simulators with honest uncertainty."""
+
+
+@app.command()
+def calibrate(
+    config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
+    estimator: Annotated[str | None, typer.Option(help="laplace or mcmc; default: the configuration's.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Default: the configuration's.")] = None,
+    budget: Annotated[int | None, typer.Option(help="Rollouts: logs times parameter values simulated.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-ESTIMATOR.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+    threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+) -> None:
+    """Posterior of a simulator's parameters from logs of the real machine."""
+    from sipe_bayes.calibration import run
+
+    with _Progress(quiet=as_json) as progress:
+        try:
+            found = run(config, estimator, seed, budget, out, threads, progress.update)
+        except (ValueError, OSError) as error:
+            progress.stop()
+            print(f"sipe: {_one_line(error)}", file=sys.stderr)
+            raise typer.Exit(BAD_INPUT) from None
+    if as_json:
+        print(json.dumps(found.to_dict()))
+    else:
+        _print(found)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+class _Progress:
+    """A bar on a terminal; nothing when piped."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._bar: Any = None
+        if not quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed} rollouts"))
+            self._bar = Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("reading", total=None)
+
+    def __enter__(self) -> _Progress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def update(self, what: str, rollouts: int, budget: int) -> None:
+        if self._bar is not None:
+            self._bar.update(self._task, description=what, completed=rollouts, total=budget)
+
+
+def _print(found: Calibration) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from sipe_bayes.diagnostics.report import parameter_verdict, significant
+
+    console = Console(soft_wrap=True)
+    table = Table(title=f"{found.name}: posterior by {found.estimator}", title_justify="left")
+    for heading in ("parameter", "estimate", "90 % interval", "unit", "contraction", "verdict"):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit", "verdict") else "right")
+    for p in found.parameters:
+        low, high = significant(p.q05, p.sd), significant(p.q95, p.sd)
+        table.add_row(
+            p.name,
+            f"{significant(p.mode, p.sd)} ± {significant(p.sd, p.sd)}",
+            f"{low} .. {high}",
+            p.unit,
+            f"{p.contraction:.2f}",
+            parameter_verdict(p).text,
+        )
+    console.print(table)
+    for title, scores in (("held out", found.holdout), ("train", found.train)):
+        for s in scores:
+            ratio = s.rmse_default / s.rmse if s.rmse else float("inf")
+            console.print(
+                f"{title} {s.log}, {s.channel}: RMSE {s.rmse:.3g} {s.unit}; model as given {s.rmse_default:.3g} "
+                f"({ratio:.1f} times that of the estimate)",
+                highlight=False,
+            )
+    for warning in found.warnings:
+        console.print(f"warning: {warning}", highlight=False, markup=False)
+    console.print(f"{found.rollouts} rollouts, {found.seconds:.1f} s", highlight=False)
+    if found.out:
+        console.print(f"report: {Path(found.out) / 'report.html'}", highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""The output folder of a run: claimed, resumed, filled; every file written under a temporary name and renamed."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sipe_bayes.calibration import Problem
+    from sipe_bayes.diagnostics.result import Calibration
+
+CHECKPOINT = "checkpoint.safetensors"
+RUN = "run.json"
+_PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
+
+
+class OutputError(ValueError):
+    """An output folder that cannot be used."""
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, Any]:
+    """Configuration, versions, seed and checksums of the inputs."""
+    config = problem.config
+    return {
+        "config": str(config.path),
+        "config_sha256": _checksum(config.path),
+        "model_sha256": _checksum(Path(config.model)),
+        "prior_sha256": _checksum(Path(f"{config.prior.source}.safetensors")) if config.prior else "",
+        "logs_sha256": {report.name: report.sha256 for report in problem.reports},
+        "estimator": estimator,
+        "seed": seed,
+        "budget": budget,
+        "configuration": config.model_dump(mode="json", by_alias=True),
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
+    }
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+_IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
+
+
+def claim(folder: Path, run: dict[str, Any]) -> None:
+    """Make ``folder`` this run's own; the same run may come back to it. Raises OutputError when it holds another."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+    record = folder / RUN
+    if record.is_file():
+        try:
+            found = json.loads(record.read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError) as error:
+            raise OutputError(f"--out {folder}: its {RUN} cannot be read ({error}); choose another folder") from None
+        differing = [key for key in _IDENTITY if found.get(key) != run[key]]
+        if differing:
+            what = ", ".join(key.removesuffix("_sha256") for key in differing)
+            raise OutputError(
+                f"--out {folder}: holds another run (it differs in {what}); choose another folder or delete it"
+            )
+        return
+    if folder.is_dir() and any(folder.iterdir()):
+        raise OutputError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(record, json.dumps({**run, "status": "started"}, indent=2))
+
+
+def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
+    """Fill the folder of a finished run; its ``run.json`` comes last and says so."""
+    from sipe_bayes.diagnostics.report import write_report
+    from sipe_bayes.envs.export import write_identified
+
+    values = problem.environment.space.values(calibration.posterior.mode.numpy())
+    calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
+    calibration.posterior.save(folder / "posterior")
+    temporary = folder / f".posterior.{os.getpid()}.nc"
+    calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
+    os.replace(temporary, folder / "posterior.nc")
+    write_text(folder / "domain_randomization.json", json.dumps(domain_randomization(calibration, problem), indent=2))
+    write_report(calibration, folder)
+    write_text(folder / "result.json", json.dumps(calibration.to_dict(), indent=2))
+    write_text(folder / RUN, json.dumps({**calibration.run, "status": "complete"}, indent=2))
+
+
+def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, Any]:
+    """What a policy trainer samples from: each parameter's normal in its unit, bounds, and their covariance."""
+    import numpy as np
+
+    space = problem.environment.space
+    draws = calibration.posterior.values(4000, generator=_generator())
+    rows = [
+        {
+            "name": p.name,
+            "target": list(s.targets),
+            "unit": p.unit,
+            "mean": p.mean,
+            "sd": p.sd,
+            "q05": p.q05,
+            "q95": p.q95,
+            "low": s.low,
+            "high": s.high,
+            "log": s.log,
+        }
+        for p, s in zip(calibration.parameters, space, strict=True)
+    ]
+    covariance = np.atleast_2d(np.cov(draws.T))
+    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "source": "posterior"}
+
+
+def _generator() -> Any:
+    import torch
+
+    return torch.Generator().manual_seed(0)
