@@ -28,7 +28,7 @@ _PUBLIC = {
     "calibrate": "sipe_bayes.calibration",
 }
 
-__all__ = ["__version__", *_PUBLIC]  # noqa: PLE0604
+__all__ = ["__version__", *_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:

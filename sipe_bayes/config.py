@@ -321,7 +321,7 @@ class ParameterEntry(Table):
 class Noise(Table):
     """The model of the residuals."""
 
-    model: Literal["ar1", "white"] = "ar1"
+    model: Literal["ar1", "white", "sandwich"] = "ar1"
 
 
 class PriorSource(Table):

@@ -41,7 +41,8 @@ class BudgetExhausted(RuntimeError):
 class Segments:
     """Multiple shooting with white or autoregressive noise.
 
-    window: seconds, or None for each log as one window; ``windows`` overrides it for logs by name. noise: "ar1" or "white". fit: names of the channels whose
+    window: seconds, or None for each log as one window; ``windows`` overrides it for logs by name. noise: "ar1", "white", or "sandwich"
+    (the optimum of white noise with the width of "ar1"; ``laplace`` only). fit: names of the channels whose
     residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated.
     """
 
@@ -52,8 +53,8 @@ class Segments:
     windows: tuple[tuple[str, float | None], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.noise not in ("ar1", "white"):
-            raise ValueError(f"noise: expected 'ar1' or 'white', got {self.noise!r}")
+        if self.noise not in ("ar1", "white", "sandwich"):
+            raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
 

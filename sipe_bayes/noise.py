@@ -27,6 +27,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
+_RESTARTS, _GAIN = 5, 1e-3  # of the search for the noise; nats
 _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
 
 
@@ -34,7 +35,8 @@ _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part
 class Sequence:
     """The observed samples of one channel in order of time: rows of the flattened (W * L) samples.
 
-    index (n,), previous (n,; -1 begins a sequence), window (n,), gap (n,) an index into ``gaps`` seconds (inf first).
+    index (n,), previous (n,; -1 begins a sequence), window (n,), gap (n,) an index into ``gaps`` seconds
+    (ascending; inf where a sequence begins).
     """
 
     index: IntArray
@@ -56,7 +58,9 @@ def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: 
         steps = np.diff(number, prepend=0)
         linked = np.zeros(len(index), bool)
         if len(index) > 1:
-            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
+            linked[1:] = (
+                (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
+            )
         previous = np.where(linked, np.concatenate([[-1], index[:-1]])[: len(index)], -1)
         seconds = np.where(linked, steps * dt[window], np.inf)
         gaps, gap = np.unique(np.round(seconds, 12), return_inverse=True)
@@ -206,7 +210,9 @@ def eliminate(
         for j in range(d):
             band[d + i - j, j : (windows - 1) * d : d] = corner[:, j, i]
     factor = scipy.linalg.cholesky_banded(band, lower=True, check_finite=False)
-    solved = scipy.linalg.cho_solve_banded((factor, True), right.reshape(windows * d, n + 1), check_finite=False)
+    solved = scipy.linalg.cho_solve_banded(
+        (factor, True), right.reshape(windows * d, n + 1), check_finite=False
+    )
     flat = right.reshape(windows * d, n + 1)
     reduced = flat.T @ solved
     precision = normal[:, theta, theta].sum(0) - reduced[:n, :n]
@@ -269,7 +275,9 @@ def estimate_noise(
 
     def unpack(x: FloatArray) -> Noise:
         tau = np.exp(x[channels:]) if coloured else np.zeros(channels)
-        innovation = 1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
+        innovation = (
+            1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
+        )
         return Noise(np.where(estimated, np.exp(x[:channels]) / np.sqrt(innovation), fixed_sd), tau)
 
     def loss(x: FloatArray) -> float:
@@ -283,11 +291,100 @@ def estimate_noise(
     tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
     if coloured and (noise.tau <= 0).all():
         tau = np.full(channels, np.clip(np.log(10 * shortest), low, high))
-    innovation = 1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
+    innovation = (
+        1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
+    )
     x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation)), tau if coloured else []])
     bounds = [(x - 12, x + 12) for x in x0[:channels]] + [(low, high)] * (channels if coloured else 0)
-    result = scipy.optimize.minimize(loss, x0, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4, "ftol": 1e-9})
-    return unpack(result.x)
+    x, value = x0, loss(x0)
+    for _ in range(_RESTARTS):  # L-BFGS may stop early with a large gradient; from its own result it goes on
+        result = scipy.optimize.minimize(loss, x, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4})
+        gain, x, value = value - result.fun, result.x, result.fun
+        if gain < _GAIN:
+            break
+    return unpack(x)
+
+
+def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArray) -> FloatArray:
+    """Covariance of the ``free`` entries of (log sd (C), log tau (C)): inverse curvature of the restricted likelihood
+    at ``noise``, sds held between 0.01 and 1."""
+    centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
+
+    def value(x: FloatArray) -> float:
+        logs = centre.copy()
+        logs[free] += x
+        return restricted(moments, _from_logs(logs, noise), pulls)
+
+    unit, h = np.eye(len(free)), 0.05
+    curvature = np.empty((len(free), len(free)))
+    for i, a in enumerate(unit):
+        for j, b in enumerate(unit):
+            corners = value(h * (a + b)) - value(h * (a - b)) - value(h * (b - a)) + value(-h * (a + b))
+            curvature[i, j] = -corners / (4 * h**2)
+    eigenvalues, axes = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    return (axes / np.clip(eigenvalues, 1.0, 1e4)) @ axes.T
+
+
+def _from_logs(logs: FloatArray, like: Noise) -> Noise:
+    """Noise of (log sd, log tau); channels that are white in ``like`` stay white."""
+    channels = len(like.sd)
+    return Noise(np.exp(logs[:channels]), np.where(like.tau > 0, np.exp(logs[channels:]), 0.0))
+
+
+def noise_cloud(
+    moments: Moments, noise: Noise, pulls: Pulls, free: IntArray, longest: float
+) -> list[tuple[float, Noise]]:
+    """Weighted points that stand for the uncertainty of the noise: two along each principal axis of its covariance, at
+    sqrt(dimensions) sds, weighted by the restricted likelihood against its normal approximation."""
+    if not len(free):
+        return [(1.0, noise)]
+    covariance, d = noise_covariance(moments, noise, pulls, free), len(free)
+    eigenvalues, axes = np.linalg.eigh(covariance)
+    best = restricted(moments, noise, pulls)
+    centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
+    points = []
+    for direction in np.concatenate(
+        [axes.T * np.sqrt(d * eigenvalues)[:, None], -axes.T * np.sqrt(d * eigenvalues)[:, None]]
+    ):
+        logs = centre.copy()
+        logs[free] += direction
+        logs[len(noise.sd) :] = np.minimum(logs[len(noise.sd) :], np.log(longest))
+        point = _from_logs(logs, noise)
+        surplus = restricted(moments, point, pulls) - best + d / 2
+        points.append((float(np.exp(np.clip(surplus, -2.0, 2.0))), point))
+    total = sum(w for w, _ in points)
+    return [(w / total, point) for w, point in points]
+
+
+def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
+    """X' V X (N, N) of the rows X (n, N) of one channel, V its residual covariance.
+
+    With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion."""
+    a = coefficients(sequence.gaps, tau)[sequence.gap]
+    scale = sd * np.sqrt(1 - a**2)
+    z = np.empty_like(rows)
+    carried = np.zeros(rows.shape[1])
+    for i in range(len(rows) - 1, -1, -1):
+        z[i] = scale[i] * (rows[i] + carried)
+        carried = a[i] / scale[i] * z[i]
+    return z.T @ z
+
+
+def sandwich(
+    jacobian: FloatArray, slope: FloatArray, white: FloatArray, all_sequences: list[Sequence], noise: Noise
+) -> FloatArray:
+    """The middle (N, N) of the sandwich covariance H^-1 M H^-1 of plain least squares under coloured noise.
+
+    jacobian (W, L, C, N + D); slope (W, D, N): how the starts answer to theta; white (C,): the sds by which least squares
+    weighs the channels; noise: what the residuals really look like. (Huber 1967, "The behavior of maximum likelihood
+    estimates under nonstandard conditions", Berkeley Symposium 5.)"""
+    n = slope.shape[2]
+    projected = jacobian[..., :n] - np.einsum("wlcd,wdn->wlcn", jacobian[..., n:], slope)
+    flat = projected.reshape(-1, projected.shape[2], n)
+    return sum(  # type: ignore[return-value]
+        coloured_square(flat[s.index, c] / white[c] ** 2, s, float(noise.sd[c]), float(noise.tau[c]))
+        for c, s in enumerate(all_sequences)
+    )
 
 
 class Marginal:
@@ -304,18 +401,27 @@ class Marginal:
         flat = jacobian.reshape(self.windows * self.length, -1, self.num_start)
         self.rows = [flat[s.index, c] for c, s in enumerate(all_sequences)]
         self.before = [
-            np.where((s.previous >= 0)[:, None], flat[s.previous, c], 0.0) for c, s in enumerate(all_sequences)
+            np.where((s.previous >= 0)[:, None], flat[s.previous, c], 0.0)
+            for c, s in enumerate(all_sequences)
         ]
         self.edges = [np.searchsorted(s.window, np.arange(self.windows)) for s in all_sequences]
 
-    def __call__(self, residual: FloatArray, starts: FloatArray, sd: FloatArray, tau: FloatArray) -> FloatArray:
+    def __call__(
+        self, residual: FloatArray, starts: FloatArray, sd: FloatArray, tau: FloatArray
+    ) -> FloatArray:
         """(B,) for residuals (B, W, L, C) at starts (B, W, D) with sd and tau (B, C)."""
         values = np.empty(len(residual))
         for b in range(len(residual)):
             noise = Noise(sd[b], tau[b])
             arrow, square = self._eliminate(residual[b], starts[b], noise)
             pull = float((starts[b] ** 2 @ self.precision).sum())
-            total = log_determinant(self.sequences, noise) + arrow.log_determinant + square - arrow.explained + pull
+            total = (
+                log_determinant(self.sequences, noise)
+                + arrow.log_determinant
+                + square
+                - arrow.explained
+                + pull
+            )
             values[b] = -0.5 * total
         return values
 

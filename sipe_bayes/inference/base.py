@@ -112,7 +112,9 @@ class Estimator(ABC):
                 state = self._counted(self.start(batch), batch)
             while not state["done"]:
                 state = self._counted(self.step(state, batch), batch)
-                if self.checkpoint is not None and (state["done"] or time.monotonic() - saved > _CHECKPOINT_SECONDS):
+                if self.checkpoint is not None and (
+                    state["done"] or time.monotonic() - saved > _CHECKPOINT_SECONDS
+                ):
                     save_state(self.checkpoint, state, fingerprint)
                     saved = time.monotonic()
                 if self.progress is not None:
@@ -120,11 +122,15 @@ class Estimator(ABC):
         except BudgetExhausted as error:
             if state is None:
                 raise ValueError(f"budget: {error}; raise it") from None
-            self.warnings.append(f"the budget of {self.budget} rollouts ran out before the method had converged")
+            self.warnings.append(
+                f"the budget of {self.budget} rollouts ran out before the method had converged"
+            )
         self._state = state
         return self.posterior(state, batch)
 
-    def update_parameter_estimate(self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> None:
+    def update_parameter_estimate(
+        self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories
+    ) -> None:
         """One step of the method, as the paper's interface names it; trajectories may differ from step to step."""
         batch = Trajectories.stack(trajectories)
         if self._state is None:
@@ -132,10 +138,14 @@ class Estimator(ABC):
         if not self._state["done"]:
             self._state = self._counted(self.step(self._state, batch), batch)
 
-    def get_parameter_estimate(self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Posterior:
+    def get_parameter_estimate(
+        self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories
+    ) -> Posterior:
         """The posterior of the present state."""
         if self._state is None:
-            raise ValueError("get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first")
+            raise ValueError(
+                "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
+            )
         return self.posterior(self._state, Trajectories.stack(trajectories))
 
     def describe(self, state: State) -> str:

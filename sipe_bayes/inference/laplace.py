@@ -6,12 +6,16 @@ noise of the size of the present residuals. At the optimum the starts are margin
 theta, truncated to the unit cube. Where a parameter sits at a bound, the normal's mean lies beyond it, at the optimum
 of the quadratic model: the truncated density is right up to the bound.
 
+With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from the autoregressive
+noise (``noise.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts the misfit down to slow
+noise and may leave the parameters behind it undetermined; plain least squares keeps what predicts best.
+
 Several starting points (the model as given and the best of a few draws from the prior) are followed; optima that are
 not the same become components of a mixture, weighted by their restricted likelihood.
 
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
-uncertainty of the noise parameters is not propagated (see the README for the measured coverage).
+uncertainty of the noise widens the normal by the moments over a handful of weighted noise values.
 """
 
 from __future__ import annotations
@@ -27,7 +31,17 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.least_squares import Fit, QuadraticPrior, energy_of, step
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Moments, Noise, Pulls, eliminate, estimate_noise, restricted
+from sipe_bayes.noise import (
+    Arrow,
+    Moments,
+    Noise,
+    Pulls,
+    eliminate,
+    estimate_noise,
+    noise_cloud,
+    restricted,
+    sandwich,
+)
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.trajectory import Trajectories
 
@@ -61,14 +75,23 @@ class Laplace(Estimator):
         **settings: Any,
     ) -> None:
         if restarts < 1 or candidates < 0:
-            raise ValueError(f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}")
+            raise ValueError(
+                f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}"
+            )
         super().__init__(simulator, **settings)
         self.restarts, self.candidates = restarts, candidates
-        self.initial = None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
+        self.initial = (
+            None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
+        )
 
     def settings(self) -> dict[str, Any]:
         initial = None if self.initial is None else self.initial.tolist()
-        return {**super().settings(), "restarts": self.restarts, "candidates": self.candidates, "initial": initial}
+        return {
+            **super().settings(),
+            "restarts": self.restarts,
+            "candidates": self.candidates,
+            "initial": initial,
+        }
 
     @property
     def quadratic_prior(self) -> QuadraticPrior:
@@ -89,8 +112,8 @@ class Laplace(Estimator):
             "mode_theta": np.empty((0, n)),
             "mode_starts": np.empty((0, w, d)),
             "mode_slope": np.empty((0, w, d, n)),
-            "mode_precision": np.empty((0, n, n)),
-            "mode_gradient": np.empty((0, n)),
+            "mode_mean": np.empty((0, n)),
+            "mode_covariance": np.empty((0, n, n)),
             "mode_sd": np.empty((0, c)),
             "mode_tau": np.empty((0, c)),
             "mode_evidence": np.empty(0),
@@ -129,7 +152,7 @@ class Laplace(Estimator):
             "due": fit.converged,
         }
         if settled or iteration >= _MAX_ITERATIONS:
-            state = self._finish(state, windows, moments, noise, theta, starts, prior)
+            state = self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
         return state
 
     def _finish(
@@ -140,19 +163,39 @@ class Laplace(Estimator):
         noise: Noise,
         theta: FloatArray,
         starts: FloatArray,
-        prior: QuadraticPrior,
+        jacobian: FloatArray,
     ) -> State:
         """Record the optimum at the last linearisation and turn to the next starting point."""
-        pull = -windows.start_precision * starts
+        prior, pull = self.quadratic_prior, -windows.start_precision * starts
         arrow = eliminate(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
-        everything = replace(pulls(windows, prior, theta, starts, arrow.gradient), free=np.full(len(theta), True))
+        everything = replace(
+            pulls(windows, prior, theta, starts, arrow.gradient), free=np.full(len(theta), True)
+        )
         evidence = restricted(moments, noise, everything) - prior.energy(theta)
+        here = pulls(windows, prior, theta, starts, arrow.gradient)
+        white = noise.sd
+        if self.likelihood.noise == "sandwich":
+            noise = _noise(windows, moments, noise, theta, starts, prior, coloured=True)
+        mean, covariance = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
+        centres = []
+        for weight, point in noise_cloud(moments, noise, here, free_noise(windows), longest_tau(windows)):
+            if self.likelihood.noise == "sandwich":
+                middle = sandwich(jacobian, arrow.start_slope, white, windows.sequences, point)
+                centre, spread = self._normal(theta, *_sandwiched(arrow, middle))
+            else:
+                inner = eliminate(moments.normal(point), moments.num_theta, windows.start_precision, pull)
+                centre, spread = self._normal(theta, inner.precision, inner.gradient)
+            mean += weight * centre
+            covariance += weight * spread
+            centres.append((weight, centre))
+        for weight, centre in centres:
+            covariance += weight * np.outer(centre - mean, centre - mean)
         found = {
             "theta": theta,
             "starts": starts,
             "slope": arrow.start_slope,
-            "precision": arrow.precision,
-            "gradient": arrow.gradient,
+            "mean": mean,
+            "covariance": covariance,
             "sd": noise.sd,
             "tau": noise.tau,
             "evidence": np.array(evidence),
@@ -172,9 +215,8 @@ class Laplace(Estimator):
         means, covariances, evidence = [], [], []
         kept = distinct_modes(state)
         for m in kept:
-            mean, covariance = self._normal(state, m)
-            means.append(mean)
-            covariances.append(covariance)
+            means.append(state["mode_mean"][m])
+            covariances.append(state["mode_covariance"][m])
             evidence.append(state["mode_evidence"][m])
         self.diagnostics = {
             "modes": len(kept),
@@ -182,31 +224,43 @@ class Laplace(Estimator):
             "noise_tau": state["mode_tau"][kept[0]].tolist(),
         }
         if len(kept) > 1:
-            self.warnings.append(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
+            self.warnings.append(
+                f"the search found {len(kept)} separate optima; the posterior is a mixture of them"
+            )
         weights = torch.tensor(np.array(evidence) - np.max(evidence))
         return GaussianMixture(weights, np.stack(means), np.stack(covariances), self.space)
 
-    def _normal(self, state: State, m: int) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance, before truncation, of optimum m."""
-        prior, theta = self.quadratic_prior, state["mode_theta"][m]
-        flat = _FLAT_PRECISION * np.eye(len(theta))
-        covariance = np.linalg.inv(state["mode_precision"][m] + prior.precision + flat)
-        pull = state["mode_gradient"][m] + prior.pull(theta) + _FLAT_PRECISION * (0.5 - theta)
+    def _normal(
+        self, theta: FloatArray, precision: FloatArray, gradient: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance, before truncation, of the quadratic model of data and prior at theta."""
+        prior = self.quadratic_prior
+        covariance = np.linalg.inv(precision + prior.precision + _FLAT_PRECISION * np.eye(len(theta)))
+        pull = gradient + prior.pull(theta) + _FLAT_PRECISION * (0.5 - theta)
         return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
 
     def information(self) -> tuple[FloatArray, FloatArray]:
-        """Optimum (N,) of the quadratic model of the data alone and its information (N, N), after ``fit``.
-
-        The optimum may lie outside the cube; along directions without information it is the best point found."""
+        """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
         if self._state is None or not len(self._state["mode_theta"]):
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        best = distinct_modes(self._state)[0]
-        precision, gradient = self._state["mode_precision"][best], self._state["mode_gradient"][best]
-        return self._state["mode_theta"][best] + np.linalg.pinv(precision, rcond=1e-12) @ gradient, precision
+        best, prior = distinct_modes(self._state)[0], self.quadratic_prior
+        mean, total = self._state["mode_mean"][best], np.linalg.inv(self._state["mode_covariance"][best])
+        flat = _FLAT_PRECISION * np.eye(len(mean))
+        eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
+        information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
+        right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
+        return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information
 
     def _cost(self, trajectories: Trajectories) -> int:
         windows = self.windows(trajectories)
         return (windows.num_theta + windows.num_start + 2) * len(trajectories)
+
+
+def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Precision and gradient of plain least squares when the residuals' covariance gives ``middle``."""
+    shift = np.linalg.pinv(arrow.precision, rcond=1e-12, hermitian=True) @ arrow.gradient
+    precision = arrow.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ arrow.precision
+    return precision, precision @ shift
 
 
 def screen(estimator: Laplace, windows: Windows, trajectories: Trajectories) -> FloatArray:
@@ -257,13 +311,19 @@ def fixed_sd(windows: Windows) -> FloatArray:
     return np.array([np.nan if given[c] is None else given[c] for c in windows.channels], float)
 
 
-def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
+def pulls(
+    windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray
+) -> Pulls:
     """Prior and bounds at (theta, starts); ``force`` (N,): the data's pull on theta, which holds it at a bound."""
     flat = _FLAT_PRECISION * np.eye(len(theta))
     total = force + prior.pull(theta)
     held = ((theta <= 0) & (total < 0)) | ((theta >= 1) & (total > 0))
     return Pulls(
-        prior.precision + flat, prior.pull(theta), windows.start_precision, -windows.start_precision * starts, ~held
+        prior.precision + flat,
+        prior.pull(theta),
+        windows.start_precision,
+        -windows.start_precision * starts,
+        ~held,
     )
 
 
@@ -290,6 +350,12 @@ def _noise(
     return estimate_noise(moments, before, context, fixed_sd(windows), coloured, shortest, longest)
 
 
+def free_noise(windows: Windows) -> NDArray[np.int64]:
+    """Which of (log sd (C), log tau (C)) are unknown."""
+    free = np.isnan(fixed_sd(windows))
+    return np.flatnonzero(np.concatenate([free, np.full(len(free), windows.settings.noise != "white")]))
+
+
 def longest_tau(windows: Windows) -> float:
     """The longest correlation time that the logs could show: the longest log's duration."""
     return float((windows.trajectories.length * windows.trajectories.dt).max())
@@ -313,5 +379,5 @@ def distinct_modes(state: State) -> list[int]:
 
 def _close(state: State, a: int, b: int) -> bool:
     """Whether optimum b's normal holds optimum a well inside it."""
-    gap = state["mode_theta"][a] - state["mode_theta"][b]
-    return bool(gap @ state["mode_precision"][b] @ gap < len(gap))
+    gap = state["mode_mean"][a] - state["mode_mean"][b]
+    return bool(gap @ np.linalg.solve(state["mode_covariance"][b], gap) < len(gap))

@@ -50,14 +50,21 @@ class Fit:
 
 
 def energy_of(
-    windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, residual: FloatArray
+    windows: Windows,
+    noise: Noise,
+    prior: QuadraticPrior,
+    theta: FloatArray,
+    starts: FloatArray,
+    residual: FloatArray,
 ) -> float:
     """Half the whitened sum of squares of a residual (W, L, C), plus the priors."""
     fit = 0.5 * float(windows.chi_square(residual[None], noise)[0])
     return fit + prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
 
 
-def energy(windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray) -> float:
+def energy(
+    windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray
+) -> float:
     """``energy_of`` a simulation at (theta, starts); infinite where that is not valid."""
     residual, valid = windows.residuals(theta[None], starts[None])
     return energy_of(windows, noise, prior, theta, starts, residual[0]) if valid[0] else np.inf

@@ -30,10 +30,10 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import Laplace, distinct_modes, fixed_sd, longest_tau
+from sipe_bayes.inference.laplace import Laplace, distinct_modes, free_noise, longest_tau
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Windows
-from sipe_bayes.noise import Marginal, Moments, Noise, Pulls, restricted
+from sipe_bayes.noise import Marginal, Noise, Pulls, noise_covariance
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.trajectory import Trajectories
 
@@ -57,8 +57,14 @@ class MCMC(Estimator):
     name: ClassVar[str] = "mcmc"
     default_budget: ClassVar[int] = 50_000
 
-    def __init__(self, simulator: Any, *, walkers: int | None = None, effective: int = 400, **settings: Any) -> None:
+    def __init__(
+        self, simulator: Any, *, walkers: int | None = None, effective: int = 400, **settings: Any
+    ) -> None:
         super().__init__(simulator, **settings)
+        if self.likelihood.noise == "sandwich":
+            raise ValueError(
+                "noise: 'sandwich' is a width without a likelihood, for laplace only; use 'ar1' with mcmc"
+            )
         if walkers is not None and walkers < 2 * len(self.space) + 2:
             raise ValueError(f"walkers: expected at least {2 * len(self.space) + 2}, got {walkers}")
         self.walkers, self.effective = walkers, effective
@@ -79,7 +85,11 @@ class MCMC(Estimator):
         best = distinct_modes(first._state)[0]
         picked = {k: first._state[f"mode_{k}"][best] for k in ("theta", "starts", "slope", "sd", "tau")}
         linearisation = windows.linearise(picked["theta"], picked["starts"])
-        spread = self._noise_covariance(windows, windows.moments(linearisation), picked)
+        noise, held = Noise(picked["sd"], picked["tau"]), (picked["theta"] <= 0) | (picked["theta"] >= 1)
+        prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
+        start_pull = -windows.start_precision * picked["starts"]
+        here = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
+        spread = noise_covariance(windows.moments(linearisation), noise, here, free_noise(windows))
         random = np.random.RandomState(self.seed)
         state = {
             "done": False,
@@ -102,39 +112,6 @@ class MCMC(Estimator):
             "chain_log_prob": np.empty((0, count)),
             **_random_state(random),
         }
-
-    def _noise_covariance(self, windows: Windows, moments: Moments, picked: dict[str, FloatArray]) -> FloatArray:
-        """Covariance of the free (log sigma, log tau): inverse curvature of the restricted likelihood at its optimum."""
-        free, held = self._free_noise(windows), (picked["theta"] <= 0) | (picked["theta"] >= 1)
-        prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
-        centre = np.log(np.maximum(np.concatenate([picked["sd"], picked["tau"]]), 1e-300))
-        channels, start_pull = len(picked["sd"]), -windows.start_precision * picked["starts"]
-        context = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
-
-        def value(x: FloatArray) -> float:
-            logs = centre.copy()
-            logs[free] += x
-            tau = np.exp(logs[channels:]) if self.likelihood.noise == "ar1" else np.zeros(channels)
-            return restricted(moments, Noise(np.exp(logs[:channels]), tau), context)
-
-        unit, step = np.eye(len(free)), 0.05
-        curvature = np.array(
-            [
-                [
-                    value(step * (a + b)) - value(step * (a - b)) - value(step * (b - a)) + value(-step * (a + b))
-                    for b in unit
-                ]
-                for a in unit
-            ]
-        )
-        moments_, axes = np.linalg.eigh(-curvature.reshape(len(free), len(free)) / (4 * step**2))
-        return (axes / np.clip(moments_, 1.0, 1e4)) @ axes.T  # sds between 0.01 and 1
-
-    def _free_noise(self, windows: Windows) -> NDArray[np.int64]:
-        """Which of (log sigma (C), log tau (C)) are sampled."""
-        free = np.isnan(fixed_sd(windows))
-        coloured = np.full(len(free), self.likelihood.noise == "ar1")
-        return np.flatnonzero(np.concatenate([free, coloured]))
 
     def _noise_bounds(self, windows: Windows, picked: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
         shortest = float(windows.dt.min())
@@ -213,7 +190,9 @@ class MCMC(Estimator):
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
         if not len(state["chain"]):
-            raise ValueError(f"budget: {self.budget} rollouts were not enough for one block of steps; raise it")
+            raise ValueError(
+                f"budget: {self.budget} rollouts were not enough for one block of steps; raise it"
+            )
         n = len(self.space)
         chain, log_prob = self._kept(state), state["chain_log_prob"][-len(self._kept(state)) :]
         thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
@@ -237,7 +216,9 @@ class MCMC(Estimator):
 
     def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
         target = _Target(self, self.windows(trajectories), state)
-        sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
+        sd, tau = target.noise(
+            np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None]
+        )
         return {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
 
     def _linearisation_error(self, state: State, trajectories: Trajectories) -> float:
@@ -263,7 +244,7 @@ class _Proposal:
         self.theta = GaussianMixture(
             state["proposal_weights"], state["proposal_means"], state["proposal_covariances"], owner.space
         )
-        free = owner._free_noise(windows)
+        free = free_noise(windows)
         logs = np.log(np.maximum(np.concatenate([state["fit_sd"], state["fit_tau"]]), 1e-300))
         low, high = owner._noise_bounds(windows, {k: state[f"fit_{k}"] for k in ("sd", "tau")})
         self.centre = np.clip(logs, low + 0.1, high - 0.1)[free]
@@ -296,16 +277,22 @@ class _Target:
     def __init__(self, owner: MCMC, windows: Windows, state: State) -> None:
         self.owner, self.windows, self.n = owner, windows, len(owner.space)
         self.fit = {k[4:]: v for k, v in state.items() if k.startswith("fit_")}
-        self.free = owner._free_noise(windows)
+        self.free = free_noise(windows)
         self.low, self.high = owner._noise_bounds(windows, self.fit)
         self.marginal = Marginal(windows.sequences, self.fit["jacobian"], windows.start_precision)
 
     def noise(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """sd and tau (B, C) of walkers."""
-        logs = np.tile(np.log(np.maximum(np.concatenate([self.fit["sd"], self.fit["tau"]]), 1e-300)), (len(points), 1))
+        logs = np.tile(
+            np.log(np.maximum(np.concatenate([self.fit["sd"], self.fit["tau"]]), 1e-300)), (len(points), 1)
+        )
         logs[:, self.free] = points[:, self.n :]
         channels = len(self.fit["sd"])
-        tau = np.exp(logs[:, channels:]) if self.owner.likelihood.noise == "ar1" else np.zeros((len(points), channels))
+        tau = (
+            np.exp(logs[:, channels:])
+            if self.owner.likelihood.noise == "ar1"
+            else np.zeros((len(points), channels))
+        )
         return np.exp(logs[:, :channels]), tau
 
     def __call__(self, points: FloatArray) -> FloatArray:

@@ -1,0 +1,46 @@
+# `make demo` and `make test` set up .venv when it is missing or out of date. PYTHON: 3.11 or later.
+# PIP_ARGS: for pip, e.g. PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" for torch without CUDA.
+
+PYTHON ?= python3
+PIP_ARGS ?=
+BIN := .venv/bin
+READY := .venv/.ready
+PIP := $(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt
+
+.PHONY: demo test bench studies wheel-check clean
+.DEFAULT_GOAL := test
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed, $(PYTHON) is %d.%d: make PYTHON=python3.11" % sys.version_info[:2])'
+	@echo "setting up .venv, a few minutes"
+	$(PYTHON) -m venv .venv
+	$(PIP) torch # first and alone, so that a build without CUDA is taken where one is offered
+	$(PIP) -e '.[dev]'
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/python examples/demo.py
+
+test: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+bench: $(READY)
+	$(BIN)/python tests/bench/bench.py
+
+studies: $(patsubst examples/studies/%.py,study-%,$(wildcard examples/studies/[a-z]*.py))
+
+study-%: $(READY)
+	$(BIN)/python examples/studies/$*.py
+
+# sdist -> wheel, then: only sipe_bayes in it, with what it needs to run
+wheel-check: $(READY)
+	rm -rf build/wheel-check
+	$(BIN)/python -m build --no-isolation --outdir build/wheel-check . >build.log 2>&1 || { cat build.log; rm -f build.log; exit 1; }
+	@rm -f build.log
+	$(BIN)/python .ci/check_wheel.py build/wheel-check
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,98 @@
+"""``make demo``: calibrate the simple pendulum from one real log and compare it on two others.
+
+The comparison is the error over 0.5 s open-loop windows of logs that were not used for the fit, from the same starts:
+the posterior's mode, the identification published with the logs, and the model as weighed, without friction.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.calibration import prepare, run
+from sipe_bayes.cli import Progress, print_calibration
+from sipe_bayes.diagnostics.evaluate import errors
+from sipe_bayes.diagnostics.result import Calibration
+from sipe_bayes.likelihood import Windows
+from sipe_bayes.output import OutputError
+
+CONFIG = Path(__file__).parent / "simple_pendulum" / "calibrate.toml"
+OUT = Path("runs")
+
+INERTIA, MASS_LENGTH = 0.06259, 0.1022  # kg m^2, kg m: published with the logs
+VISCOUS, COULOMB, OFFSET = 0.04707, 0.1839, -0.07586  # N m s/rad, N m, N m
+GRAVITY = 9.81  # m/s^2
+STEP = 5e-4  # s
+
+
+def published_acceleration(angle: NDArray[np.float64], rate: NDArray[np.float64], torque: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The published equation of motion, with the offset added to the measured torque and the arctangent as stated."""
+    friction = VISCOUS * rate + COULOMB * np.arctan(100 * rate)
+    return (torque + OFFSET - friction - MASS_LENGTH * GRAVITY * np.sin(angle)) / INERTIA
+
+
+def simulate_published(windows: Windows) -> NDArray[np.float64]:
+    """Angles (W, L) of the published model over the windows: MuJoCo has no arctangent friction, so by Runge-Kutta."""
+    starts = windows.states(windows.no_starts())
+    angle, rate = starts[:, 1].copy(), starts[:, 2].copy()
+    path = [angle.copy()]
+    for k in range(windows.actions.shape[1]):
+        torque, parts = windows.actions[:, k, 0], int(np.ceil(windows.dt.max() / STEP))
+        h = windows.dt / parts
+        for _ in range(parts):
+            v1, a1 = rate, published_acceleration(angle, rate, torque)
+            v2 = rate + h / 2 * a1
+            a2 = published_acceleration(angle + h / 2 * v1, v2, torque)
+            v3 = rate + h / 2 * a2
+            a3 = published_acceleration(angle + h / 2 * v2, v3, torque)
+            v4 = rate + h * a3
+            a4 = published_acceleration(angle + h * v3, v4, torque)
+            angle = angle + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
+            rate = rate + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        path.append(angle)
+    return np.stack(path, axis=1)
+
+
+def published_errors(windows: Windows) -> NDArray[np.float64]:
+    """RMSE (logs,) of the published model, counted as ``errors`` counts."""
+    difference = windows.measured[:, :, 0] - simulate_published(windows)
+    square = np.where(windows.observed[:, :, 0], difference, 0.0) ** 2
+    mine = [windows.log == k for k in range(len(windows.trajectories))]
+    return np.array([np.sqrt(square[m].sum() / windows.observed[m].sum()) for m in mine])
+
+
+def calibrate() -> Calibration:
+    """Into runs/demo, or a fresh folder when that one holds another configuration's run."""
+    folders = [OUT / "demo", *(OUT / f"demo-{n}" for n in range(2, 100))]
+    for folder in folders:
+        try:
+            with Progress() as progress:
+                return run(CONFIG, out=folder, progress=progress.update)
+        except OutputError:
+            continue
+    raise OutputError(f"{OUT}: holds a hundred demos; delete them")
+
+
+def main() -> int:
+    found = calibrate()
+    print_calibration(found)
+    problem = prepare(CONFIG)
+    if problem.holdout is None:
+        raise ValueError(f"{CONFIG}: no log is held out; mark one with use = 'holdout'")
+    windows = Windows(problem.likelihood, problem.simulator, problem.holdout)
+    space = problem.environment.space
+    ours, weighed = errors(windows, np.stack([found.posterior.mode.numpy(), space.default_theta]))[:, :, 0]
+    print("\nHeld-out error over 0.5 s windows (RMSE, rad), from the same starts")
+    print(f"{'log':28}{'posterior mode':>16}{'published':>12}{'weighed, no friction':>23}")
+    rows = zip(problem.holdout.names, ours, published_errors(windows), weighed, strict=True)
+    for name, *values in rows:
+        print(f"{name:28}{values[0]:16.3f}{values[1]:12.3f}{values[2]:23.3f}")
+    print(f"\nreport: {Path(found.out).resolve() / 'report.html'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
