@@ -35,12 +35,9 @@ studies: $(patsubst examples/studies/%.py,study-%,$(wildcard examples/studies/[a
 study-%: $(READY)
 	$(BIN)/python examples/studies/$*.py
 
-# sdist -> wheel, then: only sipe_bayes in it, with what it needs to run
+# sdist -> wheel, and what the wheel holds
 wheel-check: $(READY)
-	rm -rf build/wheel-check
-	$(BIN)/python -m build --no-isolation --outdir build/wheel-check . >build.log 2>&1 || { cat build.log; rm -f build.log; exit 1; }
-	@rm -f build.log
-	$(BIN)/python .ci/check_wheel.py build/wheel-check
+	.ci/run wheel
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

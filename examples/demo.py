@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from sipe_bayes.calibration import prepare, run
 from sipe_bayes.cli import Progress, print_calibration
@@ -28,10 +29,16 @@ GRAVITY = 9.81  # m/s^2
 STEP = 5e-4  # s
 
 
-def published_acceleration(angle: NDArray[np.float64], rate: NDArray[np.float64], torque: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The published equation of motion, with the offset added to the measured torque and the arctangent as stated."""
+def published_acceleration(
+    angle: NDArray[np.float64], rate: NDArray[np.float64], torque: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The published equation of motion: measured torque = J a + m g c sin(q) + viscous + Coulomb atan(100 v) + offset.
+
+    The offset is thus taken off the measured torque, the sign with which a linear regression of that torque yields it;
+    the arctangent counts as stated, so that Coulomb friction reaches pi / 2 times its coefficient.
+    """
     friction = VISCOUS * rate + COULOMB * np.arctan(100 * rate)
-    return (torque + OFFSET - friction - MASS_LENGTH * GRAVITY * np.sin(angle)) / INERTIA
+    return (torque - OFFSET - friction - MASS_LENGTH * GRAVITY * np.sin(angle)) / INERTIA
 
 
 def simulate_published(windows: Windows) -> NDArray[np.float64]:
@@ -76,8 +83,21 @@ def calibrate() -> Calibration:
     raise OutputError(f"{OUT}: holds a hundred demos; delete them")
 
 
+def save_picture(found: Calibration) -> Path:
+    """The README's picture, from the report's figures: a held-out log above the marginals."""
+    figures = Path(found.out) / "figures"
+    parts = [Image.open(figures / f"{name}.png") for name in ("signals_1_direct_collocation", "marginals")]
+    whole = Image.new("RGB", (max(p.width for p in parts), sum(p.height for p in parts)), "white")
+    for part, top in zip(parts, (0, parts[0].height), strict=True):
+        whole.paste(part, (0, top))
+    path = Path(found.out) / "figure.png"
+    whole.quantize(64).save(path, optimize=True)
+    return path
+
+
 def main() -> int:
     found = calibrate()
+    save_picture(found)
     print_calibration(found)
     problem = prepare(CONFIG)
     if problem.holdout is None:

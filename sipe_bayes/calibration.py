@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config
-from sipe_bayes.diagnostics.agreement import Disagreement, LogEstimate, disagreement
+from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
 from sipe_bayes.diagnostics.evaluate import channel_scores, fitted_residuals, signals
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary, Ridge
@@ -21,8 +21,7 @@ from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import estimator_class, get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
+from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
 from sipe_bayes.output import CHECKPOINT, claim, describe_run, write_all
 from sipe_bayes.parameters import Parameter, ParameterSpace
@@ -30,7 +29,7 @@ from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
-from sipe_bayes.units import find_unit
+from sipe_bayes.units import find_unit, to_si
 
 FloatArray = NDArray[np.float64]
 
@@ -96,6 +95,7 @@ def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
                 scale=entry.scale,
                 targets=entry.targets,
                 relative=entry.factor is not None,
+                unit=_command_unit(config, entry.targets[0]),
                 prior_mean=entry.prior.mean if entry.prior else None,
                 prior_sd=entry.prior.sd if entry.prior else None,
                 description=entry.description,
@@ -111,6 +111,12 @@ def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
         raise
     except ValueError as error:
         raise ConfigError(f"{config.path}: {error}") from None
+
+
+def _command_unit(config: Config, target: str) -> str:
+    """The unit of a command offset is the command's; other units are the model's own (empty here)."""
+    units = {f"{c.target}.offset": to_si(c.unit)[1] for c in config.commands}
+    return units.get(target, "")
 
 
 def _likelihood(config: Config) -> Segments:
@@ -182,7 +188,7 @@ def calibrate(
     train = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.train)
     fitted = problem.likelihood.bind(problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
-    conflict = _compare_logs(problem, posterior, method.seed)
+    conflict = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed)
     draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(method.seed))
     summaries = _summaries(problem, posterior, draws, dead, conflict)
     found = ridges(problem.environment.space, draws, [p.contraction for p in summaries])
@@ -215,27 +221,6 @@ def _run_name(config: Config) -> str:
     return config.path.resolve().parent.name if stem in ("calibrate", "config") else stem
 
 
-def _compare_logs(problem: Problem, posterior: Posterior, seed: int) -> Disagreement | None:
-    """Fit each training log by itself, from the joint mode, and compare."""
-    if len(problem.train) < 2:
-        return None
-    estimates = []
-    for trajectory in problem.train:
-        alone = Laplace(
-            problem.simulator,
-            likelihood=problem.likelihood,
-            seed=seed,
-            initial=posterior.mode.numpy(),
-            budget=10**6,
-        )
-        try:
-            alone.fit(trajectory)
-        except (ValueError, BudgetExhausted, np.linalg.LinAlgError):
-            continue
-        estimates.append(LogEstimate(trajectory.name, *alone.information()))
-    return disagreement(problem.environment.space, estimates)
-
-
 def _summaries(
     problem: Problem,
     posterior: Posterior,
@@ -266,16 +251,18 @@ def _summaries(
             flags.append("nuisance")
         rows.append(
             ParameterSummary(
-                p.name,
-                p.unit,
-                p.targets,
-                float(draws[:, j].mean()),
-                float(draws[:, j].std()),
-                *(float(q) for q in quantiles[:, j]),
-                float(mode[j]),
-                p.default,
-                float(contraction[j]),
-                tuple(flags),
+                name=p.name,
+                unit=p.unit,
+                targets=p.targets,
+                mean=float(draws[:, j].mean()),
+                sd=float(draws[:, j].std()),
+                q05=float(quantiles[0, j]),
+                q50=float(quantiles[1, j]),
+                q95=float(quantiles[2, j]),
+                mode=float(mode[j]),
+                default=p.default,
+                contraction=float(contraction[j]),
+                flags=tuple(flags),
             )
         )
     return rows

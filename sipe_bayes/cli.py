@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +20,7 @@ app = typer.Typer(
 )
 
 BAD_INPUT = 2
+_PIPED_WIDTH = 120
 
 
 def main() -> None:
@@ -45,38 +45,48 @@ def calibrate(
 ) -> None:
     """Posterior of a simulator's parameters from logs of the real machine."""
     from sipe_bayes.calibration import run
+    from sipe_bayes.output import to_json
 
-    with _Progress(quiet=as_json) as progress:
+    with Progress(quiet=as_json) as progress:
         try:
+            _check("--seed", seed, 0)
+            _check("--budget", budget, 1)
+            _check("--threads", threads, 1)
             found = run(config, estimator, seed, budget, out, threads, progress.update)
         except (ValueError, OSError) as error:
             progress.stop()
             print(f"sipe: {_one_line(error)}", file=sys.stderr)
             raise typer.Exit(BAD_INPUT) from None
     if as_json:
-        print(json.dumps(found.to_dict()))
+        print(to_json(found.to_dict()))
     else:
-        _print(found)
+        print_calibration(found)
+
+
+def _check(option: str, value: int | None, least: int) -> None:
+    if value is not None and value < least:
+        raise ValueError(f"{option} {value}: expected at least {least}; raise it or leave it out")
 
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-class _Progress:
+class Progress:
     """A bar on a terminal; nothing when piped."""
 
-    def __init__(self, quiet: bool) -> None:
+    def __init__(self, quiet: bool = False) -> None:
         self._bar: Any = None
         if not quiet and sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+            from rich.progress import Progress as Bar
 
             columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed} rollouts"))
-            self._bar = Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+            self._bar = Bar(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
             self._task = self._bar.add_task("reading", total=None)
 
-    def __enter__(self) -> _Progress:
+    def __enter__(self) -> Progress:
         if self._bar is not None:
             self._bar.start()
         return self
@@ -94,20 +104,24 @@ class _Progress:
             self._bar.update(self._task, description=what, completed=rollouts, total=budget)
 
 
-def _print(found: Calibration) -> None:
+def print_calibration(found: Calibration) -> None:
+    """The table of parameters, the errors, the warnings and where the report lies, on standard output."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from sipe_bayes.diagnostics.report import parameter_verdict, significant
 
     console = Console(soft_wrap=True)
-    table = Table(title=f"{found.name}: posterior by {found.estimator}", title_justify="left")
+    if not console.is_terminal:
+        console.width = _PIPED_WIDTH
+    table = Table(title=Text(f"{found.name}: posterior by {found.estimator}"), title_justify="left")
     for heading in ("parameter", "estimate", "90 % interval", "unit", "contraction", "verdict"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "verdict") else "right")
     for p in found.parameters:
         low, high = significant(p.q05, p.sd), significant(p.q95, p.sd)
         table.add_row(
-            p.name,
+            Text(p.name),  # brackets of a name are not markup
             f"{significant(p.mode, p.sd)} ± {significant(p.sd, p.sd)}",
             f"{low} .. {high}",
             p.unit,
@@ -122,6 +136,7 @@ def _print(found: Calibration) -> None:
                 f"{title} {s.log}, {s.channel}: RMSE {s.rmse:.3g} {s.unit}; model as given {s.rmse_default:.3g} "
                 f"({ratio:.1f} times that of the estimate)",
                 highlight=False,
+                markup=False,
             )
     for warning in found.warnings:
         console.print(f"warning: {warning}", highlight=False, markup=False)

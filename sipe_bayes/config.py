@@ -218,7 +218,9 @@ class LogEntry(Table):
     name: Text = ""
     use: Use = "train"
     span: Pair | None = None
-    window: Annotated[float | Literal["log"] | None, BeforeValidator(lambda v: None if v is None else _window(v))] = None
+    window: Annotated[float | Literal["log"] | None, BeforeValidator(lambda v: None if v is None else _window(v))] = (
+        None
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -276,9 +278,7 @@ class ParameterEntry(Table):
         if "target" not in data:
             return data
         if not isinstance(data["target"], str):
-            raise _problem(
-                f"expected one string, got {data['target']!r}; for several use `targets`", "target"
-            )
+            raise _problem(f"expected one string, got {data['target']!r}; for several use `targets`", "target")
         return {**{k: v for k, v in data.items() if k != "target"}, "targets": [data["target"]]}
 
     @model_validator(mode="after")
@@ -460,9 +460,7 @@ def load_config(path: str | Path) -> Config:
         raise ConfigError(f"{path}: {_one_line(error.errors()[0])}") from None
     config._path = path
     if not config.model.is_file():
-        raise ConfigError(
-            f"{path}: key `model`: no such file, got {config.model}; {nearest_file(config.model)}"
-        )
+        raise ConfigError(f"{path}: key `model`: no such file, got {config.model}; {nearest_file(config.model)}")
     return config
 
 

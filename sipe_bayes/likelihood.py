@@ -63,7 +63,9 @@ class Segments:
         windows = Windows(self, simulator, trajectories)
         for name, seen in zip(windows.fitted, windows.observed.any(axis=(0, 1)), strict=True):
             if not seen:
-                raise ValueError(f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`")
+                raise ValueError(
+                    f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`"
+                )
         return windows
 
 
@@ -85,7 +87,10 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
             measured[column] = np.interp(np.arange(len(series)), there, series[there])
     for joint in range(model.njnt):
         if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            position, velocity = 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
+            position, velocity = (
+                1 + int(model.jnt_qposadr[joint]),
+                1 + model.nq + int(model.jnt_dofadr[joint]),
+            )
             if position in measured and velocity not in measured:
                 states[:, velocity] = _smooth(measured[position], trajectory.dt, 1)
     for column, series in measured.items():
@@ -123,7 +128,9 @@ class Windows:
                 f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
             )
         if trajectories.actions.shape[2] != environment.num_actions:
-            raise ValueError(f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}")
+            raise ValueError(
+                f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
+            )
         self.channels = self._fitted(environment.channels)
         self._cut(trajectories)
         self._read_samples(trajectories)
@@ -165,7 +172,9 @@ class Windows:
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
         self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
-        self.actions = trajectories.actions[self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)][:, :-1]
+        self.actions = trajectories.actions[
+            self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)
+        ][:, :-1]
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
         guesses = [estimate_states(simulator, t) for t in trajectories]
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
@@ -272,4 +281,4 @@ class Windows:
         """Whitened sum of squares (B,) of residuals (B, W, L, C)."""
         flat = residual.reshape(len(residual), -1, len(self.channels))
         parts = [whiten(flat[..., c], s, float(noise.sd[c]), float(noise.tau[c])) for c, s in enumerate(self.sequences)]
-        return sum((p**2).sum(-1) for p in parts)  # type: ignore[return-value]
+        return np.asarray(sum((p**2).sum(-1) for p in parts))

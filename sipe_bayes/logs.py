@@ -115,9 +115,7 @@ def _read_csv(path: Path) -> Columns:
     separator = _separator(header)
     names = [name.strip() for name in _split(header.lstrip("# "), separator)]
     if any(_is_number(name) for name in names):
-        raise LogError(
-            f"{path}: the first line must name the columns, got {header[:40]!r}; add a header line"
-        )
+        raise LogError(f"{path}: the first line must name the columns, got {header[:40]!r}; add a header line")
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise LogError(f"{path}: column {twice[0]!r} appears more than once; rename one of them")
@@ -369,9 +367,7 @@ def _check_any(log: LogEntry, name: str, before: FloatArray, after: FloatArray) 
     if not np.isfinite(before).any():
         raise LogError(f"log {log.name!r}: measured column {name!r} holds no number; drop the measurement")
     if not np.isfinite(after).any():
-        raise LogError(
-            f"log {log.name!r}: no sample of measured column {name!r} survives; raise `resample.max_gap`"
-        )
+        raise LogError(f"log {log.name!r}: no sample of measured column {name!r} survives; raise `resample.max_gap`")
 
 
 # The grid
@@ -469,9 +465,7 @@ def _report(config: Config, log: LogEntry, raw: _Raw, grid: _Grid, trajectory: T
 def _clock_note(raw: _Raw, grid: _Grid, jitter: float) -> str:
     rate = f"{1 / grid.dt:.4g} Hz"
     if grid.regular:
-        return (
-            f"{len(raw.time)} samples passed through unchanged at {rate}; clock jitter {1e3 * jitter:.3g} ms"
-        )
+        return f"{len(raw.time)} samples passed through unchanged at {rate}; clock jitter {1e3 * jitter:.3g} ms"
     own = f"{1 / float(np.median(np.diff(raw.time))):.4g} Hz"
     return f"{len(raw.time)} samples at {own}, clock jitter {1e3 * jitter:.3g} ms, resampled to {rate}"
 

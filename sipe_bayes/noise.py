@@ -16,18 +16,19 @@ Biometrika 58): -2 l_R = log|V| + log|A| + r' V^-1 r - b' A^-1 b, A = J' V^-1 J 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
-_RESTARTS, _GAIN = 5, 1e-3  # of the search for the noise; nats
+_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-4, 100, 2.0  # of the search for the noise: nats, steps, of a logarithm
 _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
 
 
@@ -58,12 +59,10 @@ def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: 
         steps = np.diff(number, prepend=0)
         linked = np.zeros(len(index), bool)
         if len(index) > 1:
-            linked[1:] = (
-                (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
-            )
+            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
         previous = np.where(linked, np.concatenate([[-1], index[:-1]])[: len(index)], -1)
         seconds = np.where(linked, steps * dt[window], np.inf)
-        gaps, gap = np.unique(np.round(seconds, 12), return_inverse=True)
+        gaps, gap = np.unique(np.asarray(np.round(seconds, 12), np.float64), return_inverse=True)
         crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
         found.append(Sequence(index, previous, window, crosses, gap, gaps))
     return found
@@ -103,58 +102,77 @@ class Moments:
     """Noise-free products of the rows of a linearisation, per channel and gap.
 
     residual (W, L, C); jacobian (W, L, C, N + D): derivatives of the prediction by theta and the window's start.
+    With x a row and y the row before it, each of the G pairs of channel and gap has the sums x x', x y' + y x' and
+    y y' over its samples: ``products`` (3 G, W K K). gaps, owner (its channel) and counts are (G,).
     """
 
     def __init__(
         self, residual: FloatArray, jacobian: FloatArray, num_theta: int, all_sequences: list[Sequence]
     ) -> None:
-        windows, length, _channels, columns = jacobian.shape
+        windows, length, channels, columns = jacobian.shape
         self.num_theta, self.num_start, self.windows = num_theta, columns - num_theta, windows
         self.sequences = all_sequences
-        width = num_theta + 2 * self.num_start + 1
-        own = slice(num_theta, num_theta + self.num_start)
-        prev = slice(num_theta + self.num_start, width - 1)
-        self.blocks: list[list[tuple[FloatArray, FloatArray, FloatArray]]] = []
-        flat_r = residual.reshape(windows * length, -1)
-        flat_j = jacobian.reshape(windows * length, -1, columns)
+        self.gaps = np.concatenate([s.gaps for s in all_sequences])
+        self.owner = np.repeat(np.arange(channels), [len(s.gaps) for s in all_sequences])
+        self.counts = np.concatenate([np.bincount(s.gap, minlength=len(s.gaps)) for s in all_sequences])
+        rows = np.empty((channels, windows * length, columns + 1))
+        rows[:, :, :-1] = np.moveaxis(jacobian, 2, 0).reshape(channels, windows * length, columns)
+        rows[:, :, -1] = np.moveaxis(residual, 2, 0).reshape(channels, windows * length)
+        width = columns + self.num_start + 1
+        products = np.zeros((len(self.gaps), 3, windows, width, width))
+        first = 0
         for c, s in enumerate(all_sequences):
-            rows = np.zeros((len(s.index), width))
-            rows[:, :num_theta], rows[:, own], rows[:, -1] = (
-                flat_j[s.index, c, :num_theta],
-                flat_j[s.index, c, num_theta:],
-                flat_r[s.index, c],
-            )
-            lagged = np.zeros_like(rows)
-            has = s.previous >= 0
-            before = s.previous[has]
-            lagged[has, :num_theta], lagged[has, -1] = flat_j[before, c, :num_theta], flat_r[before, c]
-            same = has & ~s.crosses
-            lagged[same, own] = flat_j[s.previous[same], c, num_theta:]
-            lagged[s.crosses, prev] = flat_j[s.previous[s.crosses], c, num_theta:]
-            self.blocks.append([self._products(rows, lagged, s, g) for g in range(len(s.gaps))])
+            self._add_products(products[first : first + len(s.gaps)], rows[c], s)
+            first += len(s.gaps)
+        self.products = products.reshape(3 * len(self.gaps), -1)
 
-    def _products(self, rows: FloatArray, lagged: FloatArray, s: Sequence, g: int) -> tuple[FloatArray, ...]:
-        """Sums over the samples with gap g of x x', x y' + y x', y y' per window; x a row, y the row before."""
-        chosen = np.flatnonzero(s.gap == g)
-        bounds = np.searchsorted(s.window[chosen], np.arange(self.windows + 1))
-        width = rows.shape[1]
-        out = np.zeros((3, self.windows, width, width))
-        for w in range(self.windows):
-            part = chosen[bounds[w] : bounds[w + 1]]
-            if len(part):
-                x, y = rows[part], lagged[part]
-                cross = x.T @ y
-                out[0, w], out[1, w], out[2, w] = x.T @ x, cross + cross.T, y.T @ y
-        return out[0], out[1], out[2]
+    def _add_products(self, out: FloatArray, rows: FloatArray, s: Sequence) -> None:
+        """Add the sums of one channel to ``out`` (its gaps, 3, W, K, K); rows (W L, N + D + 1)."""
+        n, d, size = self.num_theta, self.num_start, rows.shape[1]
+        own = np.r_[0 : n + d, n + 2 * d]
+        before = np.r_[0:n, n + d : n + 2 * d, n + 2 * d]
+        both = np.concatenate([rows[s.index], np.where((s.previous >= 0)[:, None], rows[s.previous], 0.0)], axis=1)
+        # runs of samples of the same window, gap and side of a window's edge
+        key = (s.window * len(s.gaps) + s.gap) * 2 + s.crosses
+        order = np.argsort(key, kind="stable")
+        edges = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1))
+        for begin, end in zip(edges[:-1], edges[1:], strict=True):
+            part = order[begin:end]
+            w, g, crosses = s.window[part[0]], s.gap[part[0]], s.crosses[part[0]]
+            chosen = both[part[0] : part[-1] + 1] if part[-1] - part[0] == len(part) - 1 else both[part]
+            square, lag = chosen.T @ chosen, before if crosses else own
+            block = out[g, :, w]
+            block[0][np.ix_(own, own)] += square[:size, :size]
+            block[1][np.ix_(own, lag)] += square[:size, size:]
+            block[1][np.ix_(lag, own)] += square[size:, :size]
+            block[2][np.ix_(lag, lag)] += square[size:, size:]
 
     def normal(self, noise: Noise) -> FloatArray:
         """Whitened products (W, K, K), K = N + 2 D + 1, summed over channels."""
-        total = 0.0
-        for c, s in enumerate(self.sequences):
-            a = coefficients(s.gaps, float(noise.tau[c]))
-            for g, (xx, xy, yy) in enumerate(self.blocks[c]):
-                total = total + (xx - a[g] * xy + a[g] ** 2 * yy) / (noise.sd[c] ** 2 * (1 - a[g] ** 2))
-        return np.asarray(total)
+        a = coefficients(self.gaps, noise.tau[self.owner])
+        weight = 1 / (noise.sd[self.owner] ** 2 * (1 - a**2))
+        width = self.num_theta + 2 * self.num_start + 1
+        factors = np.stack([weight, -a * weight, a**2 * weight], axis=1)
+        return (factors.ravel() @ self.products).reshape(self.windows, width, width)
+
+    def log_determinant(self, noise: Noise) -> float:
+        """log|V| of the residual covariance."""
+        a = coefficients(self.gaps, noise.tau[self.owner])
+        return float(self.counts @ np.log(noise.sd[self.owner] ** 2 * (1 - a**2)))
+
+    def slopes(self, noise: Noise, inner: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (C,) by log sd and by log tau of sum(inner * normal(noise)) + log|V|; inner (W, K, K)."""
+        tau = noise.tau[self.owner]
+        a = coefficients(self.gaps, tau)
+        weight = 1 / (noise.sd[self.owner] ** 2 * (1 - a**2))
+        xx, xy, yy = (self.products @ inner.ravel()).reshape(-1, 3).T
+        by_sd = -2 * weight * (xx - a * xy + a**2 * yy) + 2 * self.counts
+        by_weight = 2 * a * weight / (1 - a**2)
+        by_a = by_weight * (xx - a * xy + a**2 * yy) + weight * (2 * a * yy - xy) - 2 * a * self.counts / (1 - a**2)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            by_tau = np.where(a > 0, by_a * a * self.gaps / tau, 0.0)
+        channels = len(noise.sd)
+        return np.bincount(self.owner, by_sd, channels), np.bincount(self.owner, by_tau, channels)
 
 
 @dataclass(frozen=True)
@@ -162,7 +180,8 @@ class Arrow:
     """Normal equations with the starts eliminated.
 
     precision (N, N) and gradient (N,) of theta with the starts marginalised (no prior on theta in them);
-    log_determinant of the starts' block; explained: b_x' A_xx^-1 b_x; square: r' V^-1 r; solve gives the starts' step.
+    log_determinant of the starts' block; explained: b_x' A_xx^-1 b_x; square: r' V^-1 r; start_offset (W, D) and
+    start_slope (W, D, N) give the starts' step; factor (2 D, W D): banded Cholesky factor of the starts' block.
     """
 
     precision: FloatArray
@@ -172,6 +191,7 @@ class Arrow:
     square: float
     start_offset: FloatArray
     start_slope: FloatArray
+    factor: FloatArray
 
     def starts(self, step: FloatArray) -> FloatArray:
         """Best change of the starts (W, D) for a change ``step`` (N,) of theta."""
@@ -203,16 +223,14 @@ def eliminate(
     right[:-1, :, n] += normal[1:, prev, r]
     index = np.arange(d)
     diagonal[:, index, index] = diagonal[:, index, index] * (1 + damping) + start_precision
-    band = np.zeros((2 * d, windows * d))  # lower form: band[i - j, j] = A[i, j]
-    for i in range(d):
-        for j in range(i + 1):
-            band[i - j, j::d] = diagonal[:, i, j]
-        for j in range(d):
-            band[d + i - j, j : (windows - 1) * d : d] = corner[:, j, i]
+    band = np.zeros((2 * d, windows, d))  # lower form: band[i - j, j] = A[i, j]
+    i, j = np.tril_indices(d)
+    band[i - j, :, j] = diagonal[:, i, j].T
+    i, j = np.indices((d, d)).reshape(2, -1)
+    band[d + i - j, :-1, j] = corner[:, j, i].T
+    band = band.reshape(2 * d, windows * d)
     factor = scipy.linalg.cholesky_banded(band, lower=True, check_finite=False)
-    solved = scipy.linalg.cho_solve_banded(
-        (factor, True), right.reshape(windows * d, n + 1), check_finite=False
-    )
+    solved = scipy.linalg.cho_solve_banded((factor, True), right.reshape(windows * d, n + 1), check_finite=False)
     flat = right.reshape(windows * d, n + 1)
     reduced = flat.T @ solved
     precision = normal[:, theta, theta].sum(0) - reduced[:n, :n]
@@ -225,7 +243,29 @@ def eliminate(
         float(normal[:, r, r].sum()),
         solved[:, n].reshape(windows, d),
         solved[:, :n].reshape(windows, d, n),
+        factor,
     )
+
+
+def _start_covariance(factor: FloatArray, windows: int) -> tuple[FloatArray, FloatArray]:
+    """Blocks (w, w) (W, D, D) and (w, w-1) (W, D, D; the first is zero) of the inverse of the starts' matrix.
+
+    factor (2 D, W D): its banded Cholesky factor. Takahashi's recursion: the inverse is never formed as a whole."""
+    d = len(factor) // 2
+    column = np.arange(windows * d).reshape(windows, d)
+    lower, below = np.zeros((windows, d, d)), np.zeros((windows, d, d))
+    for i in range(d):
+        lower[:, i, : i + 1] = np.stack([factor[i - j, column[:, j]] for j in range(i + 1)], axis=1)
+        below[:, i] = np.stack([factor[d + i - j, column[:, j]] for j in range(d)], axis=1)
+    inverse = np.linalg.inv(lower)
+    gain = below @ inverse  # L_{w+1,w} L_w^-1
+    gain[-1] = 0.0
+    same, apart = np.swapaxes(inverse, 1, 2) @ inverse, np.zeros((windows, d, d))
+    for w in range(windows - 2, -1, -1):
+        # the factor of what lies below, seen from this block
+        apart[w + 1] = -same[w + 1] @ gain[w]
+        same[w] -= gain[w].T @ apart[w + 1]
+    return same, apart
 
 
 @dataclass(frozen=True)
@@ -247,14 +287,49 @@ class Pulls:
 def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> float:
     """Restricted log-likelihood of the noise, up to a constant."""
     arrow = eliminate(moments.normal(noise), moments.num_theta, pulls.start_precision, pulls.start_pull)
-    value = log_determinant(moments.sequences, noise) + arrow.log_determinant + arrow.square - arrow.explained
+    return _restricted(moments, noise, pulls, arrow)[0]
+
+
+def _restricted(moments: Moments, noise: Noise, pulls: Pulls, arrow: Arrow) -> tuple[float, FloatArray, FloatArray]:
+    """Restricted log-likelihood; best step (N,) and covariance (N, N) of theta, zero where it may not move."""
+    value = moments.log_determinant(noise) + arrow.log_determinant + arrow.square - arrow.explained
+    n = moments.num_theta
+    move, covariance = np.zeros(n), np.zeros((n, n))
     if pulls.free.any():
         free = np.ix_(pulls.free, pulls.free)
         factor = np.linalg.cholesky(arrow.precision[free] + pulls.prior[free])
-        pull = (arrow.gradient + pulls.prior_pull)[pulls.free]
-        half = scipy.linalg.solve_triangular(factor, pull, lower=True)
+        inverse = np.linalg.inv(factor)
+        half = inverse @ (arrow.gradient + pulls.prior_pull)[pulls.free]
         value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)
-    return -0.5 * value
+        move[pulls.free], covariance[free] = inverse.T @ half, inverse.T @ inverse
+    return -0.5 * value, move, covariance
+
+
+def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray]:
+    """Restricted log-likelihood and its derivatives (C,) by log sd and by log tau.
+
+    With A the precision of all unknowns u = (theta, starts), v_w = (u_w, -1) and dM_w the change of the products of
+    window w, -2 dl = d log|V| + sum_w <A^-1 of that window + v_w v_w', dM_w>."""
+    arrow = eliminate(moments.normal(noise), moments.num_theta, pulls.start_precision, pulls.start_pull)
+    value, move, covariance = _restricted(moments, noise, pulls, arrow)
+    n, d, windows = moments.num_theta, moments.num_start, moments.windows
+    slope, starts = arrow.start_slope, arrow.starts(move)
+    same, apart = _start_covariance(arrow.factor, windows)
+    size = n + 2 * d
+    by_start = np.zeros((windows, size, n))  # how the window's unknowns follow theta
+    by_start[:, :n] = np.eye(n)
+    by_start[:, n : n + d], by_start[1:, n + d :] = -slope, -slope[:-1]
+    inner = np.zeros((windows, size + 1, size + 1))
+    inner[:, :size, :size] = by_start @ covariance @ np.swapaxes(by_start, 1, 2)
+    inner[:, n : n + d, n : n + d] += same
+    inner[1:, n + d : size, n + d : size] += same[:-1]
+    inner[1:, n : n + d, n + d : size] += apart[1:]
+    inner[1:, n + d : size, n : n + d] += np.swapaxes(apart[1:], 1, 2)
+    v = np.zeros((windows, size + 1))
+    v[:, :n], v[:, n : n + d], v[1:, n + d : size], v[:, -1] = move, starts, starts[:-1], -1.0
+    inner += v[:, :, None] * v[:, None, :]
+    by_sd, by_tau = moments.slopes(noise, inner)
+    return value, -0.5 * by_sd, -0.5 * by_tau
 
 
 def estimate_noise(
@@ -269,58 +344,90 @@ def estimate_noise(
     """Noise that maximises the restricted likelihood, started from ``noise``.
 
     fixed_sd (C,): given sds, NaN where to be estimated. coloured: whether tau is estimated, from a tenth of
-    ``shortest`` to ``longest`` seconds. (log innovation sd, log tau) of all channels are searched by L-BFGS.
+    ``shortest`` to ``longest`` seconds. (log innovation sd, log tau) of all channels are searched, whose information
+    is all but diagonal.
     """
     channels, estimated = len(noise.sd), np.isnan(fixed_sd)
 
     def unpack(x: FloatArray) -> Noise:
         tau = np.exp(x[channels:]) if coloured else np.zeros(channels)
-        innovation = (
-            1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
-        )
+        innovation = 1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
         return Noise(np.where(estimated, np.exp(x[:channels]) / np.sqrt(innovation), fixed_sd), tau)
 
-    def loss(x: FloatArray) -> float:
+    def loss(x: FloatArray) -> tuple[float, FloatArray]:
+        here = unpack(x)
         try:
-            value = -restricted(moments, unpack(x), pulls)
+            value, by_sd, by_tau = restricted_slopes(moments, here, pulls)
         except np.linalg.LinAlgError:
-            return 1e12
-        return value if np.isfinite(value) else 1e12
+            return 1e12, np.zeros_like(x)
+        by_sd = np.where(estimated, by_sd, 0.0)
+        slope = by_sd
+        if coloured:
+            ratio = shortest / here.tau
+            a = np.exp(-ratio)
+            slope = np.concatenate([by_sd, by_tau + by_sd * a**2 * ratio / (1 - a**2)])
+        return (-value, -slope) if np.isfinite(value) and np.isfinite(slope).all() else (1e12, np.zeros_like(x))
 
     low, high = np.log(_SHORTEST_TAU * shortest), np.log(longest)
     tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
     if coloured and (noise.tau <= 0).all():
         tau = np.full(channels, np.clip(np.log(10 * shortest), low, high))
-    innovation = (
-        1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
-    )
+    innovation = 1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
     x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation)), tau if coloured else []])
-    bounds = [(x - 12, x + 12) for x in x0[:channels]] + [(low, high)] * (channels if coloured else 0)
-    x, value = x0, loss(x0)
-    for _ in range(_RESTARTS):  # L-BFGS may stop early with a large gradient; from its own result it goes on
-        result = scipy.optimize.minimize(loss, x, method="L-BFGS-B", bounds=bounds, options={"eps": 1e-4})
-        gain, x, value = value - result.fun, result.x, result.fun
-        if gain < _GAIN:
-            break
-    return unpack(x)
+    free_sd, free_tau = np.full(channels, 12.0), np.tile([[low], [high]], channels if coloured else 0)
+    bounds = np.concatenate([[x0[:channels] - free_sd, x0[:channels] + free_sd], free_tau], axis=1)
+    counts = np.array([len(s.index) for s in moments.sequences], float)
+    ratio = shortest / np.exp(tau)
+    information = [2 * counts, counts * ratio**2 / np.maximum(np.expm1(2 * ratio), 1e-300)][: 1 + coloured]
+    return unpack(_minimise(loss, x0, bounds, np.concatenate(information)))
+
+
+def _minimise(
+    loss: Callable[[FloatArray], tuple[float, FloatArray]], x: FloatArray, bounds: FloatArray, curvature: FloatArray
+) -> FloatArray:
+    """Minimiser within bounds (2, n) of a smooth loss in nats, by BFGS steps from a first diagonal ``curvature`` (n,).
+
+    SciPy's L-BFGS-B stops early on these losses and its steps cost more than they do."""
+    hessian = np.diag(np.maximum(curvature, 1.0))
+    value, slope = loss(x)
+    for _ in range(_MOST_STEPS):
+        low, high = np.maximum(bounds[0] - x, -_LONGEST_STEP), np.minimum(bounds[1] - x, _LONGEST_STEP)
+        move, factor, index = np.zeros(len(x)), np.zeros((len(x), len(x) + 7)), np.zeros(len(x), np.int32)
+        if mujoco.mju_boxQP(move, factor, index, hessian, slope, low, high) < 0:
+            return x
+        expected = -float(slope @ move + 0.5 * move @ hessian @ move)
+        if expected < _GAIN:
+            return x
+        trial, steeper = loss(x + move)
+        while value - trial < 1e-4 * expected and np.abs(move).max() > 1e-9:
+            move = 0.3 * move
+            trial, steeper = loss(x + move)
+        if trial >= value:
+            return x
+        bend, along = steeper - slope, hessian @ move
+        if bend @ move < 0.1 * (move @ along):  # Powell's damping keeps the Hessian positive
+            mix = 0.9 * (move @ along) / (move @ along - bend @ move)
+            bend = mix * bend + (1 - mix) * along
+        hessian += np.outer(bend, bend) / (bend @ move) - np.outer(along, along) / (move @ along)
+        x, value, slope = x + move, trial, steeper
+    return x
 
 
 def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArray) -> FloatArray:
     """Covariance of the ``free`` entries of (log sd (C), log tau (C)): inverse curvature of the restricted likelihood
     at ``noise``, sds held between 0.01 and 1."""
+    if not len(free):
+        return np.zeros((0, 0))
     centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
 
-    def value(x: FloatArray) -> float:
+    def slopes(x: FloatArray) -> FloatArray:
         logs = centre.copy()
         logs[free] += x
-        return restricted(moments, _from_logs(logs, noise), pulls)
+        _, by_sd, by_tau = restricted_slopes(moments, _from_logs(logs, noise), pulls)
+        return np.concatenate([by_sd, by_tau])[free]
 
-    unit, h = np.eye(len(free)), 0.05
-    curvature = np.empty((len(free), len(free)))
-    for i, a in enumerate(unit):
-        for j, b in enumerate(unit):
-            corners = value(h * (a + b)) - value(h * (a - b)) - value(h * (b - a)) + value(-h * (a + b))
-            curvature[i, j] = -corners / (4 * h**2)
+    h = 0.05
+    curvature = np.array([(slopes(-step) - slopes(step)) / (2 * h) for step in h * np.eye(len(free))])
     eigenvalues, axes = np.linalg.eigh(0.5 * (curvature + curvature.T))
     return (axes / np.clip(eigenvalues, 1.0, 1e4)) @ axes.T
 
@@ -401,27 +508,18 @@ class Marginal:
         flat = jacobian.reshape(self.windows * self.length, -1, self.num_start)
         self.rows = [flat[s.index, c] for c, s in enumerate(all_sequences)]
         self.before = [
-            np.where((s.previous >= 0)[:, None], flat[s.previous, c], 0.0)
-            for c, s in enumerate(all_sequences)
+            np.where((s.previous >= 0)[:, None], flat[s.previous, c], 0.0) for c, s in enumerate(all_sequences)
         ]
         self.edges = [np.searchsorted(s.window, np.arange(self.windows)) for s in all_sequences]
 
-    def __call__(
-        self, residual: FloatArray, starts: FloatArray, sd: FloatArray, tau: FloatArray
-    ) -> FloatArray:
+    def __call__(self, residual: FloatArray, starts: FloatArray, sd: FloatArray, tau: FloatArray) -> FloatArray:
         """(B,) for residuals (B, W, L, C) at starts (B, W, D) with sd and tau (B, C)."""
         values = np.empty(len(residual))
         for b in range(len(residual)):
             noise = Noise(sd[b], tau[b])
             arrow, square = self._eliminate(residual[b], starts[b], noise)
             pull = float((starts[b] ** 2 @ self.precision).sum())
-            total = (
-                log_determinant(self.sequences, noise)
-                + arrow.log_determinant
-                + square
-                - arrow.explained
-                + pull
-            )
+            total = log_determinant(self.sequences, noise) + arrow.log_determinant + square - arrow.explained + pull
             values[b] = -0.5 * total
         return values
 

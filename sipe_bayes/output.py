@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import math
 import os
 import platform
 from pathlib import Path
@@ -28,6 +29,19 @@ def write_text(path: Path, text: str) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
+
+
+def to_json(data: Any, indent: int | None = None) -> str:
+    """JSON as the standard has it: what is not a finite number becomes null."""
+    return json.dumps(_finite(data), indent=indent, allow_nan=False)
+
+
+def _finite(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, Any]:
@@ -81,7 +95,7 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
     if folder.is_dir() and any(folder.iterdir()):
         raise OutputError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(record, json.dumps({**run, "status": "started"}, indent=2))
+    write_text(record, to_json({**run, "status": "started"}, indent=2))
 
 
 def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
@@ -95,14 +109,15 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
     temporary = folder / f".posterior.{os.getpid()}.nc"
     calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
     os.replace(temporary, folder / "posterior.nc")
-    write_text(folder / "domain_randomization.json", json.dumps(domain_randomization(calibration, problem), indent=2))
+    randomization = domain_randomization(calibration, problem)
+    write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
     write_report(calibration, folder)
-    write_text(folder / "result.json", json.dumps(calibration.to_dict(), indent=2))
-    write_text(folder / RUN, json.dumps({**calibration.run, "status": "complete"}, indent=2))
+    write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
+    write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
 
 
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, Any]:
-    """What a policy trainer samples from: each parameter's normal in its unit, bounds, and their covariance."""
+    """What a policy trainer samples from: each parameter's normal in its unit, bounds, and the covariance."""
     import numpy as np
 
     space = problem.environment.space
@@ -123,7 +138,7 @@ def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str
         for p, s in zip(calibration.parameters, space, strict=True)
     ]
     covariance = np.atleast_2d(np.cov(draws.T))
-    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "source": "posterior"}
+    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist()}
 
 
 def _generator() -> Any:

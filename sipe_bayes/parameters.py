@@ -159,9 +159,7 @@ class ParameterSpace(Sequence[Parameter]):
     @property
     def default_theta(self) -> FloatArray:
         """Theta (N,) of the model's own values; 0.5 where a parameter has none."""
-        return np.array(
-            [0.5 if p.default is None else float(p.normalise(p.default)) for p in self._parameters]
-        )
+        return np.array([0.5 if p.default is None else float(p.normalise(p.default)) for p in self._parameters])
 
     def check_shape(self, array: Any) -> FloatArray:
         """``array`` as float64 (..., N); raises ValueError when its last axis is not N."""

@@ -132,9 +132,7 @@ class Simulator:
         theta, actions, initial_state = (
             np.broadcast_to(a, (batch, *a.shape[1:])) for a in (theta, actions, initial_state)
         )
-        steps, timesteps = (
-            np.array(x) for x in zip(*(self.physics_steps(d) for d in dts.tolist()), strict=True)
-        )
+        steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(d) for d in dts.tolist()), strict=True))
         horizon = actions.shape[1]
         states = np.empty((batch, horizon + 1, self.state_size))
         observations = np.empty((batch, horizon + 1, len(self.environment.channels)))
@@ -171,8 +169,7 @@ class Simulator:
             raise ValueError("actions: expected at least one control step, got none")
         if not (np.abs(actions) <= _HUGE).all():
             raise ValueError(
-                "actions: expected finite numbers up to 1e10, got NaN, infinity or more; "
-                "mask or hold them first"
+                "actions: expected finite numbers up to 1e10, got NaN, infinity or more; mask or hold them first"
             )
         initial_state = np.atleast_2d(np.asarray(initial_state, float))
         if initial_state.shape[-1] != self.state_size:
@@ -180,8 +177,7 @@ class Simulator:
         sizes = {len(theta), len(actions), len(initial_state)} - {1}
         if len(sizes) > 1:
             raise ValueError(
-                f"batch sizes differ: theta {len(theta)}, actions {len(actions)}, "
-                f"initial_state {len(initial_state)}"
+                f"batch sizes differ: theta {len(theta)}, actions {len(actions)}, initial_state {len(initial_state)}"
             )
         return theta, actions, initial_state
 
@@ -190,9 +186,7 @@ class Simulator:
     ) -> tuple[FloatArray, list[str | None]]:
         dts = np.asarray(self.model.opt.timestep if dt is None else dt, float)
         if dts.shape not in ((), (1,), (batch,)):
-            raise ValueError(
-                f"dt: expected one number or ({batch},), one for each lane, got shape {dts.shape}"
-            )
+            raise ValueError(f"dt: expected one number or ({batch},), one for each lane, got shape {dts.shape}")
         if not (np.isfinite(dts) & (dts > 0)).all():
             raise ValueError(f"dt: expected seconds above zero, got {float(dts.min()):g}")
         names: list[str | None] = [None] * batch if logs is None else list(logs)
@@ -209,9 +203,7 @@ class Simulator:
             for chunk in np.array_split(group, math.ceil(len(group) / most)):
                 yield skip, chunk
 
-    def _models(
-        self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]
-    ) -> NDArray[np.int64]:
+    def _models(self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]) -> NDArray[np.int64]:
         """Which pooled model each lane uses, written in place."""
         index: dict[bytes, int] = {}
         lanes = np.empty(len(theta), int)

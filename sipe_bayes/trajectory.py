@@ -51,16 +51,12 @@ class Trajectory:
         if not 0 < self.dt < np.inf:
             raise ValueError(f"{label}: dt must be positive, got {self.dt}")
         if not np.isfinite(actions).all():
-            raise ValueError(
-                f"{label}: actions must be finite, got {int((~np.isfinite(actions)).sum())} that are not"
-            )
+            raise ValueError(f"{label}: actions must be finite, got {int((~np.isfinite(actions)).sum())} that are not")
         states = None if self.states is None else np.asarray(self.states, dtype=np.float64)
         if states is not None and (states.ndim != 2 or len(states) != len(observations)):
             raise ValueError(f"{label}: expected states ({len(observations)}, S), got {states.shape}")
         if self.channels and len(self.channels) != observations.shape[1]:
-            raise ValueError(
-                f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels"
-            )
+            raise ValueError(f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels")
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "actions", actions)
         object.__setattr__(self, "states", states)
@@ -155,9 +151,7 @@ class Trajectories(Sequence[Trajectory]):
         states = None if self.states is None else self.states[key, : n + 1]
         name = self.names[key] if self.names else ""
         dt = float(self.dt[key])
-        return Trajectory(
-            self.observations[key, : n + 1], self.actions[key, :n], dt, states, name, self.channels
-        )
+        return Trajectory(self.observations[key, : n + 1], self.actions[key, :n], dt, states, name, self.channels)
 
     def _subset(self, chosen: NDArray[np.int64]) -> Trajectories:
         if not len(chosen):

@@ -69,9 +69,7 @@ def find_unit(word: str, dimension: str | None = None) -> Unit:
         raise ValueError(_unknown(word, dimension))
     if dimension is not None and unit.dimension != dimension:
         legal = ", ".join(repr(w) for w in unit_words(dimension))
-        raise ValueError(
-            f"expected a unit of {dimension}, got {word!r} ({unit.dimension}); use one of {legal}"
-        )
+        raise ValueError(f"expected a unit of {dimension}, got {word!r} ({unit.dimension}); use one of {legal}")
     return unit
 
 

@@ -94,9 +94,7 @@ def test_whole_log_as_one_window_and_earlier_posterior(tmp_path: Path) -> None:
 
 
 def test_a_file_may_train_and_be_held_out_in_different_spans(tmp_path: Path) -> None:
-    text = BASE.replace('"a.csv"', '"a.csv"\nspan = [0, 2]').replace(
-        '"b.csv"', '"a.csv"\nname = "rest"\nspan = [2, 3]'
-    )
+    text = BASE.replace('"a.csv"', '"a.csv"\nspan = [0, 2]').replace('"b.csv"', '"a.csv"\nname = "rest"\nspan = [2, 3]')
     assert [log.span for log in read(tmp_path, text).logs] == [(0.0, 2.0), (2.0, 3.0)]
 
 
@@ -208,14 +206,10 @@ def test_missing_configuration_names_the_nearest(tmp_path: Path) -> None:
 
 def test_wrong_kind_of_unit(tmp_path: Path) -> None:
     config = read(tmp_path, BASE.replace('"deg"', '"m"'))
-    with pytest.raises(
-        ConfigError, match=r"`measurements\[0\].unit`: .*expected a unit of angle, got 'm' \(length\)"
-    ):
+    with pytest.raises(ConfigError, match=r"`measurements\[0\].unit`: .*expected a unit of angle, got 'm' \(length\)"):
         check_dimensions(config, {"joint:hinge.position": "angle"})
     check_dimensions(config, {"joint:other.position": "angle"})
-    with pytest.raises(
-        ConfigError, match=r"`commands\[0\].unit`: actuator:motor .*unit of voltage, got 'N m'"
-    ):
+    with pytest.raises(ConfigError, match=r"`commands\[0\].unit`: actuator:motor .*unit of voltage, got 'N m'"):
         check_dimensions(config, {"actuator:motor": "voltage"})
 
 

@@ -289,9 +289,7 @@ def test_units_signs_and_span(tmp_path: Path) -> None:
     text = (tmp_path / "run.toml").read_text().replace('"s"', '"ms"').replace('"rad"', '"deg"\nsign = -1')
     (tmp_path / "run.toml").write_text(text.replace('"N m"', '"mN m"'))
     config = load_config(tmp_path / "run.toml")
-    trajectory, report = load_log(
-        config, config.logs[0], {"joint:hinge.position": "angle", "actuator:motor": "torque"}
-    )
+    trajectory, report = load_log(config, config.logs[0], {"joint:hinge.position": "angle", "actuator:motor": "torque"})
     assert report.samples == 31
     assert report.duration_s == pytest.approx(0.3)
     np.testing.assert_allclose(trajectory.observations[:, 0], -np.deg2rad(columns["q"][20:51]))
@@ -323,9 +321,7 @@ def test_shipped_logs_pass_through(name: str) -> None:
     for log in config.logs:
         trajectory, report = load_log(config, log)
         table = read_table(log.file)
-        np.testing.assert_array_equal(
-            trajectory.observations[:, 0], np.float64(table[config.measurements[0].column])
-        )
+        np.testing.assert_array_equal(trajectory.observations[:, 0], np.float64(table[config.measurements[0].column]))
         assert not report.resampled
         assert len(report.notes) == 1, report.notes
 

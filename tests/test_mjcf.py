@@ -158,9 +158,7 @@ def test_inertia_is_the_same_after_any_earlier_values() -> None:
 
 def test_the_centre_of_mass_of_a_free_ball_may_move() -> None:
     """MuJoCo compiles such a body with a short cut that holds only while its centre of mass is its origin."""
-    environment = build(
-        p("com", -0.05, 0.05, "body:ball.com_x"), p("i", 0.005, 0.012, "body:ball.inertia_xx")
-    )
+    environment = build(p("com", -0.05, 0.05, "body:ball.com_x"), p("i", 0.005, 0.012, "body:ball.inertia_xx"))
     simulator = Simulator(environment, 1)
     start = simulator.default_state()
     start[1 + simulator.model.nq + 6] = 3.0  # spins about y
@@ -178,9 +176,7 @@ def test_history_has_room_for_the_longest_delay() -> None:
     state = Simulator(environment, 1).default_state()[None]
     past = [np.ones((5, 1))]
     environment.history(model, state, past, np.array([0.001]))
-    with pytest.raises(
-        ValueError, match=r"actuator:motor.delay: 0.05 s do not fit the history of 52 physics steps"
-    ):
+    with pytest.raises(ValueError, match=r"actuator:motor.delay: 0.05 s do not fit the history of 52 physics steps"):
         environment.history(model, state, past, np.array([0.0005]))
 
 
@@ -255,9 +251,7 @@ def test_all_sensor_units_are_known_or_empty() -> None:
         ),
     ],
 )
-def test_wrong_models_and_measurements_are_named(
-    arguments: dict[str, Any], error: type[Exception], words: str
-) -> None:
+def test_wrong_models_and_measurements_are_named(arguments: dict[str, Any], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         build(**arguments)
 

@@ -50,9 +50,7 @@ class Problem:
         return Moments(self.residual, self.jacobian, N, self.sequences)
 
 
-def problem(
-    windows: tuple[int, ...], steps: int, missing: float = 0.0, channels: int = 2, seed: int = 0
-) -> Problem:
+def problem(windows: tuple[int, ...], steps: int, missing: float = 0.0, channels: int = 2, seed: int = 0) -> Problem:
     """Logs of so many windows of ``steps`` control steps; a log's last window owns its last sample."""
     rng = np.random.default_rng(seed)
     log = np.repeat(np.arange(len(windows)), windows)

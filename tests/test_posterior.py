@@ -67,9 +67,7 @@ def single(mean: object, covariance: object) -> GaussianMixture:
 
 def example_particles(n: int) -> Particles:
     rng = np.random.default_rng(n)
-    return Particles(
-        rng.beta(2, 3, (400, n)), space_of(n), rng.exponential(size=400), log_density=rng.normal(size=400)
-    )
+    return Particles(rng.beta(2, 3, (400, n)), space_of(n), rng.exponential(size=400), log_density=rng.normal(size=400))
 
 
 EXAMPLES: dict[str, Callable[[int], Posterior]] = {
@@ -100,9 +98,7 @@ def test_density_integrates_to_one(posterior: Posterior) -> None:
         return
     uniforms = torch.rand(60_000, len(posterior.space), dtype=torch.float64, generator=seeded(1))
     density = posterior.log_prob(uniforms).exp()
-    assert float(density.mean()) == pytest.approx(
-        1, abs=SIGMAS * float(density.std()) / math.sqrt(60_000) + 1e-12
-    )
+    assert float(density.mean()) == pytest.approx(1, abs=SIGMAS * float(density.std()) / math.sqrt(60_000) + 1e-12)
 
 
 def test_samples_agree_with_moments(posterior: Posterior) -> None:
@@ -199,9 +195,7 @@ def test_global_generator_and_values(posterior: Posterior) -> None:
         torch.manual_seed(7)
         assert torch.equal(first, posterior.sample((5,)))
     values = posterior.values(50, generator=seeded(8))
-    np.testing.assert_array_equal(
-        values, posterior.space.values(posterior.sample((50,), generator=seeded(8)).numpy())
-    )
+    np.testing.assert_array_equal(values, posterior.space.values(posterior.sample((50,), generator=seeded(8)).numpy()))
     assert posterior.sample((0,)).shape == (0, len(posterior.space))
 
 
@@ -330,9 +324,7 @@ def test_exact_sampler_in_thirty_dimensions() -> None:
     log_terms = stats.norm.logpdf(factor) + n * log_interval(-centre / sd, (1 - centre) / sd)
     mass = np.trapezoid(np.exp(log_terms), factor)
     assert truncated.log_mass == pytest.approx(math.log(mass), abs=SIGMAS * truncated.log_mass_error + 1e-4)
-    inside = interval_moments(np.zeros_like(centre), np.ones_like(centre), centre, np.full_like(centre, sd))[
-        0
-    ]
+    inside = interval_moments(np.zeros_like(centre), np.ones_like(centre), centre, np.full_like(centre, sd))[0]
     expected = np.trapezoid(np.exp(log_terms) * inside, factor) / mass
     theta = truncated.sample(3000, seeded(12))
     row_means = theta.mean(1)
@@ -362,9 +354,7 @@ def test_mode_on_the_boundary() -> None:
     torch.testing.assert_close(mode, torch.tensor([1.0, 0.5 - 0.75 * 0.2], dtype=torch.float64))
     ridge = single([0.3, -2e-5], RIDGE).mode
     conditional = 0.3 + 0.9999 / 1e-4 * 2e-5
-    torch.testing.assert_close(
-        ridge, torch.tensor([conditional, 0.0], dtype=torch.float64), rtol=1e-6, atol=1e-12
-    )
+    torch.testing.assert_close(ridge, torch.tensor([conditional, 0.0], dtype=torch.float64), rtol=1e-6, atol=1e-12)
 
 
 def test_mode_of_overlapping_components() -> None:

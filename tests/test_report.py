@@ -67,14 +67,10 @@ def signal(log: str, use: str, channel: str, steps: int = 200, window: int = 50)
     measured = np.sin(3 * time)
     measured[40:60] = np.nan
     mode = np.sin(3 * time) + 0.01
-    return Signal(
-        log, use, channel, "rad", time, measured, mode, mode - 0.05, mode + 0.05, mode * 3, time[:-1:window]
-    )
+    return Signal(log, use, channel, "rad", time, measured, mode, mode - 0.05, mode + 0.05, mode * 3, time[:-1:window])
 
 
-def make_calibration(
-    size: int = 3, logs: int = 1, channels: int = 1, names: tuple[str, ...] = ()
-) -> Calibration:
+def make_calibration(size: int = 3, logs: int = 1, channels: int = 1, names: tuple[str, ...] = ()) -> Calibration:
     names = names or tuple(f"p{i}" for i in range(size))
     space = ParameterSpace(
         Parameter(n, 1.0, 2.0, 1.5, "kg m^2", targets=(f"body:{i}.mass",)) for i, n in enumerate(names)
@@ -105,10 +101,7 @@ def make_calibration(
         residuals=residuals,
         ridges=[Ridge("the last two trade against each other", names[-2:])],
         noise={"angle_0": {"sd": 0.0123, "tau": 0.0, "unit": "rad"}},
-        logs=[
-            {"name": log, "use": use, "rate_hz": 100.0, "samples": 201, "gaps": [[0.4, 0.6]]}
-            for log, use in keys
-        ],
+        logs=[{"name": log, "use": use, "rate_hz": 100.0, "samples": 201, "gaps": [[0.4, 0.6]]} for log, use in keys],
         run={"config": {"model": "pendulum.xml"}, "seed": 0},
         rollouts=1234,
         seconds=5.6,
@@ -258,9 +251,7 @@ def test_marginals_stay_within_the_bounds(calibration: Calibration) -> None:
 
 
 def test_a_wide_log_scale_is_drawn_as_one() -> None:
-    space = ParameterSpace(
-        [Parameter("friction", 1e-6, 1e-2, 1e-4, "N", scale="log"), Parameter("mass", 0, 1, 0.5)]
-    )
+    space = ParameterSpace([Parameter("friction", 1e-6, 1e-2, 1e-4, "N", scale="log"), Parameter("mass", 0, 1, 0.5)])
     posterior = GaussianMixture(torch.zeros(1), torch.full((1, 2), 0.5), 0.04 * torch.eye(2)[None], space)
     found = dataclasses.replace(
         make_calibration(2), posterior=posterior, prior=prior(space), parameters=summaries(posterior, {})
@@ -424,9 +415,7 @@ def test_verdict_on_the_prediction(rows: list[ChannelScore], tone: str, words: s
 
 def test_headline_counts_without_nuisance_parameters() -> None:
     good, weak, nuisance = parameter(0.9), parameter(0.5), parameter(0.9, "nuisance")
-    assert (
-        report.headline([good, weak, nuisance]).text == "1 of 2 parameters is well determined by these logs."
-    )
+    assert report.headline([good, weak, nuisance]).text == "1 of 2 parameters is well determined by these logs."
     assert report.headline([good, good]).text == "All 2 parameters are well determined by these logs."
     assert report.headline([weak, weak]).tone == "bad"
     assert report.headline([nuisance]).tone == "fair"
@@ -529,9 +518,7 @@ def test_the_least_there_can_be(tmp_path: Path) -> None:
 # Files
 
 
-def test_report_and_figures_are_written(
-    tmp_path: Path, images: list[report.Picture], monkeypatch: Any
-) -> None:
+def test_report_and_figures_are_written(tmp_path: Path, images: list[report.Picture], monkeypatch: Any) -> None:
     monkeypatch.setattr(report, "pictures", lambda _: images)
     path = report.write_report(make_calibration(), tmp_path / "new" / "run")
     assert path == tmp_path / "new" / "run" / "report.html"
@@ -548,9 +535,7 @@ def test_report_and_figures_are_written(
 
 
 @pytest.mark.parametrize("part", ["render", "pictures"])
-def test_a_failure_leaves_nothing(
-    part: str, tmp_path: Path, images: list[report.Picture], monkeypatch: Any
-) -> None:
+def test_a_failure_leaves_nothing(part: str, tmp_path: Path, images: list[report.Picture], monkeypatch: Any) -> None:
     def fail(*_: Any) -> Any:
         raise RuntimeError("no ink")
 

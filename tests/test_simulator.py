@@ -136,9 +136,7 @@ def draw(case: Case, batch: int = 7, seed: int = 0) -> tuple[Simulator, Any, Any
     return simulator, rng.random((batch, len(case.parameters))), actions, starts
 
 
-def plain(
-    environment: MjcfEnvironment, theta: Any, actions: Any, start: Any, dt: float, skip: int
-) -> tuple[Any, int]:
+def plain(environment: MjcfEnvironment, theta: Any, actions: Any, start: Any, dt: float, skip: int) -> tuple[Any, int]:
     """States (T+1, S) of one lane by mj_step, and the first physics step that warned, from 1."""
     model = environment.compile()
     environment.write(model, environment.space.values(theta))
@@ -166,9 +164,7 @@ def test_bits_are_those_of_a_plain_loop(name: str, skip: int) -> None:
     dt = skip * simulator.model.opt.timestep
     result = simulator.rollout(theta, actions, starts, dt)
     assert result.valid.all()
-    expected = [
-        plain(simulator.environment, *lane, dt, skip)[0] for lane in zip(theta, actions, starts, strict=True)
-    ]
+    expected = [plain(simulator.environment, *lane, dt, skip)[0] for lane in zip(theta, actions, starts, strict=True)]
     np.testing.assert_array_equal(result.states, expected)
 
 
@@ -323,9 +319,7 @@ def test_unphysical_parameters_are_never_simulated(
     assert np.isnan(result.states[1]).all()
     assert lanes == [2]
     assert simulator.diverged == 1
-    assert not simulator.rollout(
-        [[theta]], actions, simulator.default_state(), allow_outside=True
-    ).valid.any()
+    assert not simulator.rollout([[theta]], actions, simulator.default_state(), allow_outside=True).valid.any()
     assert lanes == [2]
 
 
@@ -452,9 +446,7 @@ def test_parameters_and_biases_of_each_log() -> None:
     plain_one = Simulator(MjcfEnvironment.build(PENDULUM, common, ["motor"], HINGE), 1)
     offsets = [values[1], values[2], values[1:].mean(), values[1:].mean()]
     for lane, offset in enumerate(offsets):
-        expected = plain_one.rollout(
-            [0.3, (offset + 1) / 2], actions, plain_one.default_state()
-        ).observations[0]
+        expected = plain_one.rollout([0.3, (offset + 1) / 2], actions, plain_one.default_state()).observations[0]
         np.testing.assert_allclose(result.observations[lane], expected + np.array([offset, 0]), atol=1e-12)
 
 

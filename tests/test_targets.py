@@ -189,9 +189,7 @@ def written(model: Any, *writes: tuple[str, float]) -> Any:
 
 
 @pytest.mark.parametrize(("target", "value", "unit", "edit"), CASES, ids=[c[0] for c in CASES])
-def test_writing_in_place_is_compiling_the_edited_model(
-    target: str, value: float, unit: str, edit: Edit
-) -> None:
+def test_writing_in_place_is_compiling_the_edited_model(target: str, value: float, unit: str, edit: Edit) -> None:
     model, spec = frozen_spec().compile(), frozen_spec()
     edit(element(spec, target), value)
     assert_same(written(model, (target, value)), spec.compile(), target)
@@ -266,9 +264,7 @@ def test_offset_is_gain_times_command() -> None:
     for command, shift in ((0.5, 0.2), (0.7, 0.0)):
         data = mujoco.MjData(model)
         data.ctrl[model.actuator("motor").id] = command
-        mujoco.mj_forward(
-            written(model, ("actuator:motor.gain", 3.0), ("actuator:motor.offset", shift)), data
-        )
+        mujoco.mj_forward(written(model, ("actuator:motor.gain", 3.0), ("actuator:motor.offset", shift)), data)
         torque.append(data.actuator_force[model.actuator("motor").id])
     assert torque[0] == pytest.approx(2.1, rel=1e-14)
     assert torque[1] == pytest.approx(torque[0], rel=1e-14)

@@ -46,7 +46,7 @@ def one_fit(problem: Problem, estimator: str, rho: float, seed: int) -> dict[str
     space = problem.environment.space
     theta = rng.uniform(0, 1, len(space))
     log = simulated_log(problem, theta, rho, rng)
-    settings: dict[str, Any] = {"budget": 3000} if estimator == "mcmc" else {}
+    settings: dict[str, Any] = {"budget": 700} if estimator == "mcmc" else {}
     method = sipe.get_estimator(problem.simulator, estimator, likelihood=problem.likelihood, seed=seed, **settings)
     posterior = method.fit(log)
     low, high = posterior.quantile([0.05, 0.95]).numpy()

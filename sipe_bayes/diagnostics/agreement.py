@@ -14,11 +14,16 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
 LEVEL = 0.01  # false alarms where logs agree
+_BUDGET = 5000  # rollouts for each log
 _DETERMINED = 12.0  # information of a uniform prior: directions with less are not tested
 
 
@@ -47,6 +52,21 @@ class Disagreement:
             f"the logs disagree about {self.parameter} (p = {self.p:.1g}): {parts} {unit}; "
             "give it per_log = true, model what changed, or leave a log out"
         )
+
+
+def compare_logs(
+    simulator: Simulator, likelihood: Segments, trajectories: Trajectories, theta: FloatArray, seed: int = 0
+) -> Disagreement | None:
+    """Fit each log by itself, from theta (N,), and compare; a log that cannot be fitted alone is left out."""
+    estimates = []
+    for trajectory in trajectories if len(trajectories) > 1 else ():
+        alone = Laplace(simulator, likelihood=likelihood, seed=seed, initial=theta, budget=_BUDGET)
+        try:
+            alone.fit(trajectory)
+        except (ValueError, np.linalg.LinAlgError):
+            continue
+        estimates.append(LogEstimate(trajectory.name, *alone.information()))
+    return disagreement(simulator.space, estimates)
 
 
 def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
@@ -108,4 +128,7 @@ def _scatter(
     q = square - float(right @ solution)
     if own is None:
         return q, []
-    return q, [(float(solution[len(common) + i]), float(np.sqrt(covariance[len(common) + i, len(common) + i]))) for i in range(k)]
+    return q, [
+        (float(solution[len(common) + i]), float(np.sqrt(covariance[len(common) + i, len(common) + i])))
+        for i in range(k)
+    ]

@@ -62,7 +62,8 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
     moving = np.flatnonzero(spread > 1e-12 * np.maximum(np.abs(draws.mean(0)), 1e-300))
     if len(moving) < 2:
         return []
-    found, used = [], set()
+    found: list[Ridge] = []
+    used: set[int] = set()
     eigenvalues, vectors = np.linalg.eigh(np.corrcoef(draws[:, moving].T))
     for value, vector in zip(eigenvalues, vectors.T, strict=True):
         members = [int(moving[i]) for i in np.flatnonzero(np.abs(vector) > _MEMBER)]

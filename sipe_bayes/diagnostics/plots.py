@@ -113,9 +113,7 @@ def autocorrelation(series: FloatArray, lags: int) -> FloatArray:
     known = np.isfinite(series)
     z = np.where(known, series - series[known].mean(), 0.0)
     size = 2 ** int(np.ceil(np.log2(2 * len(z))))
-    products, pairs = (
-        np.fft.irfft(np.abs(np.fft.rfft(a, size)) ** 2, size)[: lags + 1] for a in (z, known * 1.0)
-    )
+    products, pairs = (np.fft.irfft(np.abs(np.fft.rfft(a, size)) ** 2, size)[: lags + 1] for a in (z, known * 1.0))
     covariance = products / np.maximum(np.round(pairs), 1)
     return covariance / covariance[0] if covariance[0] > 0 else np.full(lags + 1, np.nan)
 
@@ -265,10 +263,7 @@ def marginals(calibration: Calibration) -> list[Figure]:
     panel is the whole prior range, with the interval and the default marked in it.
     """
     theta = draws(calibration.posterior)
-    return [
-        _marginal_figure(calibration, part, theta)
-        for part in _parts(ordered(calibration.parameters), _PANELS)
-    ]
+    return [_marginal_figure(calibration, part, theta) for part in _parts(ordered(calibration.parameters), _PANELS)]
 
 
 def _marginal_figure(calibration: Calibration, part: Sequence[ParameterSummary], theta: FloatArray) -> Figure:
@@ -291,9 +286,7 @@ def _marginal_figure(calibration: Calibration, part: Sequence[ParameterSummary],
     return figure
 
 
-def _marginal(
-    ax: Axes, summary: ParameterSummary, parameter: Parameter, theta: FloatArray, prior: Posterior
-) -> None:
+def _marginal(ax: Axes, summary: ParameterSummary, parameter: Parameter, theta: FloatArray, prior: Posterior) -> None:
     default = None if summary.default is None else float(parameter.normalise(summary.default))
     low, high = _view(theta, default)
     ax.set_xscale(_scale(parameter, (low, high)))
@@ -374,9 +367,7 @@ def _axis_range(parameter: Parameter, theta: FloatArray) -> tuple[str, tuple[flo
     return _scale(parameter, view), (float(parameter.value(view[0])), float(parameter.value(view[1])))
 
 
-def _pair(
-    ax: Axes, parameters: tuple[Parameter, Parameter], theta: FloatArray, default: list[float | None]
-) -> None:
+def _pair(ax: Axes, parameters: tuple[Parameter, Parameter], theta: FloatArray, default: list[float | None]) -> None:
     x, y = (p.value(theta[:2000, k]) for k, p in enumerate(parameters))
     ax.scatter(x, y, s=3, color=POSTERIOR, alpha=0.2, lw=0)
     (x_scale, x_limits), (y_scale, y_limits) = (_axis_range(p, theta[:, k]) for k, p in enumerate(parameters))
@@ -534,9 +525,7 @@ def _restarted(signal: Signal, values: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _window_ticks(ax: Axes, signal: Signal, height: float) -> None:
-    ax.vlines(
-        signal.window_starts, 0, height, transform=ax.get_xaxis_transform(), color=PRIOR, lw=0.9, clip_on=True
-    )
+    ax.vlines(signal.window_starts, 0, height, transform=ax.get_xaxis_transform(), color=PRIOR, lw=0.9, clip_on=True)
 
 
 def _signal(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
@@ -572,9 +561,7 @@ def _keep_in_view(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
 
 def _error(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
     time, low = _restarted(signal, signal.low - signal.mode)
-    ax.fill_between(
-        time, low, _restarted(signal, signal.high - signal.mode)[1], color=POSTERIOR, alpha=0.3, lw=0
-    )
+    ax.fill_between(time, low, _restarted(signal, signal.high - signal.mode)[1], color=POSTERIOR, alpha=0.3, lw=0)
     ax.axhline(0, color="#555555", lw=0.7)
     error = signal.measured - signal.mode
     ax.plot(*_restarted(signal, error), color=MEASURED, lw=0.8)

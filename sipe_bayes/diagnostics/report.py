@@ -329,9 +329,7 @@ def pictures(calibration: Calibration) -> list[Picture]:
         slug = re.sub(r"[^A-Za-z0-9]+", "_", log).strip("_")[:40]
         alt = f"Measured and simulated signals of {log}"
         found.append((f"signals_{use}", f"signals_{i + 1}_{slug}", alt, plots.signals(calibration, log)))
-    found.append(
-        ("residuals", "residuals", "Residuals and their autocorrelation", plots.residuals(calibration))
-    )
+    found.append(("residuals", "residuals", "Residuals and their autocorrelation", plots.residuals(calibration)))
     found.append(("chains", "chains", "Traces of the Markov chains", plots.chains(calibration)))
     return [
         Picture(section, f"{file}{f'_{k + 1}' if len(figures) > 1 else ''}.png", plots.png(figure), alt)

@@ -62,7 +62,9 @@ class Environment(ABC):
     def state_columns(self, model: Any) -> tuple[int | None, ...]:
         """For each channel the column of the physics state that it measures directly, if it does."""
 
-    def history(self, model: Any, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray) -> FloatArray:
+    def history(
+        self, model: Any, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
+    ) -> FloatArray:
         """States (L, S) whose command history holds the ``actions`` ((n, A), one row a physics step, newest last)
         that came before each of them. Without delayed actuators the states are returned as they are."""
         return states

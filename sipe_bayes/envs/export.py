@@ -45,12 +45,16 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
         temporary.write_text(spec.to_xml())
         differing = differing_fields(model, mujoco.MjModel.from_xml_path(str(temporary)))
         if differing:
-            raise ExportError(f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written")
+            raise ExportError(
+                f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written"
+            )
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
     biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
-    return [f"identified.xml has no place for the sensor bias {name!r}; subtract it from the measurement" for name in biased]
+    return [
+        f"identified.xml has no place for the sensor bias {name!r}; subtract it from the measurement" for name in biased
+    ]
 
 
 def differing_fields(a: Any, b: Any) -> list[str]:

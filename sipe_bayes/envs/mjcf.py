@@ -289,9 +289,7 @@ class MjcfEnvironment(Environment):
         return states
 
     def _check_history(self, actuator: str, samples: int, timestep: float) -> None:
-        longest = max(
-            (p.high for p in self.parameters if f"actuator:{actuator}.delay" in p.targets), default=0.0
-        )
+        longest = max((p.high for p in self.parameters if f"actuator:{actuator}.delay" in p.targets), default=0.0)
         if longest > (samples - 1) * timestep * (1 + 1e-9):
             raise ValueError(
                 f"actuator:{actuator}.delay: {longest:g} s do not fit the history of {samples} physics steps "
@@ -352,16 +350,13 @@ def _reader(model: Any, channel: Channel) -> _Reader:
     match = _CHANNEL.match(channel.target)
     if not match:
         raise TargetError(
-            f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, "
-            "sensor:NAME[i]"
+            f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, sensor:NAME[i]"
         )
     if match["joint"]:
         joint = named(model, "joint", match["joint"], where)
         hinge = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
         if not hinge and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_SLIDE):
-            raise TargetError(
-                f"{where}: joint {match['joint']!r} is neither hinge nor slide; measure it by a sensor"
-            )
+            raise TargetError(f"{where}: joint {match['joint']!r} is neither hinge nor slide; measure it by a sensor")
         if match["what"] == "position":
             return _Reader(1 + int(model.jnt_qposadr[joint]), False, "rad" if hinge else "m")
         return _Reader(1 + model.nq + int(model.jnt_dofadr[joint]), False, "rad/s" if hinge else "m/s")
@@ -377,9 +372,7 @@ def _reader(model: Any, channel: Channel) -> _Reader:
 def _state_column(model: Any, reader: _Reader) -> int | None:
     if not reader.derived:
         return reader.index
-    sensor = (
-        int(np.flatnonzero(model.sensor_adr == reader.index)[0]) if reader.index in model.sensor_adr else -1
-    )
+    sensor = int(np.flatnonzero(model.sensor_adr == reader.index)[0]) if reader.index in model.sensor_adr else -1
     kind, joint = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
     if sensor >= 0 and kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
         return 1 + int(model.jnt_qposadr[joint])
@@ -422,9 +415,7 @@ def _bias_channels(channels: Sequence[Channel], name: str) -> list[int]:
 def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Channel]) -> Parameter:
     """The parameter with the unit and the default that the model gives it."""
     if not parameter.targets:
-        raise TargetError(
-            f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass"
-        )
+        raise TargetError(f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass")
     units, values = [], []
     for spec in parameter.targets:
         match = _BIAS.match(spec)
@@ -435,8 +426,7 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
                 close = difflib.get_close_matches(match.group(1), names, 1)
                 hint = f"did you mean {close[0]!r}?" if close else f"measured are {names}"
                 raise TargetError(
-                    f"parameter {parameter.name!r}: target {spec!r} names no measured sensor or channel; "
-                    f"{hint}"
+                    f"parameter {parameter.name!r}: target {spec!r} names no measured sensor or channel; {hint}"
                 )
             units.append(channels[found[0]].unit)
             values.append(0.0)

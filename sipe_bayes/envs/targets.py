@@ -72,8 +72,7 @@ def split(spec: str) -> tuple[str, str, str]:
     match = _PATTERN.match(spec)
     if not match:
         raise TargetError(
-            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {sorted(_OBJECTS)}, "
-            "or option.ATTRIBUTE"
+            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {sorted(_OBJECTS)}, or option.ATTRIBUTE"
         )
     kind, name, option, attribute = match.groups()
     return (option or kind, name or "", attribute)
@@ -142,9 +141,7 @@ def _actuator_gear(model: Any, spec: str, actuator: int, attribute: str) -> Targ
 
 def _fixed_gain(model: Any, actuator: int, spec: str) -> None:
     if int(model.actuator_gaintype[actuator]) != int(mujoco.mjtGain.mjGAIN_FIXED):
-        raise TargetError(
-            f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)"
-        )
+        raise TargetError(f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)")
 
 
 def _affine_bias(model: Any, actuator: int, spec: str) -> None:
@@ -234,9 +231,7 @@ def _body_mass(model: Any, spec: str, body: int, attribute: str) -> Target:
     mass, inertia = float(model.body_mass[body]), model.body_inertia[body].copy()
     axes = model.body_iquat[body].copy()
     if mass <= 0:
-        raise TargetError(
-            f"target {spec!r}: the body has no mass of its own to scale; give it one in the MJCF"
-        )
+        raise TargetError(f"target {spec!r}: the body has no mass of its own to scale; give it one in the MJCF")
 
     def write(other: Any, value: float) -> None:
         other.body_mass[body] = value

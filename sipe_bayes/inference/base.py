@@ -25,8 +25,6 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
 
-_CHECKPOINT_SECONDS = 1.0
-
 
 class Estimator(ABC):
     """Infers a posterior over theta from trajectories.
@@ -60,6 +58,7 @@ class Estimator(ABC):
     name: ClassVar[str]
     amortised: ClassVar[bool] = False
     default_budget: ClassVar[int] = 1000
+    checkpoint_seconds: float = 1.0
 
     def __init__(
         self,
@@ -113,7 +112,7 @@ class Estimator(ABC):
             while not state["done"]:
                 state = self._counted(self.step(state, batch), batch)
                 if self.checkpoint is not None and (
-                    state["done"] or time.monotonic() - saved > _CHECKPOINT_SECONDS
+                    state["done"] or time.monotonic() - saved > self.checkpoint_seconds
                 ):
                     save_state(self.checkpoint, state, fingerprint)
                     saved = time.monotonic()

@@ -146,7 +146,8 @@ class MCMC(Estimator):
         )
         log_prob = state["log_prob"] if len(state["chain"]) else None
         begin = emcee.State(state["walkers"], log_prob=log_prob, random_state=_restore_random(state))
-        end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
+        with np.errstate(invalid="ignore"):  # a walker that begins outside waits for its first valid proposal
+            end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
         random = np.random.RandomState()
         random.set_state(end.random_state)
         state = {

@@ -34,9 +34,7 @@ def as_float64(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
         array = value if isinstance(value, Tensor) else np.asarray(value, dtype=np.float64)
         tensor = torch.as_tensor(array, dtype=torch.float64).detach()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"{name}: expected an array of numbers, got {type(value).__name__} ({error})"
-        ) from error
+        raise ValueError(f"{name}: expected an array of numbers, got {type(value).__name__} ({error})") from error
     if tensor.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, tensor.shape)):  # noqa: B905
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{name}: expected shape ({wanted}), got {tuple(tensor.shape)}; reshape it")
@@ -174,14 +172,10 @@ class Posterior(TorchDistribution):
     def log_prob(self, theta: Any) -> Tensor:
         """Log density (...) of theta (..., N), -inf outside the cube; NoDensityError where there is none."""
         if not self.has_density:
-            raise NoDensityError(
-                f"{type(self).__name__} has no density; use .smoothed(bandwidth), a GaussianMixture"
-            )
+            raise NoDensityError(f"{type(self).__name__} has no density; use .smoothed(bandwidth), a GaussianMixture")
         theta = torch.as_tensor(theta, dtype=torch.float64)
         if theta.ndim == 0 or theta.shape[-1] != len(self.space):
-            raise ValueError(
-                f"theta: expected shape (..., {len(self.space)}), got {tuple(theta.shape)}; reshape it"
-            )
+            raise ValueError(f"theta: expected shape (..., {len(self.space)}), got {tuple(theta.shape)}; reshape it")
         flat = theta.reshape(-1, len(self.space))
         inside = ((flat >= 0) & (flat <= 1)).all(-1)
         result = torch.full((len(flat),), -torch.inf, dtype=torch.float64)
@@ -234,9 +228,7 @@ class Posterior(TorchDistribution):
 
     def _columns(self, names: Iterable[str]) -> tuple[list[int], ParameterSpace]:
         if isinstance(names, str):
-            raise TypeError(
-                f"names: expected a list of parameter names, got the string {names!r}; write [{names!r}]"
-            )
+            raise TypeError(f"names: expected a list of parameter names, got the string {names!r}; write [{names!r}]")
         names = list(names)
         return [self.space.index(n) for n in names], self.space.subset(names)
 
@@ -267,9 +259,7 @@ class Posterior(TorchDistribution):
             values = self.space.values(self._chains(num_draws, generator).numpy())
         data = arviz.from_dict(posterior={name: values[..., j] for j, name in enumerate(self.space.names)})
         for parameter in self.space:
-            data.posterior[parameter.name].attrs.update(
-                units=parameter.unit, description=parameter.description
-            )
+            data.posterior[parameter.name].attrs.update(units=parameter.unit, description=parameter.description)
         return data
 
     def save(self, path: str | os.PathLike[str]) -> None:

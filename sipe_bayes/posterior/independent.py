@@ -33,9 +33,7 @@ class IndependentPrior(Posterior):
         self.normal_mean = as_float64("mean", mean, (len(space),))
         sd = torch.as_tensor(sd, dtype=torch.float64)
         if sd.shape != (len(space),) or not (sd > 0).all():
-            raise ValueError(
-                f"sd: expected {len(space)} positive numbers, got {sd.tolist()}; inf means uniform"
-            )
+            raise ValueError(f"sd: expected {len(space)} positive numbers, got {sd.tolist()}; inf means uniform")
         self.normal_sd = sd
 
     @cached_property
@@ -61,9 +59,7 @@ class IndependentPrior(Posterior):
 
     def _inverse(self, q: Tensor) -> Tensor:
         """Quantiles at levels q (n, N), one level for each parameter."""
-        normal = self.normal_mean + self.normal_sd * torch.from_numpy(
-            interval_quantile(*self._limits, q.numpy())
-        )
+        normal = self.normal_mean + self.normal_sd * torch.from_numpy(interval_quantile(*self._limits, q.numpy()))
         return torch.where(self._flat, q, normal).clamp(0.0, 1.0)
 
     def _sample(self, n: int, generator: Generator | None) -> Tensor:

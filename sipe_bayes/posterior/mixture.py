@@ -89,9 +89,7 @@ class GaussianMixture(Posterior):
         """log Z, the log mass of the mixture in the cube."""
         log_z = torch.logsumexp(self.log_weights + self.log_masses, 0)
         if not torch.isfinite(log_z):
-            raise ValueError(
-                "means: expected mass in the cube, but every component is out of reach of it; move them"
-            )
+            raise ValueError("means: expected mass in the cube, but every component is out of reach of it; move them")
         return log_z
 
     @cached_property
@@ -184,9 +182,7 @@ class GaussianMixture(Posterior):
         used = torch.nonzero(share > 1e-12).flatten().tolist()
         roots = [float(share[k]) ** 0.5 * self._components[k].whitening for k in used]
         matrix = np.concatenate(roots)
-        target = np.concatenate(
-            [root @ self._components[k].mean for root, k in zip(roots, used, strict=True)]
-        )
+        target = np.concatenate([root @ self._components[k].mean for root, k in zip(roots, used, strict=True)])
         if len(used) > 1:
             q, matrix = np.linalg.qr(matrix)
             target = q.T @ target
@@ -210,9 +206,7 @@ class GaussianMixture(Posterior):
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
         new = cls(tensors["log_weights"], tensors["means"], tensors["covariances"], space)
-        masses = (
-            as_float64(key, tensors[key], (len(new.means),)) for key in ("log_masses", "log_mass_errors")
-        )
+        masses = (as_float64(key, tensors[key], (len(new.means),)) for key in ("log_masses", "log_mass_errors"))
         new._known_masses = list(zip(*(mass.tolist() for mass in masses), strict=True))
         return new
 
@@ -236,9 +230,7 @@ def _symmetric(covariances: Tensor) -> Tensor:
     transposed = covariances.transpose(1, 2)
     variances = covariances.diagonal(dim1=1, dim2=2)
     if (variances <= 0).any():
-        raise ValueError(
-            f"covariances: expected positive variances, got {variances.min():.3g}; add to the diagonal"
-        )
+        raise ValueError(f"covariances: expected positive variances, got {variances.min():.3g}; add to the diagonal")
     sd = variances.sqrt()
     if ((covariances - transposed).abs() > 1e-8 * sd[:, :, None] * sd[:, None, :]).any():
         raise ValueError("covariances: expected symmetric matrices, got asymmetric ones; use (C + C.T) / 2")

@@ -72,9 +72,7 @@ class Particles(Posterior):
         if bandwidth == "scott":
             sd = self.stddev * self.effective_size ** (-1 / (len(self.space) + 4))
             if (sd <= 0).any():
-                raise ValueError(
-                    'bandwidth: "scott" needs spread in every parameter, got none; give a number'
-                )
+                raise ValueError('bandwidth: "scott" needs spread in every parameter, got none; give a number')
         else:
             sd = torch.full((len(self.space),), check_bandwidth(bandwidth), dtype=torch.float64)
         centres, weights = self._kernels()
@@ -133,9 +131,7 @@ class Particles(Posterior):
 
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
-        return cls(
-            tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("log_density")
-        )
+        return cls(tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("log_density"))
 
 
 def _normalised(weights: Any, rows: int) -> Tensor:
@@ -144,8 +140,6 @@ def _normalised(weights: Any, rows: int) -> Tensor:
     weights = as_float64("weights", weights, (rows,))
     total = weights.sum()
     if (weights < 0).any() or not total > 0:
-        raise ValueError(
-            "weights: expected non-negative numbers with a positive sum; exponentiate log weights first"
-        )
+        raise ValueError("weights: expected non-negative numbers with a positive sum; exponentiate log weights first")
     # weights read back from disk sum to one already and must stay the same to the last bit
     return weights if (total - 1).abs() < 1e-12 else weights / total

@@ -279,9 +279,7 @@ class TruncatedNormal:
         if self.untruncated:
             return self.mean, self.covariance
         if self.diagonal:
-            mean, variance = interval_moments(
-                np.zeros_like(self.mean), np.ones_like(self.mean), self.mean, self.sd
-            )
+            mean, variance = interval_moments(np.zeros_like(self.mean), np.ones_like(self.mean), self.mean, self.sd)
             return mean, np.diag(variance)
         return self._estimate.mean, self._estimate.covariance
 

@@ -1,0 +1,80 @@
+"""Logs that agree pass in silence; a planted disagreement is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sipe_bayes.diagnostics.agreement import LogEstimate, compare_logs, disagreement
+from sipe_bayes.likelihood import Segments
+from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.trajectory import Trajectories
+from tests.pendulums import log, pendulum
+
+SEEDS = range(20)
+
+
+def alarms(heavier: float, rho: float) -> list[str]:
+    """What is named, seed by seed, when the second log's rod is ``heavier`` times the first's."""
+    simulator = pendulum(Parameter("coulomb", 0.0, 0.1, targets=("joint:hinge.frictionloss",)))
+    named = []
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        mass, damping, coulomb = rng.uniform(0.5, 0.8), rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.05)
+        logs = Trajectories.stack(
+            [
+                log(simulator, [mass, damping, coulomb], 100 + seed, "monday", rho=rho),
+                log(simulator, [mass * heavier, damping, coulomb], 200 + seed, "tuesday", rho=rho),
+            ]
+        )
+        start = simulator.space.normalise(np.array([mass, damping, coulomb]))
+        found = compare_logs(simulator, Segments(0.5), logs, start)
+        named.append("" if found is None else found.parameter)
+    return named
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_agreeing_logs_pass_in_silence(rho: float) -> None:
+    """At the 1 % level, 3 or more alarms in 20 have a probability of 0.1 %."""
+    named = alarms(1.0, rho)
+    assert named.count("") >= 18, named
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_a_heavier_rod_is_named(rho: float) -> None:
+    named = alarms(1.1, rho)
+    assert named.count("rod_mass") >= 18, named
+
+
+def test_cochrans_q_against_a_plain_reference() -> None:
+    """Gaussian estimates of two logs: p uniform when they agree (false-alarm rate of this test 1 %)."""
+    space = ParameterSpace([Parameter("a"), Parameter("b")])
+    rng = np.random.default_rng(0)
+    root = np.array([[30.0, 0.0], [12.0, 20.0]])
+    information = root @ root.T
+    alarmed = 0
+    for _ in range(2000):
+        means = [0.5 + np.linalg.solve(root.T, rng.standard_normal(2)) for _ in range(2)]
+        estimates = [LogEstimate(str(i), m, information) for i, m in enumerate(means)]
+        alarmed += disagreement(space, estimates) is not None
+    assert 8 <= alarmed <= 33  # 20 expected at the 1 % level, sd 4.5
+
+
+def test_the_most_economical_parameter_is_named() -> None:
+    """Both marginals shift when a alone differs and b is free to follow; a is the one that explains it."""
+    space = ParameterSpace([Parameter("a", unit="kg"), Parameter("b")])
+    information = np.array([[4000.0, 3000.0], [3000.0, 4000.0]])
+    first = LogEstimate("one", np.array([0.40, 0.50]), information)
+    second = LogEstimate("two", np.array([0.60, 0.50]), information)
+    found = disagreement(space, [first, second])
+    assert found is not None
+    assert found.parameter == "a"
+    assert "one says 0.4" in found.text("kg")
+    assert "per_log = true" in found.text("kg")
+
+
+def test_a_log_that_says_nothing_disagrees_with_nobody() -> None:
+    space = ParameterSpace([Parameter("a"), Parameter("b")])
+    silent = LogEstimate("silent", np.array([5.0, -3.0]), np.zeros((2, 2)))
+    loud = LogEstimate("loud", np.array([0.5, 0.5]), 1e4 * np.eye(2))
+    assert disagreement(space, [silent, loud]) is None

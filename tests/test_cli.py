@@ -1,0 +1,499 @@
+"""The command: wrong input is one line and exit code 2, JSON is JSON, a killed run resumes, the folder is complete."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import arviz
+import mujoco
+import numpy as np
+import pandas as pd
+import pytest
+from safetensors import safe_open
+from typer.testing import CliRunner
+
+import sipe_bayes as sipe
+from sipe_bayes.cli import app
+
+MODEL = """\
+<mujoco model="pendulum">
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="rod">
+      <joint name="hinge" type="hinge" axis="0 1 0" damping="0.02"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+CONFIG = """\
+model = "pendulum.xml"
+window = 0.5
+
+[[commands]]
+actuator = "motor"
+column = "torque"
+unit = "N m"
+
+[[measurements]]
+name = "angle"
+column = "position"
+target = "joint:hinge.position"
+unit = "rad"
+
+[[logs]]
+file = "log.csv"
+span = [0.0, 2.0]
+
+[[logs]]
+file = "log.csv"
+name = "rest"
+use = "holdout"
+span = [2.01, 3.0]
+
+[[parameters]]
+name = "mass"
+target = "body:rod.mass"
+bounds = [0.3, 0.8]
+
+[[parameters]]
+name = "damping"
+target = "joint:hinge.damping"
+bounds = [0.01, 0.2]
+scale = "log"
+
+[noise]
+model = "white"
+"""
+
+TRUTH = {"mass": 0.6, "damping": 0.05}
+SAMPLES, DT, NOISE = 301, 0.01, 0.002
+
+
+def swing() -> pd.DataFrame:
+    """A recorded log of the pendulum with the true parameters."""
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    scale = TRUTH["mass"] / model.body_mass[1]
+    model.body_mass[1] *= scale
+    model.body_inertia[1] *= scale
+    model.dof_damping[0] = TRUTH["damping"]
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    time_s = np.arange(SAMPLES) * DT
+    torque = 1.5 * np.sin(2 * np.pi * time_s) + 0.7 * np.sin(2 * np.pi * 2.3 * time_s)
+    angle = np.empty(SAMPLES)
+    for k in range(SAMPLES):
+        angle[k] = data.qpos[0]
+        data.ctrl[0] = torque[k]
+        mujoco.mj_step(model, data, 2)
+    angle += np.random.default_rng(0).normal(0, NOISE, SAMPLES)
+    return pd.DataFrame({"time": time_s, "torque": torque, "position": angle})
+
+
+@pytest.fixture(scope="module")
+def log() -> pd.DataFrame:
+    return swing()
+
+
+def write_case(folder: Path, log: pd.DataFrame) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "pendulum.xml").write_text(MODEL)
+    (folder / "config.toml").write_text(CONFIG)
+    log.to_csv(folder / "log.csv", index=False)
+    return folder / "config.toml"
+
+
+def call(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["calibrate", *map(str, arguments), "--threads", "2"])
+
+
+# Wrong input
+
+
+def text(old: str, new: str, file: str = "config.toml") -> Callable[[Path], None]:
+    """Replace ``old`` in a file of the case."""
+
+    def change(folder: Path) -> None:
+        content = (folder / file).read_text()
+        assert content.count(old) >= 1
+        (folder / file).write_text(content.replace(old, new, 1))
+
+    return change
+
+
+def table(edit: Callable[[pd.DataFrame], pd.DataFrame]) -> Callable[[Path], None]:
+    """Change the log."""
+    return lambda folder: edit(pd.read_csv(folder / "log.csv")).to_csv(folder / "log.csv", index=False)
+
+
+def gone(file: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / file).unlink()
+
+
+def turned_back(log: pd.DataFrame) -> pd.DataFrame:
+    log.loc[7, "time"] = 0.02
+    return log
+
+
+def occupied(file: str, content: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        (folder / "out").mkdir()
+        (folder / "out" / file).write_text(content)
+
+    return change
+
+
+def nothing(folder: Path) -> None:
+    pass
+
+
+# what is wrong: (change, more arguments, words of the one line: argument, value, remedy)
+WRONG: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
+    "missing config": (gone("config.toml"), [], ["config.toml", "no such file", "correct the path"]),
+    "missing log": (gone("log.csv"), [], ["log 'log'", "log.csv: no such file", "correct the path"]),
+    "misspelt log": (text('"log.csv"', '"lag.csv"'), [], ["lag.csv: no such file", "did you mean 'log.csv'?"]),
+    "missing model": (text("pendulum.xml", "pendulm.xml"), [], ["key `model`", "did you mean 'pendulum.xml'?"]),
+    "missing column": (
+        table(lambda log: log.rename(columns={"position": "positn"})),
+        [],
+        ["log 'log'", "no column 'position'", "did you mean 'positn'?"],
+    ),
+    "missing clock": (
+        text("[noise]", '[columns]\ntime = { column = "tome" }\n\n[noise]'),
+        [],
+        ["log 'log'", "no column 'tome'", "did you mean 'time'?"],
+    ),
+    "unknown joint": (text("joint:hinge.pos", "joint:hing.pos"), [], ["'angle'", "no joint 'hing'", "'hinge'?"]),
+    "unknown actuator": (text('"motor"', '"moter"'), [], ["no actuator 'moter'", "did you mean 'motor'?"]),
+    "unknown body": (text("body:rod.mass", "body:rood.mass"), [], ["'mass'", "no body 'rood'", "'rod'?"]),
+    "unknown attribute": (
+        text("body:rod.mass", "body:rod.weight"),
+        [],
+        ["'mass'", "no attribute 'weight'", "known: com_x"],
+    ),
+    "target without attribute": (text("body:rod.mass", "rod"), [], ["'mass'", "'rod'", "KIND:NAME.ATTRIBUTE"]),
+    "unknown quantity": (
+        text("hinge.position", "hinge.angle"),
+        [],
+        ["measurements[0].target", "'joint:hinge.angle'", "'joint:NAME.position'"],
+    ),
+    "time turns back": (table(turned_back), [], ["log 'log'", "'time' must increase", "0.02", "sort the rows"]),
+    "time stands still": (
+        table(lambda log: log.assign(time=log["time"].where(log["time"] != 0.03, 0.02))),
+        [],
+        ["'time' must increase", "0.02 in row 4", "drop duplicate rows"],
+    ),
+    "channel all NaN": (
+        table(lambda log: log.assign(position=np.nan)),
+        [],
+        ["log 'log'", "'position' holds no number", "drop the measurement"],
+    ),
+    "command all NaN": (
+        table(lambda log: log.assign(torque=np.nan)),
+        [],
+        ["log 'log'", "'torque' holds no number", "choose another column"],
+    ),
+    "words in a column": (
+        table(lambda log: log.assign(position="up")),
+        [],
+        ["'position' holds 'up' in row 1", "correct it"],
+    ),
+    "bounds reversed": (text("[0.3, 0.8]", "[0.8, 0.3]"), [], ["parameters[0].bounds", "[0.8, 0.3]", "swap to"]),
+    "bounds equal": (text("[0.3, 0.8]", "[0.3, 0.3]"), [], ["parameters[0].bounds", "[0.3, 0.3]", "widen"]),
+    "default outside bounds": (
+        text("[0.3, 0.8]", "[0.6, 0.8]"),
+        [],
+        ["'mass'", "0.5", "[0.6, 0.8]", "widen"],
+    ),
+    "log scale from zero": (
+        text("[0.01, 0.2]", "[0.0, 0.2]"),
+        [],
+        ["parameters[1].bounds", "[0, 0.2]", "raise the lower one"],
+    ),
+    "log shorter than a window": (
+        text("window = 0.5", "window = 2.5"),
+        [],
+        ["log 'log'", "lasts 2 s", "window of 2.5 s", "lower `window`"],
+    ),
+    "wrong unit word": (text('"rad"', '"radian"'), [], ["measurements[0].unit", "'radian'", "did you mean 'rad'?"]),
+    "wrong kind of unit": (
+        text('"rad"', '"m"'),
+        [],
+        ["measurements[0].unit", "'m' (length)", "use one of 'rad'"],
+    ),
+    "not MJCF": (text("</mujoco>", "", "pendulum.xml"), [], ["model", "pendulum.xml", "not valid MJCF", "Line"]),
+    "does not compile": (
+        text('joint="hinge"', 'joint="knee"', "pendulum.xml"),
+        [],
+        ["model", "pendulum.xml", "knee", "line 9"],
+    ),
+    "not TOML": (
+        text('model = "pendulum.xml"', "model = "),
+        [],
+        ["config.toml", "not valid TOML", "line 1", "correct"],
+    ),
+    "unknown key": (text("window =", "windows ="), [], ["key `windows`", "did you mean 'window'?"]),
+    "target twice": (
+        text("joint:hinge.damping", "body:rod.mass"),
+        [],
+        ["parameters[1].targets", "'body:rod.mass'", "drop it from one"],
+    ),
+    "held-out samples train": (text("[2.01, 3.0]", "[1.0, 3.0]"), [], ["logs[1].use", "'log'", "give spans apart"]),
+    "unknown estimator": (nothing, ["--estimator", "laplase"], ["estimator", "'laplase'", "did you mean 'laplace'?"]),
+    "negative seed": (nothing, ["--seed", "-1"], ["--seed -1", "at least 0", "raise it"]),
+    "no budget": (nothing, ["--budget", "0"], ["--budget 0", "at least 1", "raise it"]),
+    "output holds another run": (
+        occupied("run.json", '{"seed": 3}'),
+        [],
+        ["--out", "out", "another run", "seed", "choose another folder"],
+    ),
+    "output holds something else": (
+        occupied("thesis.tex", "precious"),
+        [],
+        ["--out", "out", "something else", "choose an empty or a new folder"],
+    ),
+    "output is a file": (lambda folder: (folder / "out").touch(), [], ["--out", "is a file", "another name"]),
+}
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() if p.is_file() else ""
+        for p in sorted(folder.rglob("*"))
+    }
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_input_is_one_line(
+    wrong: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    change, arguments, words = WRONG[wrong]
+    config = write_case(tmp_path, log)
+    change(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    before = contents(tmp_path)
+    result = call(config, "--out", tmp_path / "out", *arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.startswith("sipe: ")
+    assert [w for w in words if w not in result.stderr] == [], result.stderr
+    assert contents(tmp_path) == before
+
+
+def test_wrong_input_of_the_installed_command(tmp_path: Path, log: pd.DataFrame) -> None:
+    config = write_case(tmp_path, log)
+    text('joint="hinge"', 'joint="knee"', "pendulum.xml")(tmp_path)
+    before = contents(tmp_path)
+    result = sipe_command(tmp_path, config, "--json")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.count("\n") == 1
+    assert "knee" in result.stderr
+    assert contents(tmp_path) == before
+
+
+# A finished run
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "sipe_bayes.cli", "calibrate", *map(str, arguments)]
+
+
+def environment() -> dict[str, str]:
+    here = str(Path(sipe.__file__).parents[1])
+    return {**os.environ, "PYTHONPATH": here, "OMP_NUM_THREADS": "1"}
+
+
+def sipe_command(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments), cwd=folder, env=environment(), capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, log: pd.DataFrame) -> tuple[Path, Path, Any]:
+    """(config, output folder, the subprocess's result) of a run with --json."""
+    folder = tmp_path_factory.mktemp("finished")
+    config = write_case(folder, log)
+    result = sipe_command(folder, config, "--json", "--out", folder / "out")
+    assert result.returncode == 0, result.stderr
+    return config, folder / "out", result
+
+
+def strict_json(words: str) -> Any:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(words, parse_constant=refuse)
+
+
+def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
+    _, out, result = finished
+    assert result.stdout.count("\n") == 1
+    assert result.stderr == ""  # no progress bar when piped
+    found = strict_json(result.stdout)
+    assert {"parameters", "holdout", "train", "warnings", "rollouts", "seconds", "out"} <= set(found)
+    wanted = {"name", "unit", "targets", "mean", "sd", "q05", "q50", "q95", "contraction", "flags"}
+    assert [wanted - set(p) for p in found["parameters"]] == [set(), set()]
+    for use, name in (("holdout", "rest"), ("train", "log")):
+        assert [set(s) for s in found[use]] == [{"log", "channel", "unit", "rmse", "rmse_default"}]
+        assert (found[use][0]["log"], found[use][0]["channel"], found[use][0]["unit"]) == (name, "angle", "rad")
+        assert found[use][0]["rmse"] < found[use][0]["rmse_default"]
+    assert found["rollouts"] > 0
+    assert Path(found["out"]) == out
+    for p in found["parameters"]:  # 5 sd: one in a million
+        assert abs(p["mean"] - TRUTH[p["name"]]) < 5 * p["sd"]
+        assert p["q05"] < p["q50"] < p["q95"]
+
+
+def test_numbers_that_are_not_finite_are_null() -> None:
+    from sipe_bayes.output import to_json
+
+    assert strict_json(to_json({"a": float("nan"), "b": [1.0, float("inf")]})) == {"a": None, "b": [1.0, None]}
+
+
+def test_output_folder(finished: tuple[Path, Path, Any]) -> None:
+    config, out, result = finished
+    names = {p.name for p in out.iterdir()}
+    assert names == {
+        *("checkpoint.safetensors", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
+        *("identified.xml", "domain_randomization.json", "result.json", "report.html", "figures"),
+    }
+    assert list((out / "figures").iterdir())
+    assert strict_json((out / "result.json").read_text()) == strict_json(result.stdout)
+    run = strict_json((out / "run.json").read_text())
+    assert (run["status"], run["estimator"], run["seed"]) == ("complete", "laplace", 0)
+    assert run["versions"]["mujoco"] == mujoco.__version__
+    assert run["config_sha256"] == hashlib.sha256(config.read_bytes()).hexdigest()
+    assert run["model_sha256"] == hashlib.sha256((config.parent / "pendulum.xml").read_bytes()).hexdigest()
+    assert run["logs_sha256"]["log"] == hashlib.sha256((config.parent / "log.csv").read_bytes()).hexdigest()
+    assert run["configuration"]["window"] == tomllib.loads(CONFIG)["window"]
+
+
+def test_posterior_is_read_back(finished: tuple[Path, Path, Any]) -> None:
+    _, out, result = finished
+    posterior = sipe.load_posterior(out / "posterior")
+    found = {p["name"]: p for p in strict_json(result.stdout)["parameters"]}
+    assert posterior.space.names == tuple(found)
+    mode = posterior.space.values(posterior.mode.numpy())
+    np.testing.assert_allclose(mode, [p["mode"] for p in found.values()], rtol=1e-12)
+    data = arviz.from_netcdf(out / "posterior.nc")
+    for name, p in found.items():
+        draws = data.posterior[name].values
+        assert abs(draws.mean() - p["mean"]) < 6 * p["sd"] / np.sqrt(draws.size)
+
+
+def test_identified_model_carries_the_mode(finished: tuple[Path, Path, Any]) -> None:
+    _, out, result = finished
+    mode = {p["name"]: p["mode"] for p in strict_json(result.stdout)["parameters"]}
+    before = mujoco.MjModel.from_xml_string(MODEL)
+    after = mujoco.MjModel.from_xml_path(str(out / "identified.xml"))
+    assert after.body("rod").mass[0] == pytest.approx(mode["mass"], rel=1e-5)
+    assert after.joint("hinge").damping[0] == pytest.approx(mode["damping"], rel=1e-5)
+    scaled = before.body("rod").inertia * mode["mass"] / before.body("rod").mass[0]
+    np.testing.assert_allclose(after.body("rod").inertia, scaled, rtol=1e-5)
+    np.testing.assert_allclose(after.opt.timestep, before.opt.timestep)
+
+
+def test_domain_randomization(finished: tuple[Path, Path, Any]) -> None:
+    _, out, result = finished
+    found = strict_json((out / "domain_randomization.json").read_text())
+    parameters = strict_json(result.stdout)["parameters"]
+    assert found["names"] == ["mass", "damping"]
+    assert [row["target"] for row in found["parameters"]] == [["body:rod.mass"], ["joint:hinge.damping"]]
+    assert [(row["low"], row["high"]) for row in found["parameters"]] == [(0.3, 0.8), (0.01, 0.2)]
+    for row, p in zip(found["parameters"], parameters, strict=True):
+        assert {k: row[k] for k in ("name", "unit", "mean", "sd", "q05", "q95")} == {
+            k: p[k] for k in ("name", "unit", "mean", "sd", "q05", "q95")
+        }
+    covariance = np.array(found["covariance"])
+    np.testing.assert_array_equal(covariance, covariance.T)
+    # two sets of 4000 draws of a normal: relative error of an sd 0.011 each, 6 standard errors
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [p["sd"] for p in parameters], rtol=0.1)
+
+
+def test_same_run_comes_back_and_another_seed_is_refused(finished: tuple[Path, Path, Any]) -> None:
+    config, out, result = finished
+    posterior = (out / "posterior.safetensors").read_bytes()
+    again = call(config, "--json", "--out", out)
+    assert again.exit_code == 0, again.stderr
+    first, second = strict_json(result.stdout), strict_json(again.stdout)
+    assert first.pop("seconds") > 0
+    assert second.pop("seconds") > 0
+    assert first == second
+    assert (out / "posterior.safetensors").read_bytes() == posterior
+    before = contents(out)
+    other = call(config, "--seed", 1, "--out", out)
+    assert other.exit_code == 2
+    assert "differs in seed" in other.stderr
+    assert other.stderr.count("\n") == 1
+    assert contents(out) == before
+
+
+def test_table_for_people(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = write_case(tmp_path / "swing", log)
+    result = call(config)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    assert (tmp_path / "runs" / "config-laplace").is_dir() or (tmp_path / "runs" / "swing-laplace").is_dir()
+    for words in ("mass", "damping", "90 % interval", "held out rest, angle: RMSE", "rollouts", "report: runs/"):
+        assert words in result.stdout
+
+
+# A killed run
+
+
+def test_killed_run_resumes_to_the_same_posterior(tmp_path: Path, log: pd.DataFrame) -> None:
+    """kill -9 in the middle of the chain; the same command again gives bit for bit what nobody disturbed gives.
+
+    The number of native threads differs on purpose."""
+    config = write_case(tmp_path, log)
+    text('model = "white"', 'model = "ar1"')(tmp_path)
+    whole = [config, "--estimator", "mcmc", "--out", tmp_path / "whole", "--threads", 1]
+    broken = [config, "--estimator", "mcmc", "--out", tmp_path / "broken"]
+    quiet: dict[str, Any] = {"env": environment(), "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    undisturbed = subprocess.Popen(command(*whole), **quiet)
+    process = subprocess.Popen(command(*broken, "--threads", 1), **quiet)
+    try:
+        size = wait_for_growth(tmp_path / "broken" / "checkpoint.safetensors", process)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        with safe_open(tmp_path / "broken" / "checkpoint.safetensors", framework="numpy") as file:
+            assert not json.loads(file.metadata()["plain"])["done"]
+        assert not (tmp_path / "broken" / "posterior.safetensors").exists()
+        resumed = sipe_command(tmp_path, *broken, "--threads", 2)
+        assert resumed.returncode == 0, resumed.stderr
+        assert undisturbed.wait() == 0, undisturbed.stderr
+    finally:
+        process.kill()
+        undisturbed.kill()
+    assert (tmp_path / "broken" / "checkpoint.safetensors").stat().st_size > size
+    for name in ("posterior.safetensors", "posterior.json", "identified.xml", "domain_randomization.json"):
+        assert (tmp_path / "broken" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    results = [strict_json((tmp_path / k / "result.json").read_text()) for k in ("broken", "whole")]
+    assert results[0]["rollouts"] == results[1]["rollouts"]
+    assert results[0]["mixing"] == results[1]["mixing"]
+
+
+def wait_for_growth(checkpoint: Path, process: subprocess.Popen[bytes]) -> int:
+    """The size of the checkpoint once it has appeared and grown."""
+    sizes: set[int] = set()
+    deadline = time.monotonic() + 300
+    while len(sizes) < 2:
+        assert process.poll() is None, "it ended before it could be killed: make the problem longer"
+        assert time.monotonic() < deadline, "no checkpoint in five minutes"
+        if checkpoint.exists():
+            sizes.add(checkpoint.stat().st_size)
+        time.sleep(0.02)
+    return max(sizes)

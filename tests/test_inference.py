@@ -1,0 +1,210 @@
+"""Every estimator of the registry, against exact posteriors and against the contract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import sipe_bayes as sipe
+from sipe_bayes.inference import ESTIMATORS, get_estimator
+from sipe_bayes.inference.state import CheckpointError
+from sipe_bayes.likelihood import Segments
+from sipe_bayes.parameters import Parameter
+from sipe_bayes.posterior import IndependentPrior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+from tests.pendulums import coloured, log, pendulum
+
+NAMES = list(ESTIMATORS)
+BUDGET = {"laplace": 400, "mcmc": 2500}
+
+CART = """
+<mujoco>
+  <option timestep="0.02" gravity="0 0 0" integrator="Euler"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="slide" type="slide" axis="1 0 0"/>
+      <geom size="0.1" mass="2" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="slide"/></actuator>
+</mujoco>
+"""
+NOISE = 0.02
+
+
+def cart() -> Simulator:
+    """A frictionless cart: its position is linear in the force's offset and in the encoder's bias."""
+    parameters = [
+        Parameter("offset", -1.0, 1.0, targets=("actuator:push.offset",)),
+        Parameter("bias", -0.5, 0.5, targets=("sensor:x.bias",), prior_mean=0.0, prior_sd=0.05),
+    ]
+    channel = sipe.Channel("joint:slide.position", "x")
+    return Simulator(sipe.MjcfEnvironment.build(CART, parameters, ["push"], [channel]), num_threads=1)
+
+
+def cart_log(simulator: Simulator, seed: int, rho: float = 0.0) -> tuple[Trajectory, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    theta = np.array([rng.uniform(0.3, 0.7), np.clip(0.5 + 0.05 * rng.standard_normal(), 0, 1)])
+    actions = 2.0 * np.sin(0.1 * np.arange(100))[:, None]
+    motion = simulator.rollout(theta, actions, simulator.default_state(), dt=0.02)
+    noise = coloured(rng, 101, NOISE, rho)[:, None]
+    return Trajectory(motion.observations[0] + noise, actions, 0.02, name="cart"), theta
+
+
+def exact_posterior(simulator: Simulator, trajectory: Trajectory, rho: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance (2, 2) by dense linear algebra: unknown start (flat), noise of known sd and rho."""
+    lanes = np.array([[0.5, 0.5], [0.6, 0.5], [0.5, 0.6]])
+    start = simulator.default_state()
+    still = simulator.rollout(lanes, trajectory.actions, start, dt=0.02).observations[:, :, 0]
+    moved = []
+    for column in (1, 2):  # position, velocity
+        shifted = start.copy()
+        shifted[column] += 1.0
+        moved.append(simulator.rollout(lanes[:1], trajectory.actions, shifted, dt=0.02).observations[0, :, 0] - still[0])
+    design = np.stack([(still[1] - still[0]) / 0.1, (still[2] - still[0]) / 0.1, *moved], axis=1)
+    n = len(design)
+    covariance = NOISE**2 * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    weight = np.linalg.inv(covariance)
+    prior = np.diag([0.0, 1 / 0.05**2, 0.0, 0.0])
+    posterior = np.linalg.inv(design.T @ weight @ design + prior)
+    residual = trajectory.observations[:, 0] - still[0]
+    return np.array([0.5, 0.5]) + (posterior @ design.T @ weight @ residual)[:2], posterior[:2, :2]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_exact_posterior_of_a_linear_gaussian_system(name: str) -> None:
+    """Known white noise, unknown start. The chain's mean is good to 4 of its standard errors at 300 effective draws
+    (false-alarm rate 0.03 % for each number); Laplace is exact."""
+    simulator = cart()
+    trajectory, _ = cart_log(simulator, 1)
+    mean, covariance = exact_posterior(simulator, trajectory, 0.0)
+    likelihood = Segments(None, noise="white", noise_sd=(NOISE,))
+    posterior = get_estimator(simulator, name, likelihood=likelihood, seed=0, budget=6000).fit(trajectory)
+    sd = np.sqrt(np.diag(covariance))
+    tolerance = 1e-3 if name == "laplace" else 4 / np.sqrt(300)
+    print(name, (posterior.mean.numpy() - mean) / sd, posterior.stddev.numpy() / sd)
+    np.testing.assert_allclose(posterior.mean.numpy(), mean, atol=tolerance * sd.max(), rtol=0)
+    np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=2e-3 if name == "laplace" else 0.17)
+    correlation = posterior.covariance.numpy()[0, 1] / np.prod(posterior.stddev.numpy())
+    assert abs(correlation - covariance[0, 1] / sd.prod()) < (2e-3 if name == "laplace" else 0.25)
+
+
+def test_windows_lose_no_information_that_the_starts_do_not_take() -> None:
+    """Shorter windows have more unknown starts: the posterior widens, it never sharpens."""
+    simulator = cart()
+    trajectory, _ = cart_log(simulator, 2)
+    widths = []
+    for window in (None, 1.0, 0.5):
+        likelihood = Segments(window, noise="white", noise_sd=(NOISE,))
+        widths.append(get_estimator(simulator, "laplace", likelihood=likelihood).fit(trajectory).stddev.numpy()[0])
+    assert widths[0] < widths[1] < widths[2]
+
+
+@pytest.mark.parametrize("noise", ["ar1", "sandwich"])
+def test_coloured_noise_widens_and_covers(noise: str) -> None:
+    """40 logs with rho .9: the 90 % interval of the offset holds the truth in 30 or more (a right width fails with
+    probability 0.2 %); white noise's intervals hold it in fewer than 30."""
+    simulator = cart()
+    covered = {noise: 0, "white": 0}
+    for seed in range(40):
+        trajectory, theta = cart_log(simulator, 100 + seed, rho=0.9)
+        for kind in covered:
+            fit = get_estimator(simulator, "laplace", likelihood=Segments(None, noise=kind), restarts=1, candidates=0)
+            low, high = fit.fit(trajectory).quantile(torch.tensor([0.05, 0.95])).numpy()[:, 0]
+            covered[kind] += low <= theta[0] <= high
+    assert covered[noise] >= 30, covered
+    assert covered["white"] < 30, covered
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_contract(name: str) -> None:
+    """Support, dtype, seeding, budget, several trajectories, missing samples."""
+    simulator = pendulum()
+    logs = [log(simulator, [0.6, 0.05], 1, "a", steps=200), log(simulator, [0.6, 0.05], 2, "b", steps=150)]
+    logs[0].observations[20:40] = np.nan
+    fits = [get_estimator(simulator, name, seed=3, budget=BUDGET[name]) for _ in range(2)]
+    one, other = (f.fit(logs) for f in fits)
+    draws = one.sample((500,), generator=torch.Generator().manual_seed(0))
+    assert draws.dtype == torch.float64
+    assert draws.shape == (500, 2)
+    assert ((draws >= 0) & (draws <= 1)).all()
+    assert fits[0].rollouts <= BUDGET[name]
+    assert torch.equal(draws, other.sample((500,), generator=torch.Generator().manual_seed(0)))
+    truth = simulator.space.normalise(np.array([0.6, 0.05]))
+    assert (np.abs(one.mean.numpy() - truth) < 5 * one.stddev.numpy()).all()
+    assert (one.stddev.numpy() < 0.1).all()
+
+
+class Interrupted(Exception):
+    """Stands for a killed process."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: Path) -> None:
+    simulator = pendulum()
+    trajectory = log(simulator, [0.6, 0.05], 1, steps=200)
+    undisturbed = get_estimator(simulator, name, seed=5, budget=BUDGET[name]).fit(trajectory)
+    steps = 0
+
+    def interrupt(*_: Any) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 3:
+            raise Interrupted
+
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    settings = {"seed": 5, "budget": BUDGET[name], "checkpoint": checkpoint}
+    first = get_estimator(simulator, name, progress=interrupt, **settings)
+    first.checkpoint_seconds = 0.0
+    with pytest.raises(Interrupted):
+        first.fit(trajectory)
+    assert checkpoint.exists()
+    resumed = get_estimator(pendulum(), name, **settings).fit(trajectory)
+    same = torch.Generator().manual_seed(1), torch.Generator().manual_seed(1)
+    assert torch.equal(undisturbed.sample((100,), generator=same[0]), resumed.sample((100,), generator=same[1]))
+    with pytest.raises(CheckpointError, match="belongs to another run"):
+        get_estimator(simulator, name, seed=6, budget=BUDGET[name], checkpoint=checkpoint).fit(trajectory)
+    checkpoint.write_bytes(b"nonsense")
+    with pytest.raises(CheckpointError, match="delete it"):
+        get_estimator(simulator, name, **settings).fit(trajectory)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_prior_counts(name: str) -> None:
+    """A narrow prior far from the data's answer pulls the posterior to it."""
+    simulator = pendulum()
+    trajectory = log(simulator, [0.6, 0.05], 1, steps=100)
+    prior = IndependentPrior([0.9, 0.5], [1e-4, float("inf")], simulator.space)
+    posterior = get_estimator(simulator, name, prior=prior, budget=BUDGET[name]).fit(trajectory)
+    assert abs(float(posterior.mean[0]) - 0.9) < 5e-3
+
+
+def test_wrong_input() -> None:
+    simulator = pendulum()
+    trajectory = log(simulator, [0.6, 0.05], 1, steps=100)
+    other = Trajectory(np.zeros((11, 3)), np.zeros((10, 1)), 0.01)
+    silent = Trajectory(np.full((101, 1), np.nan), np.zeros((100, 1)), 0.01)
+    table: list[tuple[Any, type[Exception], str]] = [
+        (lambda: get_estimator(simulator, "laplas"), ValueError, "did you mean 'laplace'"),
+        (lambda: get_estimator(simulator, "laplace", budget=0), ValueError, "at least 1 rollout"),
+        (lambda: get_estimator(simulator, "laplace", restarts=0), ValueError, "restarts"),
+        (lambda: get_estimator(simulator, "mcmc", walkers=3), ValueError, "walkers"),
+        (lambda: get_estimator(simulator, "mcmc", likelihood=Segments(noise="sandwich")), ValueError, "use 'ar1'"),
+        (lambda: get_estimator(simulator, "laplace", budget=12).fit(trajectory), ValueError, "raise the budget"),
+        (lambda: get_estimator(simulator, "laplace").fit(other), ValueError, "expected observations of the 1 channels"),
+        (lambda: get_estimator(simulator, "laplace").fit(silent), ValueError, "no sample at all"),
+        (lambda: get_estimator(simulator, "laplace").fit([]), ValueError, "at least one"),
+        (lambda: get_estimator(simulator, "laplace").get_parameter_estimate(trajectory), ValueError, "nothing has been"),
+        (lambda: Segments(0.0), ValueError, "seconds above zero"),
+        (lambda: Segments(noise="pink"), ValueError, "expected 'ar1'"),
+        (lambda: Segments(5.0).bind(simulator, Trajectories.stack(trajectory)), ValueError, "shorter than one window"),
+        (lambda: Segments(0.5, fit=("speed",)).bind(simulator, Trajectories.stack(trajectory)), ValueError, "unknown channels"),
+    ]
+    for call, exception, words in table:
+        with pytest.raises(exception, match=words):
+            call()
