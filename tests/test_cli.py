@@ -443,11 +443,12 @@ def test_same_run_comes_back_and_another_seed_is_refused(finished: tuple[Path, P
 def test_table_for_people(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     config = write_case(tmp_path / "swing", log)
+    text("bounds = [0.01, 0.2]", "bounds = [0.01, 0.2]\nper_log = true")(config.parent)
     result = call(config)
     assert result.exit_code == 0, result.stderr
     assert result.stderr == ""
     assert (tmp_path / "runs" / "config-laplace").is_dir() or (tmp_path / "runs" / "swing-laplace").is_dir()
-    for words in ("mass", "damping", "90 % interval", "held out rest, angle: RMSE", "rollouts", "report: runs/"):
+    for words in ("mass", "damping[log]", "90 % interval", "held out rest, angle: RMSE", "rollouts", "report: runs/"):
         assert words in result.stdout
 
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sipe_bayes.config import Config, ConfigError, load_config
-from sipe_bayes.logs import LogError, LogReport, count_clipped, load_log, read_table
+from sipe_bayes.logs import LogReport, count_clipped, load_log
+from sipe_bayes.tables import LogError, read_table
 from sipe_bayes.trajectory import Trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

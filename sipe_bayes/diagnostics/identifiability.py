@@ -1,8 +1,8 @@
 """What the data cannot say: parameters that change nothing, ranges that are dead, directions left open.
 
 A ridge is a direction of small posterior variance in a space where the parameters one by one have large variance: the
-smallest principal components of the posterior's correlation matrix. Where all members are positive it is taken in
-logarithms, which turns products and quotients (gear / mass, mass * length^2) into straight lines.
+smallest principal components of the posterior's correlation matrix. It is described as a sum or, in logarithms, as a
+product (gear / mass, mass * length^2), whichever is the narrower.
 """
 
 from __future__ import annotations
@@ -62,44 +62,55 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
     moving = np.flatnonzero(spread > 1e-12 * np.maximum(np.abs(draws.mean(0)), 1e-300))
     if len(moving) < 2:
         return []
+    steady = np.abs(np.sign(draws).sum(0)) == len(draws)
+    logarithms = np.where(steady, np.log(np.maximum(np.abs(draws), 1e-300)), draws)
     found: list[Ridge] = []
     used: set[int] = set()
-    eigenvalues, vectors = np.linalg.eigh(np.corrcoef(draws[:, moving].T))
-    for value, vector in zip(eigenvalues, vectors.T, strict=True):
-        members = [int(moving[i]) for i in np.flatnonzero(np.abs(vector) > _MEMBER)]
-        if value > 3 * _NARROW or len(members) < 2 or used & set(members):
-            continue
-        if all(contraction[j] > _DETERMINED for j in members):
-            continue
-        ridge = _describe(space, draws, members)
-        if ridge is not None:
-            used |= set(members)
-            found.append(ridge)
+    for view in (logarithms[:, moving], draws[:, moving]):
+        eigenvalues, vectors = np.linalg.eigh(np.corrcoef(view.T))
+        for value, vector in zip(eigenvalues, vectors.T, strict=True):
+            members = [int(moving[i]) for i in np.flatnonzero(np.abs(vector) > _MEMBER)]
+            if value > 3 * _NARROW or len(members) < 2 or used & set(members):
+                continue
+            if all(contraction[j] > _DETERMINED for j in members):
+                continue
+            ridge = _describe(space, draws, members)
+            if ridge is not None:
+                used |= set(members)
+                found.append(ridge)
     return found
 
 
 def _describe(space: ParameterSpace, draws: FloatArray, members: list[int]) -> Ridge | None:
     """The best determined combination of the members, in words; None when it is not far better known than they."""
-    positive = all(space[j].low > 0 or (draws[:, j] > 0).all() for j in members)
-    x = np.log(draws[:, members]) if positive else draws[:, members]
-    centre, sd = x.mean(0), x.std(0)
-    eigenvalues, vectors = np.linalg.eigh(np.corrcoef(((x - centre) / sd).T))
-    if eigenvalues[0] > _NARROW:
+    chosen = draws[:, members]
+    spaces = [("sum", chosen)]
+    if (np.abs(np.sign(chosen).sum(0)) == len(chosen)).all():  # nobody changes sign: products have logarithms
+        spaces.insert(0, ("product", np.log(np.abs(chosen))))
+    best = min(((*_narrowest(x), kind, x) for kind, x in spaces), key=lambda found: found[0])
+    eigenvalue, weights, loadings, kind, x = best[0], np.array(best[1]), np.array(best[2]), best[3], best[4]
+    if eigenvalue > _NARROW:
         return None
-    weights = vectors[:, 0] / sd
-    lead = int(np.argmax(np.abs(vectors[:, 0])))
-    weights = weights / weights[lead]
-    kept = [k for k in range(len(members)) if abs(vectors[k, 0]) > _MEMBER]
+    kept = np.flatnonzero(loadings > _MEMBER)
     names = [space[members[k]].name for k in kept]
     combined = x[:, kept] @ weights[kept]
-    if positive:
-        value, width = float(np.exp(combined.mean())), float(np.exp(combined.mean()) * combined.std())
-        text = _product(names, weights[kept])
+    if kind == "product":
+        sign = np.prod(np.sign(chosen[0, kept]))
+        value = float(np.exp(combined.mean()))
+        width, text, value = value * float(combined.std()), _product(names, weights[kept]), sign * value
     else:
-        value, width = float(combined.mean()), float(combined.std())
-        text = _sum(names, weights[kept])
+        value, width, text = float(combined.mean()), float(combined.std()), _sum(names, weights[kept])
     alone = " and ".join(names) if len(names) == 2 else ", ".join(names[:-1]) + " and " + names[-1]
     return Ridge(f"{text} = {value:.4g} ± {width:.1g} is determined; {alone} alone are not", tuple(names))
+
+
+def _narrowest(x: FloatArray) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
+    """Smallest eigenvalue of the correlation of x (n, m), its direction in x's units and its loadings."""
+    sd = np.maximum(x.std(0), 1e-300)
+    eigenvalues, vectors = np.linalg.eigh(np.corrcoef((x / sd).T))
+    weights = vectors[:, 0] / sd
+    weights = weights / weights[int(np.argmax(np.abs(vectors[:, 0])))]
+    return float(eigenvalues[0]), tuple(weights), tuple(np.abs(vectors[:, 0]))
 
 
 def _product(names: Sequence[str], weights: FloatArray) -> str:

@@ -90,6 +90,11 @@ class Ridge:
     parameters: tuple[str, ...]
 
 
+def _finite(value: Any) -> Any:
+    """JSON knows neither infinity nor NaN."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 @dataclass
 class Calibration:
     """The outcome of ``sipe calibrate``. noise: channel -> {"sd", "tau" (s), "unit"}; mixing: {"rhat", "ess", ...} of
@@ -122,7 +127,7 @@ class Calibration:
             "train": [asdict(s) for s in self.train],
             "warnings": list(self.warnings),
             "noise": self.noise,
-            "mixing": self.mixing,
+            "mixing": None if self.mixing is None else {k: _finite(v) for k, v in self.mixing.items()},
             "rollouts": self.rollouts,
             "seconds": round(self.seconds, 3),
             "out": self.out,

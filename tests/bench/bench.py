@@ -1,0 +1,234 @@
+"""`make bench`: tables of ratios. Whatever stands in one row was run in one process, the two sides in turn (first the one,
+then the other first), seven pairs or more; a row gives the medians and the median of the pairs' ratios.
+
+Seconds depend on the machine and on what else it does; ratios should not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import arm
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+import sipe_bayes.inference.laplace as laplace_module
+from sipe_bayes.calibration import prepare
+from sipe_bayes.inference import get_estimator
+from sipe_bayes.likelihood import Segments, Windows
+from sipe_bayes.simulator import Simulator
+
+PENDULUM = Path(__file__).parents[2] / "examples" / "simple_pendulum" / "calibrate.toml"
+LANES, STEPS = 64, 200
+PENDULUM_XML = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="a" axis="0 1 0"
+damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/></body></worldbody>
+<actuator><motor name="a" joint="a"/></actuator></mujoco>
+"""
+TWO_LINKS_XML = """
+<mujoco><option timestep="0.002" integrator="implicitfast"><flag contact="disable"/></option><worldbody><body>
+<joint name="a" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
+<body pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02"
+mass="0.6"/></body></body></worldbody>
+<actuator><motor name="a" joint="a"/><motor name="b" joint="b"/></actuator></mujoco>
+"""
+Seconds = tuple[float, float, float]
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+def side_by_side(ours: Callable[[], Any], other: Callable[[], Any], pairs: int) -> Seconds:
+    """Median seconds of each and the median of the pairs' ratios, after one warm-up of each."""
+    ours(), other()
+    times = []
+    for k in range(pairs):
+        first, second = (ours, other) if k % 2 == 0 else (other, ours)
+        a, b = seconds(first), seconds(second)
+        times.append((a, b) if k % 2 == 0 else (b, a))
+    mine, theirs = zip(*times, strict=True)
+    return statistics.median(mine), statistics.median(theirs), statistics.median(a / b for a, b in times)
+
+
+def engine(pairs: int) -> None:
+    print(f"\nEngine: Simulator.rollout against mujoco.rollout, {LANES} lanes x {STEPS} control steps")
+    print("mujoco.rollout: models written beforehand, controls repeated beforehand, states alone read")
+    print(f"{'model':<12}{'substeps':>9}{'ours ms':>10}{'bare ms':>10}{'ratio':>8}{'M steps/s':>11}")
+    for name, xml, joints in (("pendulum", PENDULUM_XML, "a"), ("two links", TWO_LINKS_XML, "ab")):
+        for substeps in (1, 5):
+            mine, bare, ratio = _engine_row(xml, joints, substeps, pairs)
+            rate = LANES * STEPS * substeps / mine / 1e6
+            print(f"{name:<12}{substeps:>9}{1e3 * mine:>10.2f}{1e3 * bare:>10.2f}{ratio:>8.2f}{rate:>11.2f}")
+
+
+def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
+    from sipe_bayes.envs.mjcf import MjcfEnvironment
+    from sipe_bayes.parameters import Parameter
+
+    parameters = [Parameter(f"damping_{j}", 0.01, 1.0, targets=(f"joint:{j}.damping",)) for j in joints]
+    simulator = Simulator(
+        MjcfEnvironment.build(xml, parameters, list(joints), [f"joint:{j}.position" for j in joints])
+    )
+    rng = np.random.default_rng(0)
+    theta = rng.random((LANES, len(joints)))
+    actions = rng.standard_normal((LANES, STEPS, len(joints)))
+    start = np.tile(simulator.default_state(), (LANES, 1))
+    dt = substeps * simulator.model.opt.timestep
+    models = []
+    for row in theta:
+        model = mujoco.MjModel.from_xml_string(xml)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+        model.dof_damping[:] = simulator.space.values(row)
+        models.append(model)
+    datas = [mujoco.MjData(models[0]) for _ in range(simulator.num_threads)]
+    controls = np.repeat(actions, substeps, axis=1)
+
+    def bare() -> Any:
+        return mujoco.rollout.rollout(
+            models, datas, initial_state=start, control=controls, persistent_pool=True
+        )[0]
+
+    def ours() -> Any:
+        return simulator.rollout(theta, actions, start, dt)
+
+    np.testing.assert_array_equal(ours().states[:, 1:], bare()[:, substeps - 1 :: substeps])
+    return side_by_side(ours, bare, max(pairs, 21))
+
+
+def rival(pairs: int) -> None:
+    print("\nlaplace against mujoco.sysid: the arm of sysid's own test, five armatures from 0.01 kg m^2, bounds 0.001 and 1,")
+    print("2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: its default")
+    print("optimiser ('mujoco'), start state given, white noise. laplace: start states estimated.")
+    import contextlib
+    import io
+
+    simulator = arm.arm_simulator()
+    settings: dict[str, tuple[Segments, dict[str, Any]]] = {
+        "default: windows 0.5 s, ar1, 2 starts": (Segments(), {}),
+        "windows 0.5 s, ar1, 1 start": (Segments(), {"restarts": 1, "candidates": 0}),
+        "one window, white, 2 starts": (Segments(window=None, noise="white"), {}),
+        "one window, white, 1 start": (Segments(window=None, noise="white"), {"restarts": 1, "candidates": 0}),
+    }
+    print(f"{'laplace settings':<40}{'ours s':>8}{'sysid s':>9}{'ratio':>7}{'rollouts':>10}")
+    found: dict[str, list[arm.Estimate]] = {}
+    for name, (likelihood, more) in settings.items():
+        mine, theirs = found.setdefault(name, []), found.setdefault("mujoco.sysid", [])
+        count = {"ours": 0, "sysid": 0}
+
+        def ours(out: Any = mine, lik: Any = likelihood, kw: Any = more, n: Any = count) -> None:
+            out.append(arm.ours(simulator, arm.arm_log(n["ours"]), lik, **kw))
+            n["ours"] += 1
+
+        def other(out: Any = theirs, n: Any = count) -> None:
+            with contextlib.redirect_stdout(io.StringIO()):
+                out.append(arm.rival(arm.arm_log(n["sysid"])))
+            n["sysid"] += 1
+
+        a, b, ratio = side_by_side(ours, other, pairs)
+        rollouts = int(statistics.median(e.rollouts for e in mine))
+        print(f"{name:<40}{a:>8.2f}{b:>9.2f}{ratio:>7.2f}{rollouts:>10}")
+    print(f"\n{'':<40}{'mean |error|':>14}{'mean half-width':>17}{'truths inside':>15}   (95 % intervals, g m^2)")
+    for name, estimates in found.items():
+        error = 1e3 * np.mean([e.error for e in estimates])
+        half = 1e3 * np.mean([e.half for e in estimates])
+        inside = sum(e.inside for e in estimates)
+        print(f"{name:<40}{error:>14.3f}{half:>17.3f}{inside:>9} of {5 * len(estimates):<5}")
+
+
+@contextmanager
+def stopwatch(table: dict[str, float], owner: Any, name: str, stage: str) -> Iterator[None]:
+    """Adds the seconds spent in ``owner.name`` to ``table[stage]``."""
+    inner = getattr(owner, name)
+
+    def timed(*args: Any, **kwargs: Any) -> Any:
+        begin = time.perf_counter()
+        try:
+            return inner(*args, **kwargs)
+        finally:
+            table[stage] = table.get(stage, 0.0) + time.perf_counter() - begin
+
+    setattr(owner, name, timed)
+    try:
+        yield
+    finally:
+        setattr(owner, name, inner)
+
+
+def stages(pairs: int) -> None:
+    print("\nWhere a laplace fit spends its time (medians, seconds)")
+    print(f"{'problem':<34}{'simulate':>10}{'noise':>8}{'algebra':>9}{'total':>8}{'rollouts':>10}")
+    pendulum = prepare(PENDULUM)
+    log = arm.arm_log(0)
+    simulator = arm.arm_simulator()
+    problems: dict[str, Callable[[], int]] = {
+        "arm, windows 0.5 s, ar1": lambda: arm.ours(simulator, log, Segments()).rollouts,
+        "pendulum (ddp), its configuration": lambda: _pendulum_fit(pendulum),
+    }
+    for name, work in problems.items():
+        rows = []
+        for _ in range(pairs):
+            table: dict[str, float] = {}
+            with (
+                stopwatch(table, Windows, "predict", "simulate"),
+                stopwatch(table, laplace_module, "estimate_noise", "noise"),
+                stopwatch(table, laplace_module, "noise_cloud", "noise"),
+            ):
+                begin = time.perf_counter()
+                rollouts = work()
+                total = time.perf_counter() - begin
+            rows.append((table["simulate"], table["noise"], total - table["simulate"] - table["noise"], total))
+        a, b, c, d = np.median(rows, axis=0)
+        print(f"{name:<34}{a:>10.2f}{b:>8.2f}{c:>9.2f}{d:>8.2f}{rollouts:>10}")
+
+
+def _pendulum_fit(problem: Any) -> int:
+    estimator = get_estimator(problem.simulator, "laplace", likelihood=problem.likelihood, prior=problem.prior)
+    estimator.fit(problem.train)
+    return estimator.rollouts
+
+
+def chain() -> None:
+    print("\nmcmc on the pendulum's ddp log, its configuration, one run")
+    problem = prepare(PENDULUM)
+    estimator = get_estimator(problem.simulator, "mcmc", likelihood=problem.likelihood, prior=problem.prior, seed=0)
+    elapsed = seconds(lambda: estimator.fit(problem.train))
+    mixing = estimator.diagnostics["mixing"]
+    print(
+        f"{estimator.rollouts} rollouts, {elapsed:.1f} s, {mixing['ess']:.0f} effective draws, R-hat {mixing['rhat']:.3f}: "
+        f"{estimator.rollouts / mixing['ess']:.0f} rollouts and {1e3 * elapsed / mixing['ess']:.0f} ms an effective draw"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    tables = ("engine", "rival", "stages", "chain")
+    parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
+    parser.add_argument("--pairs", type=int, default=7)
+    given = parser.parse_args()
+    versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in ("mujoco", "numpy", "scipy", "torch"))
+    load = os.getloadavg()[0]
+    print(f"{os.cpu_count()} cores ({platform.machine()}), load {load:.1f}, Python {platform.python_version()}, {versions}")
+    for name in given.tables or tables:
+        if name == "rival" and not hasattr(__import__("mujoco.sysid").sysid, "optimize"):
+            print("\nmujoco.sysid is not installed (pip install 'mujoco[sysid]'): no comparison")
+        elif name == "chain":
+            chain()
+        else:
+            {"engine": engine, "rival": rival, "stages": stages}[name](max(given.pairs, 7))
+
+
+if __name__ == "__main__":
+    main()
