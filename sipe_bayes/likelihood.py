@@ -249,23 +249,52 @@ class Windows:
             residual = np.where(self.observed, self.measured - predicted, 0.0)
         return np.where(valid[:, None, None, None], residual, 0.0), valid
 
-    def linearise(self, theta: FloatArray, starts: FloatArray, with_theta: bool = True) -> Linearisation:
-        """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs."""
-        n, d = (self.num_theta if with_theta else 0), self.num_start
+    @property
+    def starts_measured(self) -> bool:
+        """Whether the log tells where every window starts: recorded states, or a measured position of each joint."""
+        model = self.simulator.model
+        if self.trajectories.states is not None:
+            return True
+        if model.na or model.nq != model.nv:
+            return False
+        columns = self.simulator.environment.state_columns(model)
+        seen = [column for c, column in enumerate(columns) if np.isfinite(self.trajectories.observations[..., c]).any()]
+        return set(range(1, 1 + model.nq)) <= set(seen)
+
+    def linearise(
+        self,
+        theta: FloatArray,
+        starts: FloatArray,
+        with_theta: bool = True,
+        with_starts: bool = True,
+        residual: FloatArray | None = None,
+    ) -> Linearisation:
+        """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs.
+
+        with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
+        at this very point, which spares the one."""
+        n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
         sign = np.where(theta + _THETA_STEP <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
         for j in range(n):
             thetas[j + 1, j] += sign[j] * _THETA_STEP
         for j in range(d):
             all_starts[n + 1 + j, :, j] += _START_STEP
-        predicted, valid = self.predict(thetas, all_starts)
+        if residual is None:
+            predicted, valid = self.predict(thetas, all_starts)
+        else:
+            there = np.where(self.observed, self.measured - residual, np.nan)
+            predicted, valid = self.predict(thetas[1:], all_starts[1:])
+            predicted, valid = np.concatenate([there[None], predicted]), np.append(True, valid)
         wrong = [j for j in range(n) if not valid[j + 1]]
         if wrong and valid[0]:  # a step across a physical limit: look the other way
             sign[wrong] = -sign[wrong]
             again = np.tile(theta, (len(wrong), 1))
             again[np.arange(len(wrong)), wrong] += sign[wrong] * _THETA_STEP
             inside = np.clip(again, 0, 1)
-            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
+            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(
+                inside, all_starts[: len(wrong)]
+            )
         scale = np.concatenate([sign[:n] * _THETA_STEP, np.full(d, _START_STEP)])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]

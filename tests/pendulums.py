@@ -45,7 +45,13 @@ def coloured(rng: np.random.Generator, n: int, sd: float, rho: float) -> np.ndar
 
 
 def log(
-    simulator: Simulator, values: list[float], seed: int, name: str = "log", steps: int = 400, sd: float = 0.01, rho: float = 0.0
+    simulator: Simulator,
+    values: list[float],
+    seed: int,
+    name: str = "log",
+    steps: int = 400,
+    sd: float = 0.01,
+    rho: float = 0.0,
 ) -> Trajectory:
     """A simulated log at physical ``values``: sums of sines drive the motor, the angle is measured with noise."""
     rng = np.random.default_rng(seed)

@@ -65,7 +65,9 @@ def exact_posterior(simulator: Simulator, trajectory: Trajectory, rho: float) ->
     for column in (1, 2):  # position, velocity
         shifted = start.copy()
         shifted[column] += 1.0
-        moved.append(simulator.rollout(lanes[:1], trajectory.actions, shifted, dt=0.02).observations[0, :, 0] - still[0])
+        moved.append(
+            simulator.rollout(lanes[:1], trajectory.actions, shifted, dt=0.02).observations[0, :, 0] - still[0]
+        )
     design = np.stack([(still[1] - still[0]) / 0.1, (still[2] - still[0]) / 0.1, *moved], axis=1)
     n = len(design)
     covariance = NOISE**2 * rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
@@ -199,11 +201,19 @@ def test_wrong_input() -> None:
         (lambda: get_estimator(simulator, "laplace").fit(other), ValueError, "expected observations of the 1 channels"),
         (lambda: get_estimator(simulator, "laplace").fit(silent), ValueError, "no sample at all"),
         (lambda: get_estimator(simulator, "laplace").fit([]), ValueError, "at least one"),
-        (lambda: get_estimator(simulator, "laplace").get_parameter_estimate(trajectory), ValueError, "nothing has been"),
+        (
+            lambda: get_estimator(simulator, "laplace").get_parameter_estimate(trajectory),
+            ValueError,
+            "nothing has been",
+        ),
         (lambda: Segments(0.0), ValueError, "seconds above zero"),
         (lambda: Segments(noise="pink"), ValueError, "expected 'ar1'"),
         (lambda: Segments(5.0).bind(simulator, Trajectories.stack(trajectory)), ValueError, "shorter than one window"),
-        (lambda: Segments(0.5, fit=("speed",)).bind(simulator, Trajectories.stack(trajectory)), ValueError, "unknown channels"),
+        (
+            lambda: Segments(0.5, fit=("speed",)).bind(simulator, Trajectories.stack(trajectory)),
+            ValueError,
+            "unknown channels",
+        ),
     ]
     for call, exception, words in table:
         with pytest.raises(exception, match=words):

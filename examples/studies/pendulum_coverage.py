@@ -1,4 +1,4 @@
-"""Do 90 % intervals hold the truth 90 % of the time? Simulated logs of the simple pendulum, truths drawn from the prior.
+"""Do 90 % intervals hold the truth 90 % of the time? Simulated logs of the simple pendulum, truths from the prior.
 
     python examples/studies/pendulum_coverage.py --estimator laplace --rho 0.99 --truths 128
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from sipe_bayes.calibration import Problem
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
 NOISE_SD = 0.01  # rad
+WINDOW = 0.5  # s
+BUDGET = {"laplace": 5000, "mcmc": 700}  # rollouts; 700 give the chain about 100 effective draws
 
 
 def simulated_log(problem: Problem, theta: np.ndarray, rho: float, rng: np.random.Generator) -> sipe.Trajectory:
@@ -46,8 +49,10 @@ def one_fit(problem: Problem, estimator: str, rho: float, seed: int) -> dict[str
     space = problem.environment.space
     theta = rng.uniform(0, 1, len(space))
     log = simulated_log(problem, theta, rho, rng)
-    settings: dict[str, Any] = {"budget": 700} if estimator == "mcmc" else {}
-    method = sipe.get_estimator(problem.simulator, estimator, likelihood=problem.likelihood, seed=seed, **settings)
+    likelihood = replace(problem.likelihood, window=WINDOW)
+    method = sipe.get_estimator(
+        problem.simulator, estimator, likelihood=likelihood, seed=seed, budget=BUDGET[estimator]
+    )
     posterior = method.fit(log)
     low, high = posterior.quantile([0.05, 0.95]).numpy()
     return {
@@ -98,6 +103,8 @@ def main() -> None:
         "command": f"python examples/studies/pendulum_coverage.py --estimator {arguments.estimator} "
         f"--rho {arguments.rho:g} --truths {arguments.truths}",
         "noise_sd_rad": NOISE_SD,
+        "window_s": WINDOW,
+        "budget": BUDGET[arguments.estimator],
         **summary(rows[: arguments.truths], problem.environment.space.names),
     }
     result = HERE / "results" / f"{name}.json"

@@ -65,18 +65,18 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
     steady = np.abs(np.sign(draws).sum(0)) == len(draws)
     logarithms = np.where(steady, np.log(np.maximum(np.abs(draws), 1e-300)), draws)
     found: list[Ridge] = []
-    used: set[int] = set()
+    used: list[set[str]] = []
     for view in (logarithms[:, moving], draws[:, moving]):
         eigenvalues, vectors = np.linalg.eigh(np.corrcoef(view.T))
         for value, vector in zip(eigenvalues, vectors.T, strict=True):
             members = [int(moving[i]) for i in np.flatnonzero(np.abs(vector) > _MEMBER)]
-            if value > 3 * _NARROW or len(members) < 2 or used & set(members):
+            if value > 3 * _NARROW or len(members) < 2:
                 continue
             if all(contraction[j] > _DETERMINED for j in members):
                 continue
             ridge = _describe(space, draws, members)
-            if ridge is not None:
-                used |= set(members)
+            if ridge is not None and not any(set(ridge.parameters) <= seen for seen in used):
+                used.append(set(ridge.parameters))
                 found.append(ridge)
     return found
 

@@ -40,13 +40,19 @@ class QuadraticPrior:
 
 @dataclass(frozen=True)
 class Fit:
-    """A point of the search: theta (N,), starts (W, D), energy = -log of likelihood x prior up to a constant."""
+    """A point of the search: theta (N,), starts (W, D), energy = -log of likelihood x prior up to a constant.
+
+    residual (W, L, C): that of the simulation there, if it was done. expected, gained: nats by which the step that led
+    here was to lower the energy and did; both zero where no step was taken."""
 
     theta: FloatArray
     starts: FloatArray
     energy: float
     damping: float = 1e-4
     converged: bool = False
+    residual: FloatArray | None = None
+    expected: float = 0.0
+    gained: float = 0.0
 
 
 def energy_of(
@@ -62,19 +68,20 @@ def energy_of(
     return fit + prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
 
 
-def energy(
-    windows: Windows, noise: Noise, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray
-) -> float:
-    """``energy_of`` a simulation at (theta, starts); infinite where that is not valid."""
-    residual, valid = windows.residuals(theta[None], starts[None])
-    return energy_of(windows, noise, prior, theta, starts, residual[0]) if valid[0] else np.inf
-
-
 def step(
-    windows: Windows, noise: Noise, prior: QuadraticPrior, fit: Fit, moments: Moments, tolerance: float
+    windows: Windows,
+    noise: Noise,
+    prior: QuadraticPrior,
+    fit: Fit,
+    moments: Moments,
+    tolerance: float,
+    stale: bool = False,
 ) -> Fit:
     """The first of ever shorter damped steps from ``fit`` that lowers the energy, for the linearisation behind
-    ``moments``; converged where it would lower it by less than ``tolerance`` nats."""
+    ``moments``; converged where it would lower it by less than ``tolerance`` nats.
+
+    stale: the linearisation is of an earlier point; a refused step is then left to a fresh one, with infinite
+    ``expected``."""
     normal = moments.normal(noise)
     pull = -windows.start_precision * fit.starts
     damping = fit.damping
@@ -87,10 +94,14 @@ def step(
         if expected < tolerance:
             return replace(fit, converged=True)
         theta, starts = np.clip(fit.theta + move, 0.0, 1.0), fit.starts + arrow.starts(move)
-        value = energy(windows, noise, prior, theta, starts)
-        if value < fit.energy:
+        residual, valid = windows.residuals(theta[None], starts[None])
+        value = energy_of(windows, noise, prior, theta, starts, residual[0]) if valid[0] else np.inf
+        gained = fit.energy - value
+        if gained > 0:
             damping = max(_DAMPING_MIN, damping * _DAMPING_DOWN)
-            return Fit(theta, starts, value, damping, fit.energy - value < tolerance)
+            return Fit(theta, starts, value, damping, gained < tolerance, residual[0], expected, gained)
+        if stale:
+            return replace(fit, expected=np.inf)
         damping *= _DAMPING_UP
     return replace(fit, damping=fit.damping, converged=True)
 

@@ -79,9 +79,7 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
     from sipe_bayes.parameters import Parameter
 
     parameters = [Parameter(f"damping_{j}", 0.01, 1.0, targets=(f"joint:{j}.damping",)) for j in joints]
-    simulator = Simulator(
-        MjcfEnvironment.build(xml, parameters, list(joints), [f"joint:{j}.position" for j in joints])
-    )
+    simulator = Simulator(MjcfEnvironment.build(xml, parameters, list(joints), [f"joint:{j}.position" for j in joints]))
     rng = np.random.default_rng(0)
     theta = rng.random((LANES, len(joints)))
     actions = rng.standard_normal((LANES, STEPS, len(joints)))
@@ -97,9 +95,7 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
     controls = np.repeat(actions, substeps, axis=1)
 
     def bare() -> Any:
-        return mujoco.rollout.rollout(
-            models, datas, initial_state=start, control=controls, persistent_pool=True
-        )[0]
+        return mujoco.rollout.rollout(models, datas, initial_state=start, control=controls, persistent_pool=True)[0]
 
     def ours() -> Any:
         return simulator.rollout(theta, actions, start, dt)
@@ -109,8 +105,12 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
 
 
 def rival(pairs: int) -> None:
-    print("\nlaplace against mujoco.sysid: the arm of sysid's own test, five armatures from 0.01 kg m^2, bounds 0.001 and 1,")
-    print("2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: its default")
+    print(
+        "\nlaplace against mujoco.sysid: the arm of sysid's own test, five armatures from 0.01 kg m^2, bounds 0.001 and 1,"
+    )
+    print(
+        "2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: its default"
+    )
     print("optimiser ('mujoco'), start state given, white noise. laplace: start states estimated.")
     import contextlib
     import io
@@ -220,7 +220,9 @@ def main() -> None:
     given = parser.parse_args()
     versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in ("mujoco", "numpy", "scipy", "torch"))
     load = os.getloadavg()[0]
-    print(f"{os.cpu_count()} cores ({platform.machine()}), load {load:.1f}, Python {platform.python_version()}, {versions}")
+    print(
+        f"{os.cpu_count()} cores ({platform.machine()}), load {load:.1f}, Python {platform.python_version()}, {versions}"
+    )
     for name in given.tables or tables:
         if name == "rival" and not hasattr(__import__("mujoco.sysid").sysid, "optimize"):
             print("\nmujoco.sysid is not installed (pip install 'mujoco[sysid]'): no comparison")
