@@ -1,5 +1,5 @@
 # `make demo` and `make test` set up .venv when it is missing or out of date. PYTHON: 3.11 or later.
-# PIP_ARGS: for pip, e.g. PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu" for torch without CUDA.
+# PIP_ARGS: more options for pip, such as an index that offers torch without CUDA.
 
 PYTHON ?= python3
 PIP_ARGS ?=

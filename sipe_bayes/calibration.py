@@ -19,7 +19,7 @@ from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary, Ridge
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
-from sipe_bayes.inference import estimator_class, get_estimator
+from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
@@ -160,6 +160,27 @@ def _prior(config: Config, space: ParameterSpace) -> Posterior:
     return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
 
 
+def _method(
+    problem: Problem,
+    estimator: str | None,
+    seed: int | None,
+    budget: int | None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Estimator:
+    config = problem.config
+    return get_estimator(
+        problem.simulator,
+        estimator or config.estimator,
+        prior=problem.prior,
+        likelihood=problem.likelihood,
+        seed=config.seed if seed is None else seed,
+        budget=config.budget if budget is None else budget,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+
+
 def calibrate(
     problem: Problem,
     estimator: str | None = None,
@@ -169,18 +190,8 @@ def calibrate(
     progress: Progress | None = None,
 ) -> Calibration:
     """Fit, check and summarise. Estimator, seed and budget override the configuration's."""
-    config, began = problem.config, time.monotonic()
-    name = estimator or config.estimator
-    method = get_estimator(
-        problem.simulator,
-        name,
-        prior=problem.prior,
-        likelihood=problem.likelihood,
-        seed=config.seed if seed is None else seed,
-        budget=config.budget if budget is None else budget,
-        checkpoint=checkpoint,
-        progress=progress,
-    )
+    began = time.monotonic()
+    method = _method(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
     tell = progress or (lambda *_: None)
     tell("checking", method.rollouts, method.budget)
@@ -197,8 +208,8 @@ def calibrate(
         bound["holdout"] = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.holdout)
     scores = {use: channel_scores(w, theta) for use, w in bound.items()}
     return Calibration(
-        name=_run_name(config),
-        estimator=name,
+        name=_run_name(problem.config),
+        estimator=method.name,
         posterior=posterior,
         prior=problem.prior,
         parameters=summaries,
@@ -328,7 +339,8 @@ def run(
     Every input is checked before the folder is touched. The same call after an interruption resumes."""
     problem = prepare(config, num_threads)
     name = estimator or problem.config.estimator
-    estimator_class(name)
+    _method(problem, name, seed, budget)
+    problem.likelihood.bind(problem.simulator, problem.train)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
     folder = Path("runs") / f"{_run_name(problem.config)}-{name}" if out is None else out

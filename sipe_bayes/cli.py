@@ -119,10 +119,11 @@ def print_calibration(found: Calibration) -> None:
     for heading in ("parameter", "estimate", "90 % interval", "unit", "contraction", "verdict"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "verdict") else "right")
     for p in found.parameters:
-        low, high = significant(p.q05, p.sd), significant(p.q95, p.sd)
+        scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
+        low, high = significant(p.q05, p.sd, scale), significant(p.q95, p.sd, scale)
         table.add_row(
             Text(p.name),  # brackets of a name are not markup
-            f"{significant(p.mode, p.sd)} ± {significant(p.sd, p.sd)}",
+            f"{significant(p.mode, p.sd, scale)} ± {significant(p.sd, p.sd, scale)}",
             f"{low} .. {high}",
             p.unit,
             f"{p.contraction:.2f}",

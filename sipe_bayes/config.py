@@ -29,6 +29,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.units import find_unit
 
 Use = Literal["train", "holdout"]
@@ -71,6 +72,12 @@ def _time_word(word: str) -> str:
         return find_unit(word, "time").word
     except ValueError as error:
         raise _problem(str(error)) from None
+
+
+def _estimator(name: str) -> str:
+    if name not in ESTIMATORS:
+        raise _problem(f"expected one of {', '.join(ESTIMATORS)}, got {name!r}; {nearest(name, ESTIMATORS)}")
+    return name
 
 
 def _sign(value: Any) -> Any:
@@ -334,7 +341,7 @@ class Config(Table):
     """A whole configuration; ``load_config`` reads one. ``window`` in seconds, or "log" for whole logs."""
 
     model: Location
-    estimator: Literal["laplace", "mcmc"] = "laplace"
+    estimator: Annotated[str, Strict(), AfterValidator(_estimator)] = "laplace"
     window: Annotated[float | Literal["log"], BeforeValidator(_window)]
     seed: Annotated[int, Strict(), Field(ge=0)] = 0
     budget: Annotated[int, Strict(), Field(gt=0)] | None = None

@@ -16,6 +16,7 @@ Biometrika 58): -2 l_R = log|V| + log|A| + r' V^-1 r - b' A^-1 b, A = J' V^-1 J 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -118,34 +119,40 @@ class Moments:
         rows = np.empty((channels, windows * length, columns + 1))
         rows[:, :, :-1] = np.moveaxis(jacobian, 2, 0).reshape(channels, windows * length, columns)
         rows[:, :, -1] = np.moveaxis(residual, 2, 0).reshape(channels, windows * length)
-        width = columns + self.num_start + 1
-        products = np.zeros((len(self.gaps), 3, windows, width, width))
-        first = 0
-        for c, s in enumerate(all_sequences):
-            self._add_products(products[first : first + len(s.gaps)], rows[c], s)
-            first += len(s.gaps)
-        self.products = products.reshape(3 * len(self.gaps), -1)
+        squares = np.concatenate([self._squares(rows[c], s) for c, s in enumerate(all_sequences)])
+        self.products = self._spread(squares).reshape(3 * len(self.gaps), -1)
 
-    def _add_products(self, out: FloatArray, rows: FloatArray, s: Sequence) -> None:
-        """Add the sums of one channel to ``out`` (its gaps, 3, W, K, K); rows (W L, N + D + 1)."""
-        n, d, size = self.num_theta, self.num_start, rows.shape[1]
-        own = np.r_[0 : n + d, n + 2 * d]
-        before = np.r_[0:n, n + d : n + 2 * d, n + 2 * d]
-        both = np.concatenate([rows[s.index], np.where((s.previous >= 0)[:, None], rows[s.previous], 0.0)], axis=1)
-        # runs of samples of the same window, gap and side of a window's edge
+    def _squares(self, rows: FloatArray, s: Sequence) -> FloatArray:
+        """Sums of z z', z = (a row, the row before it), of the samples of each of a channel's gaps, each window and each
+        side of a window's edge: (its gaps, 2, W, 2 q, 2 q); rows (W L, q), q = N + D + 1."""
+        before = np.where((s.previous >= 0)[:, None], rows[s.previous], 0.0)
+        both = np.concatenate([rows[s.index], before], axis=1)
+        out = np.zeros((len(s.gaps), 2, self.windows, both.shape[1], both.shape[1]))
         key = (s.window * len(s.gaps) + s.gap) * 2 + s.crosses
         order = np.argsort(key, kind="stable")
-        edges = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1))
-        for begin, end in zip(edges[:-1], edges[1:], strict=True):
-            part = order[begin:end]
-            w, g, crosses = s.window[part[0]], s.gap[part[0]], s.crosses[part[0]]
-            chosen = both[part[0] : part[-1] + 1] if part[-1] - part[0] == len(part) - 1 else both[part]
-            square, lag = chosen.T @ chosen, before if crosses else own
-            block = out[g, :, w]
-            block[0][np.ix_(own, own)] += square[:size, :size]
-            block[1][np.ix_(own, lag)] += square[:size, size:]
-            block[1][np.ix_(lag, own)] += square[size:, :size]
-            block[2][np.ix_(lag, lag)] += square[size:, size:]
+        edges = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1)).tolist()
+        sorted_rows = both[order]
+        for begin, end in itertools.pairwise(edges):
+            window, first, part = s.window[order[begin]], order[begin], sorted_rows[begin:end]
+            out[s.gap[first], int(s.crosses[first]), window] = part.T @ part
+        return out
+
+    def _spread(self, squares: FloatArray) -> FloatArray:
+        """Products (G, 3, W, K, K) of ``squares`` (G, 2, W, 2 q, 2 q): the row before belongs to the window's own start or,
+        across an edge, to the start of the window before."""
+        n, d = self.num_theta, self.num_start
+        size, width = n + d + 1, n + 2 * d + 1
+        own = np.append(np.arange(n + d), width - 1)
+        before = np.concatenate([np.arange(n), np.arange(n + d, width)])
+        out = np.zeros((len(squares), 3, self.windows, width, width))
+        for across, lag in enumerate((own, before)):
+            part = squares[:, across]
+            out[:, 0, :, own[:, None], own] += np.moveaxis(part[..., :size, :size], (2, 3), (0, 1))
+            cross = np.moveaxis(part[..., :size, size:], (2, 3), (0, 1))
+            out[:, 1, :, own[:, None], lag] += cross
+            out[:, 1, :, lag[:, None], own] += np.swapaxes(cross, 0, 1)
+            out[:, 2, :, lag[:, None], lag] += np.moveaxis(part[..., size:, size:], (2, 3), (0, 1))
+        return out
 
     def normal(self, noise: Noise) -> FloatArray:
         """Whitened products (W, K, K), K = N + 2 D + 1, summed over channels."""
@@ -252,11 +259,12 @@ def _start_covariance(factor: FloatArray, windows: int) -> tuple[FloatArray, Flo
 
     factor (2 D, W D): its banded Cholesky factor. Takahashi's recursion: the inverse is never formed as a whole."""
     d = len(factor) // 2
-    column = np.arange(windows * d).reshape(windows, d)
+    band = factor.reshape(2 * d, windows, d)
     lower, below = np.zeros((windows, d, d)), np.zeros((windows, d, d))
-    for i in range(d):
-        lower[:, i, : i + 1] = np.stack([factor[i - j, column[:, j]] for j in range(i + 1)], axis=1)
-        below[:, i] = np.stack([factor[d + i - j, column[:, j]] for j in range(d)], axis=1)
+    i, j = np.tril_indices(d)
+    lower[:, i, j] = band[i - j, :, j].T
+    i, j = np.indices((d, d)).reshape(2, -1)
+    below[:, i, j] = band[d + i - j, :, j].T
     inverse = np.linalg.inv(lower)
     gain = below @ inverse  # L_{w+1,w} L_w^-1
     gain[-1] = 0.0

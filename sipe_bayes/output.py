@@ -101,10 +101,13 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
 def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
     """Fill the folder of a finished run; its ``run.json`` comes last and says so."""
     from sipe_bayes.diagnostics.report import write_report
-    from sipe_bayes.envs.export import write_identified
+    from sipe_bayes.envs.export import ExportError, write_identified
 
     values = problem.environment.space.values(calibration.posterior.mode.numpy())
-    calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
+    try:
+        calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
+    except ExportError as error:
+        calibration.warnings.append(str(error))
     calibration.posterior.save(folder / "posterior")
     temporary = folder / f".posterior.{os.getpid()}.nc"
     calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")

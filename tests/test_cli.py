@@ -231,11 +231,11 @@ WRONG: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
         [],
         ["measurements[0].unit", "'m' (length)", "use one of 'rad'"],
     ),
-    "not MJCF": (text("</mujoco>", "", "pendulum.xml"), [], ["model", "pendulum.xml", "not valid MJCF", "Line"]),
+    "not MJCF": (text("</mujoco>", "", "pendulum.xml"), [], ["model", "pendulum.xml", "not valid MJCF", "Line", "correct it"]),
     "does not compile": (
         text('joint="hinge"', 'joint="knee"', "pendulum.xml"),
         [],
-        ["model", "pendulum.xml", "knee", "line 9"],
+        ["model", "pendulum.xml", "knee", "line 9", "correct it"],
     ),
     "not TOML": (
         text('model = "pendulum.xml"', "model = "),

@@ -26,7 +26,7 @@ HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
 NOISE_SD = 0.01  # rad
 WINDOW = 0.5  # s
-BUDGET = {"laplace": 5000, "mcmc": 700}  # rollouts; 700 give the chain about 100 effective draws
+BUDGET = {"laplace": 5000, "mcmc": 900}  # rollouts; 900 give the chain about 100 effective draws
 
 
 def simulated_log(problem: Problem, theta: np.ndarray, rho: float, rng: np.random.Generator) -> sipe.Trajectory:

@@ -67,7 +67,7 @@ def load_spec(source: str) -> Any:
         return mujoco.MjSpec.from_string(source) if text else mujoco.MjSpec.from_file(source)
     except ValueError as error:
         where = "the MJCF text" if text else source
-        raise ModelError(f"model: {where} is not valid MJCF: {' '.join(str(error).split())}") from None
+        raise ModelError(f"model: {where} is not valid MJCF: {' '.join(str(error).split())}; correct it") from None
 
 
 def compile_spec(spec: Any, source: str) -> Any:
@@ -76,7 +76,7 @@ def compile_spec(spec: Any, source: str) -> Any:
         return spec.compile()
     except ValueError as error:
         where = "the MJCF text" if source.lstrip().startswith("<") else source
-        raise ModelError(f"model: {where} does not compile: {' '.join(str(error).split())}") from None
+        raise ModelError(f"model: {where} does not compile: {' '.join(str(error).split())}; correct it") from None
 
 
 @dataclass(frozen=True, eq=False)

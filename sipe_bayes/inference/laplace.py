@@ -16,8 +16,8 @@ not the same become components of a mixture, weighted by their restricted likeli
 Simulations are what a fit costs, so they are spared where they add nothing. Where the log tells the windows' starts, theta
 moves alone first, until a step gains little. The Jacobian of the starts is kept as long as it foretells the gain of a step
 to a fifth, all of the Jacobian as long as it foretells it to a twentieth of a nat; an optimum is only accepted where what
-was foretold since the starts' Jacobian was taken is wrong by less than half a nat. A later starting point is dropped when a
-step goes all but the whole way to an optimum that is already known.
+was foretold since the starts' Jacobian was taken is wrong by less than half a nat. A later starting point is dropped once
+the search has all but come to an optimum that is already known.
 
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
@@ -61,7 +61,7 @@ _DROP = 10.0  # nats below the best optimum
 _MAX_ITERATIONS = 80
 _LITTLE = 0.1  # of the energy: a gain from which the starts move along
 _FAIR, _EXACT, _DRIFT = 0.2, 0.05, 0.5  # how well a Jacobian foretells gains: relative, nats, nats in all
-_MOST_OF_THE_WAY = 0.95  # to a known optimum
+_NEAR = 0.05  # of the way to a known optimum
 
 
 class Laplace(Estimator):
@@ -172,7 +172,7 @@ class Laplace(Estimator):
         }
         if settled or iteration >= _MAX_ITERATIONS:
             return self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
-        return self._next(state, windows) if _known(state, theta) else state
+        return self._next(state, windows) if _known(state) else state
 
     def _linearise(self, state: State, windows: Windows) -> tuple[Linearisation, bool, float]:
         """Linearisation at the state's point, whether part of it is of an earlier one, and the drift of that part."""
@@ -422,12 +422,15 @@ def distinct_modes(state: State) -> list[int]:
     return kept
 
 
-def _known(state: State, before: FloatArray) -> bool:
-    """Whether the step from theta ``before`` went all but the whole way to one of the optima found earlier."""
+def _known(state: State) -> bool:
+    """Whether the search has come to one of the optima found earlier: in each principal direction of its normal within
+    one sd, or within a twentieth of the way that it had to come."""
+    begin = state["points"][state["point"]]
     for mean, covariance in zip(state["mode_mean"], state["mode_covariance"], strict=True):
-        gaps = np.stack([before - mean, state["theta"] - mean])
-        old, new = (gaps * np.linalg.solve(covariance, gaps.T).T).sum(1)
-        if new < (1 - _MOST_OF_THE_WAY) ** 2 * old:
+        eigenvalues, axes = np.linalg.eigh(covariance)
+        sd = np.sqrt(eigenvalues)
+        left, whole = np.abs((state["theta"] - mean) @ axes) / sd, np.abs((begin - mean) @ axes) / sd
+        if (left < np.maximum(1.0, _NEAR * whole)).all():
             return True
     return False
 
