@@ -302,9 +302,11 @@ class Windows:
         residual = np.where(self.observed, self.measured - predicted[0], 0.0)
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
 
-    def moments(self, lin: Linearisation) -> Moments:
-        """Products of the linearised rows, from which every noise model's normal equations follow."""
-        return Moments(lin.residual, lin.jacobian, lin.jacobian.shape[-1] - self.num_start, self.sequences)
+    def moments(self, lin: Linearisation, white: bool = False) -> Moments:
+        """Products of the linearised rows, from which every noise model's normal equations follow; ``white``: for white
+        noise alone."""
+        n = lin.jacobian.shape[-1] - self.num_start
+        return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
 
     def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Whitened sum of squares (B,) of residuals (B, W, L, C)."""

@@ -104,15 +104,29 @@ class Moments:
 
     residual (W, L, C); jacobian (W, L, C, N + D): derivatives of the prediction by theta and the window's start.
     With x a row and y the row before it, each of the G pairs of channel and gap has the sums x x', x y' + y x' and
-    y y' over its samples: ``products`` (3 G, W K K). gaps, owner (its channel) and counts are (G,).
+    y y' over its samples: ``products`` (3 G, W K K). gaps, owner (its channel) and counts are (G,). white: for white noise
+    alone, quickly: one endless gap a channel.
     """
 
     def __init__(
-        self, residual: FloatArray, jacobian: FloatArray, num_theta: int, all_sequences: list[Sequence]
+        self,
+        residual: FloatArray,
+        jacobian: FloatArray,
+        num_theta: int,
+        all_sequences: list[Sequence],
+        white: bool = False,
     ) -> None:
         windows, length, channels, columns = jacobian.shape
         self.num_theta, self.num_start, self.windows = num_theta, columns - num_theta, windows
         self.sequences = all_sequences
+        if white:
+            rows = np.concatenate([jacobian, residual[..., None]], axis=-1).transpose(2, 0, 1, 3)
+            self.gaps, self.owner = np.full(channels, np.inf), np.arange(channels)
+            self.counts = np.array([len(s.index) for s in all_sequences])
+            squares = np.zeros((channels, 2, windows, 2 * columns + 2, 2 * columns + 2))
+            squares[:, 0, :, : columns + 1, : columns + 1] = np.swapaxes(rows, 2, 3) @ rows
+            self.products = self._spread(squares).reshape(3 * channels, -1)
+            return
         self.gaps = np.concatenate([s.gaps for s in all_sequences])
         self.owner = np.repeat(np.arange(channels), [len(s.gaps) for s in all_sequences])
         self.counts = np.concatenate([np.bincount(s.gap, minlength=len(s.gaps)) for s in all_sequences])

@@ -15,9 +15,11 @@ not the same become components of a mixture, weighted by their restricted likeli
 
 Simulations are what a fit costs, so they are spared where they add nothing. Where the log tells the windows' starts, theta
 moves alone first, until a step gains little. The Jacobian of the starts is kept as long as it foretells the gain of a step
-to a fifth, all of the Jacobian as long as it foretells it to a twentieth of a nat; an optimum is only accepted where what
-was foretold since the starts' Jacobian was taken is wrong by less than half a nat. A later starting point is dropped once
+to a fifth; an optimum is only accepted where what was foretold since it was taken is wrong by less than half a nat. A later starting point is dropped once
 the search has all but come to an optimum that is already known.
+
+Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ from
+place to place, and the place would otherwise be an accident of the start.
 
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
@@ -59,9 +61,11 @@ _ROUGH = 1e-4  # of the energy
 _SAME_NOISE = 0.03  # relative
 _DROP = 10.0  # nats below the best optimum
 _MAX_ITERATIONS = 80
-_LITTLE = 0.1  # of the energy: a gain from which the starts move along
-_FAIR, _EXACT, _DRIFT = 0.2, 0.05, 0.5  # how well a Jacobian foretells gains: relative, nats, nats in all
+_HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move along, as foretold or not
+_FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _NEAR = 0.05  # of the way to a known optimum
+_OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
+_AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
 
 class Laplace(Estimator):
@@ -138,19 +142,21 @@ class Laplace(Estimator):
         windows, prior = self.windows(trajectories), self.quadratic_prior
         theta, starts, rough, held = state["theta"], state["starts"], state["rough"], state["held"]
         linearisation, stale, drift = self._linearise(state, windows)
-        moments = windows.moments(linearisation)
+        moments = windows.moments(linearisation, white=rough)
         noise = before = Noise(state["sd"], state["tau"])
         if rough:
             noise = _present_noise(windows, linearisation.residual)
         elif state["due"]:
             noise = _noise(windows, moments, before, theta, starts, prior, self.likelihood.noise == "ar1")
         value = energy_of(windows, noise, prior, theta, starts, linearisation.residual)
-        tolerance = max(_LITTLE if held else 0.0, _ROUGH) * value if rough else 0.0
+        tolerance = _ROUGH * value if rough else 0.0
         here = Fit(theta, starts, value, state["damping"], residual=linearisation.residual)
         fit = step(windows, noise, prior, here, moments, max(tolerance, _TOLERANCE), stale)
         surprise = abs(fit.gained - fit.expected)
         drift = drift + surprise
-        converged = fit.converged and (held or drift < _DRIFT)
+        converged = fit.converged and drift < _DRIFT and not held
+        foretold = surprise < _FAIR * max(fit.expected, _TOLERANCE)
+        held = held and not fit.converged and fit.gained > (_HALF if foretold else _LITTLE) * value
         iteration = state["iteration"] + 1
         settled = converged and not rough and state["due"] and _same(noise, before)
         state = {
@@ -161,16 +167,17 @@ class Laplace(Estimator):
             "sd": noise.sd,
             "tau": noise.tau,
             "iteration": iteration,
-            "held": held and not converged,
-            "rough": rough and (held or not converged) and iteration < _MAX_ITERATIONS // 2,
-            "due": converged and not held,
+            "held": held,
+            "rough": rough and not converged and iteration < _MAX_ITERATIONS // 2,
+            "due": converged,
             "residual": fit.residual,
-            "jacobian": np.empty(0) if held and converged else linearisation.jacobian,
+            "jacobian": np.empty(0) if state["held"] else linearisation.jacobian,
             "drift": np.inf if fit.converged and not converged else drift,
-            "keep_starts": surprise < _FAIR * max(fit.expected, _TOLERANCE),
-            "keep_all": surprise < _EXACT,
+            "keep_starts": foretold,
+            "moved": fit.gained > 0,
         }
         if settled or iteration >= _MAX_ITERATIONS:
+            moments = windows.moments(linearisation) if rough else moments
             return self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
         return self._next(state, windows) if _known(state) else state
 
@@ -184,8 +191,8 @@ class Laplace(Estimator):
             return replace(found, jacobian=np.concatenate([found.jacobian, still], axis=-1)), False, 0.0
         if not jacobian.size or not np.isfinite(state["drift"]) or not state["keep_starts"]:
             return windows.linearise(theta, starts, residual=residual), False, 0.0
-        if state["keep_all"]:
-            return Linearisation(state["residual"], jacobian, True), True, state["drift"]
+        if not state["moved"]:
+            return Linearisation(state["residual"], jacobian, True), state["drift"] > 0, state["drift"]
         found = windows.linearise(theta, starts, with_starts=False, residual=residual)
         both = np.concatenate([found.jacobian, jacobian[..., n:]], axis=-1)
         return replace(found, jacobian=both), True, state["drift"]
@@ -242,8 +249,34 @@ class Laplace(Estimator):
             "tau": noise.tau,
             "evidence": np.array(evidence),
         }
+        middle = None if state["centred"] else self._middle(windows, theta, starts, noise, mean, covariance)
+        if middle is not None:
+            return {**state, "theta": middle, "centred": True, "moved": True, **_AFRESH}
         modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in found.items()}
         return self._next({**state, **modes}, windows)
+
+    def _middle(
+        self,
+        windows: Windows,
+        theta: FloatArray,
+        starts: FloatArray,
+        noise: Noise,
+        mean: FloatArray,
+        covariance: FloatArray,
+    ) -> FloatArray | None:
+        """Where the search goes on: the middle of a ridge, so that the width across it is that of its middle wherever the
+        search began; None where no direction is open or the middle does not fit as well."""
+        eigenvalues, axes = np.linalg.eigh(covariance)
+        open_axes = axes[:, eigenvalues > _OPEN**2]
+        move = open_axes @ (open_axes.T @ (mean - theta))
+        if not len(move) or np.abs(move).max() < _OFF_CENTRE:
+            return None
+        prior = self.quadratic_prior
+        trials = np.clip(theta + np.array([0.0, 1.0, 0.5, 0.25])[:, None] * move, 0, 1)
+        residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
+        values = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(trials, residual, strict=True)]
+        good = [k for k in range(1, len(trials)) if valid[k] and values[k] < values[0] + _AS_GOOD]
+        return trials[good[0]] if good else None
 
     def posterior(self, state: State, trajectories: Trajectories) -> GaussianMixture:
         if not len(state["mode_theta"]):
@@ -344,7 +377,8 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "jacobian": np.empty(0),
         "drift": 0.0,
         "keep_starts": False,
-        "keep_all": False,
+        "moved": True,
+        "centred": False,
     }
 
 

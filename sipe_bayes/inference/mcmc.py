@@ -44,6 +44,7 @@ _WARM_UP = 1 / 3  # of the chain is dropped
 _MIXED_RHAT = 1.05
 _WIDER = 1.2  # of the sds of the independent proposal against laplace's
 _DRAWS = 4000  # at most kept
+_PLACINGS = 20  # rounds in which walkers look for a valid place
 _CHECKED = 16  # draws on which the linearisation is checked
 
 
@@ -103,15 +104,33 @@ class MCMC(Estimator):
         }
         dimensions = len(self.space) + len(spread)
         count = self.walkers or max(24, 2 * dimensions + 2)
-        walkers = _Proposal(self, windows, state).draw(count, random)
+        walkers, log_prob = self._place(windows, state, count, random)
         return {
             **state,
             "walkers": walkers,
-            "log_prob": np.full(count, -np.inf),
+            "log_prob": log_prob,
             "chain": np.empty((0, *walkers.shape)),
             "chain_log_prob": np.empty((0, count)),
             **_random_state(random),
         }
+
+    def _place(
+        self, windows: Windows, state: State, count: int, random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Walkers (count, N + noise) drawn from the proposal, each where the target is finite, and its values there."""
+        proposal, target = _Proposal(self, windows, state), _Target(self, windows, state)
+        walkers = proposal.draw(count, random)
+        log_prob = target(walkers)
+        for _ in range(_PLACINGS):
+            lost = np.flatnonzero(~np.isfinite(log_prob))
+            if not len(lost):
+                return walkers, log_prob
+            walkers[lost] = proposal.draw(len(lost), random)
+            log_prob[lost] = target(walkers[lost])
+        raise ValueError(
+            f"mcmc: {len(lost)} of {count} walkers found no valid place around the laplace fit; "
+            "the simulation diverges there: narrow the bounds or shorten the model's timestep"
+        )
 
     def _noise_bounds(self, windows: Windows, picked: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
         shortest = float(windows.dt.min())
@@ -144,10 +163,8 @@ class MCMC(Estimator):
                 (emcee.moves.DESnookerMove(), 0.1),
             ],
         )
-        log_prob = state["log_prob"] if len(state["chain"]) else None
-        begin = emcee.State(state["walkers"], log_prob=log_prob, random_state=_restore_random(state))
-        with np.errstate(invalid="ignore"):  # a walker that begins outside waits for its first valid proposal
-            end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
+        begin = emcee.State(state["walkers"], log_prob=state["log_prob"], random_state=_restore_random(state))
+        end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
         random = np.random.RandomState()
         random.set_state(end.random_state)
         state = {
