@@ -16,14 +16,14 @@ from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, l
 from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
 from sipe_bayes.diagnostics.evaluate import channel_scores, fitted_residuals, signals
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
-from sipe_bayes.diagnostics.result import Calibration, ParameterSummary, Ridge
+from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary, Ridge
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
-from sipe_bayes.output import CHECKPOINT, claim, describe_run, write_all
+from sipe_bayes.output import CHECKPOINT, claim, describe_run, release, write_all
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
@@ -286,9 +286,13 @@ def _warnings(
     dead: dict[str, list[tuple[float, float]]],
     found: Sequence[Ridge],
     conflict: Disagreement | None,
-    holdout: Sequence[Any],
+    holdout: Sequence[ChannelScore],
 ) -> list[str]:
-    words = list(method.warnings)
+    words = list(method.warnings) + [
+        f"{p.name}: its targets have different values in the model, so 'the model as given' stands for all at {p.default:.4g} {p.unit}"
+        for p in problem.environment.space
+        if problem.environment.uneven(p)
+    ]
     if conflict is not None:
         unit = problem.environment.space[problem.environment.space.index(conflict.parameter)].unit
         words.append(conflict.text(unit))
@@ -306,13 +310,21 @@ def _warnings(
         if "at_bound" in p.flags:
             bound = space.low if p.mode - space.low < space.high - p.mode else space.high
             words.append(f"{p.name} is at its bound {bound:.4g} {p.unit}: widen it, unless the bound is physical")
-    worse = [s for s in holdout if not s.rmse < s.rmse_default]
-    words += [
-        f"held-out {s.log}, {s.channel}: {s.rmse:.3g} {s.unit} is not better than the model as given ({s.rmse_default:.3g})"
-        for s in worse
-    ]
-    words += [f"log {r.name}: {note}" for r in problem.reports for note in r.notes if r.gaps or r.resampled]
+    words += [text for s in holdout if (text := _heldout_warning(s))]
+    for r in problem.reports:
+        if r.gaps or r.resampled or any(r.missing.values()) or any(r.clipped.values()):
+            words += [f"log {r.name}: {note}" for note in r.notes]
     return words
+
+
+def _heldout_warning(s: ChannelScore) -> str:
+    """Empty where the calibrated model predicts better than the model as given."""
+    where = f"held-out {s.log}, {s.channel}"
+    if not np.isfinite(s.rmse):
+        return f"{where}: the calibrated model diverges there"
+    if not np.isfinite(s.rmse_default) or s.rmse < s.rmse_default:
+        return ""
+    return f"{where}: {s.rmse:.3g} {s.unit} is not better than the model as given ({s.rmse_default:.3g})"
 
 
 def _noise(windows: Windows, method: Estimator) -> dict[str, dict[str, Any]]:
@@ -341,12 +353,18 @@ def run(
     name = estimator or problem.config.estimator
     _method(problem, name, seed, budget)
     problem.likelihood.bind(problem.simulator, problem.train)
+    if problem.holdout is not None:
+        Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.holdout)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
     folder = Path("runs") / f"{_run_name(problem.config)}-{name}" if out is None else out
     record = describe_run(problem, name, chosen_seed, chosen_budget)
     claim(folder, record)
-    found = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
+    try:
+        found = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
+    except ValueError:
+        release(folder)
+        raise
     found.run, found.out = record, str(folder)
     if progress is not None:
         progress("writing the report", found.rollouts, found.rollouts)

@@ -254,7 +254,7 @@ def _check_ordered(pair: tuple[float, float], key: str, expected: str) -> None:
 
 
 class NormalPrior(Table):
-    """A normal prior in the parameter's unit, truncated to its bounds."""
+    """A normal prior truncated to the bounds, in the terms that they are given in: SI, or factors of the model's value."""
 
     mean: Number
     sd: Positive
@@ -314,8 +314,9 @@ class ParameterEntry(Table):
             )
 
     def _check_prior(self, prior: NormalPrior) -> None:
-        if self.bounds is not None and not self.bounds[0] <= prior.mean <= self.bounds[1]:
-            low, high = self.bounds
+        pair = self.factor if self.bounds is None else self.bounds
+        if pair is not None and not pair[0] <= prior.mean <= pair[1]:
+            low, high = pair
             raise _problem(
                 f"expected a mean within the bounds [{low:g}, {high:g}], got {prior.mean:g}; widen them",
                 "prior",

@@ -12,6 +12,7 @@ A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
@@ -93,17 +94,17 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
             )
             if position in measured and velocity not in measured:
                 states[:, velocity] = _smooth(measured[position], trajectory.dt, 1)
-    for column, series in measured.items():
-        states[:, column] = _smooth(series, trajectory.dt)
+    if measured:
+        states[:, list(measured)] = _smooth(np.stack(list(measured.values()), axis=1), trajectory.dt)
     return states
 
 
 def _smooth(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
-    """Local quadratics over ``_SMOOTHING`` seconds, at least 5 samples."""
+    """Local quadratics over ``_SMOOTHING`` seconds, at least 5 samples, along the first axis."""
     span = min(max(5, 2 * round(_SMOOTHING / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
     if span < 3:
-        return np.gradient(series, dt) if derivative else series
-    return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt)
+        return np.gradient(series, dt, axis=0) if derivative else series
+    return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ class Windows:
     def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
         self.rollouts, self.budget = 0, math.inf
+        self._glimpse: Windows | None = None
         environment = simulator.environment
         if trajectories.observations.shape[2] != len(environment.channels):
             raise ValueError(
@@ -197,6 +199,26 @@ class Windows:
             past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
         return past
 
+    def glimpse(self) -> Windows:
+        """Every other window, for a rough search; the windows themselves where a log has fewer than four. Its rollouts are
+        counted by themselves, as if whole."""
+        if np.bincount(self.log).min() < 4:
+            return self
+        if self._glimpse is None:
+            self._glimpse = self._every_other()
+        self._glimpse.rollouts, self._glimpse.budget = self.rollouts, self.budget
+        return self._glimpse
+
+    def _every_other(self) -> Windows:
+        within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
+        view, keep = copy.copy(self), np.flatnonzero(within % 2 == 0)
+        for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):
+            setattr(view, name, getattr(self, name)[keep])
+        view.names = [self.names[w] for w in keep]
+        sample = view.start[:, None] + np.arange(view.observed.shape[1])
+        view.sequences = sequences(view.observed, sample, view.log, view.dt)
+        return view
+
     @property
     def num_windows(self) -> int:
         return len(self.log)
@@ -227,7 +249,9 @@ class Windows:
         return out
 
     def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid."""
+        """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid throughout.
+
+        A prediction is NaN from the sample on at which its window diverged."""
         batch = len(theta)
         cost = batch * len(self.trajectories)
         if self.rollouts + cost > self.budget:
@@ -238,9 +262,10 @@ class Windows:
         actions = np.tile(self.actions, (batch, 1, 1))
         result = self.simulator.rollout(lanes, actions, states, np.tile(self.dt, batch), self.names * batch)
         shape = (batch, self.num_windows)
-        reached = result.valid.reshape(*shape, -1) | ~self.owned
+        good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
-        return predicted, reached.all(axis=(1, 2))
+        predicted = np.where(good[..., None], predicted, np.nan)
+        return predicted, (good | ~self.owned).all(axis=(1, 2))
 
     def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Measured minus predicted (B, W, L, C), zero where nothing was measured, and which of the B are valid."""
@@ -292,9 +317,7 @@ class Windows:
             again = np.tile(theta, (len(wrong), 1))
             again[np.arange(len(wrong)), wrong] += sign[wrong] * _THETA_STEP
             inside = np.clip(again, 0, 1)
-            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(
-                inside, all_starts[: len(wrong)]
-            )
+            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
         scale = np.concatenate([sign[:n] * _THETA_STEP, np.full(d, _START_STEP)])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]

@@ -22,14 +22,14 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-import scipy.linalg
+import scipy.linalg.lapack
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
-_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-4, 100, 2.0  # of the search for the noise: nats, steps, of a logarithm
+_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-3, 100, 2.0  # of the search for the noise: nats, steps, of a logarithm
 _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
 
 
@@ -52,7 +52,7 @@ class Sequence:
 def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
     """One Sequence per channel. observed (W, L, C): samples that count; sample (W, L): their number within the log;
     log (W,): the log of each window; dt (W,): seconds per sample."""
-    windows, length, channels = observed.shape
+    _, length, channels = observed.shape
     found = []
     for c in range(channels):
         index = np.flatnonzero(observed[:, :, c].ravel())
@@ -168,6 +168,18 @@ class Moments:
             out[:, 2, :, lag[:, None], lag] += np.moveaxis(part[..., size:, size:], (2, 3), (0, 1))
         return out
 
+    def correlation_times(self) -> FloatArray:
+        """A first guess (C,) in seconds from the residual's autocorrelation over each channel's commonest gap."""
+        corner = self.products.reshape(len(self.gaps), 3, self.windows, -1)[..., -1].sum(2)
+        times = np.ones(len(self.sequences))
+        for c in range(len(times)):
+            mine = np.flatnonzero((self.owner == c) & np.isfinite(self.gaps))
+            if len(mine):
+                g = mine[np.argmax(self.counts[mine])]
+                correlation = 0.5 * corner[g, 1] / max(corner[g, 0], 1e-300)
+                times[c] = -self.gaps[g] / np.log(np.clip(correlation, 0.05, 0.999))
+        return times
+
     def normal(self, noise: Noise) -> FloatArray:
         """Whitened products (W, K, K), K = N + 2 D + 1, summed over channels."""
         a = coefficients(self.gaps, noise.tau[self.owner])
@@ -192,8 +204,8 @@ class Moments:
         by_a = by_weight * (xx - a * xy + a**2 * yy) + weight * (2 * a * yy - xy) - 2 * a * self.counts / (1 - a**2)
         with np.errstate(invalid="ignore", divide="ignore"):
             by_tau = np.where(a > 0, by_a * a * self.gaps / tau, 0.0)
-        channels = len(noise.sd)
-        return np.bincount(self.owner, by_sd, channels), np.bincount(self.owner, by_tau, channels)
+        channels = np.eye(len(noise.sd))[self.owner]
+        return by_sd @ channels, by_tau @ channels
 
 
 @dataclass(frozen=True)
@@ -250,8 +262,10 @@ def eliminate(
     i, j = np.indices((d, d)).reshape(2, -1)
     band[d + i - j, :-1, j] = corner[:, j, i].T
     band = band.reshape(2 * d, windows * d)
-    factor = scipy.linalg.cholesky_banded(band, lower=True, check_finite=False)
-    solved = scipy.linalg.cho_solve_banded((factor, True), right.reshape(windows * d, n + 1), check_finite=False)
+    factor, failed = scipy.linalg.lapack.dpbtrf(band, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the starts' block is not positive definite")
+    solved, _ = scipy.linalg.lapack.dpbtrs(factor, right.reshape(windows * d, n + 1), lower=1)
     flat = right.reshape(windows * d, n + 1)
     reduced = flat.T @ solved
     precision = normal[:, theta, theta].sum(0) - reduced[:n, :n]
@@ -393,7 +407,7 @@ def estimate_noise(
     low, high = np.log(_SHORTEST_TAU * shortest), np.log(longest)
     tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
     if coloured and (noise.tau <= 0).all():
-        tau = np.full(channels, np.clip(np.log(10 * shortest), low, high))
+        tau = np.clip(np.log(moments.correlation_times()), low, high)
     innovation = 1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
     x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation)), tau if coloured else []])
     free_sd, free_tau = np.full(channels, 12.0), np.tile([[low], [high]], channels if coloured else 0)
@@ -448,8 +462,8 @@ def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArra
         _, by_sd, by_tau = restricted_slopes(moments, _from_logs(logs, noise), pulls)
         return np.concatenate([by_sd, by_tau])[free]
 
-    h = 0.05
-    curvature = np.array([(slopes(-step) - slopes(step)) / (2 * h) for step in h * np.eye(len(free))])
+    h, here = 1e-3, slopes(np.zeros(len(free)))
+    curvature = np.array([(here - slopes(step)) / h for step in h * np.eye(len(free))])
     eigenvalues, axes = np.linalg.eigh(0.5 * (curvature + curvature.T))
     return (axes / np.clip(eigenvalues, 1.0, 1e4)) @ axes.T
 

@@ -75,6 +75,13 @@ def _version(package: str) -> str:
 _IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
 
 
+def release(folder: Path) -> None:
+    """Give back a folder that was claimed by a run that was refused before it had anything to keep."""
+    if not (folder / CHECKPOINT).exists() and [p.name for p in folder.iterdir()] == [RUN]:
+        (folder / RUN).unlink()
+        folder.rmdir()
+
+
 def claim(folder: Path, run: dict[str, Any]) -> None:
     """Make ``folder`` this run's own; the same run may come back to it. Raises OutputError when it holds another."""
     if folder.exists() and not folder.is_dir():
@@ -92,7 +99,7 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
                 f"--out {folder}: holds another run (it differs in {what}); choose another folder or delete it"
             )
         return
-    if folder.is_dir() and any(folder.iterdir()):
+    if folder.is_dir() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
         raise OutputError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
     folder.mkdir(parents=True, exist_ok=True)
     write_text(record, to_json({**run, "status": "started"}, indent=2))
@@ -103,15 +110,15 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
     from sipe_bayes.diagnostics.report import write_report
     from sipe_bayes.envs.export import ExportError, write_identified
 
+    calibration.posterior.save(folder / "posterior")
+    temporary = folder / f".posterior.{os.getpid()}.nc"
+    calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
+    os.replace(temporary, folder / "posterior.nc")
     values = problem.environment.space.values(calibration.posterior.mode.numpy())
     try:
         calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
     except ExportError as error:
         calibration.warnings.append(str(error))
-    calibration.posterior.save(folder / "posterior")
-    temporary = folder / f".posterior.{os.getpid()}.nc"
-    calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
-    os.replace(temporary, folder / "posterior.nc")
     randomization = domain_randomization(calibration, problem)
     write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
     write_report(calibration, folder)
@@ -120,7 +127,9 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
 
 
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, Any]:
-    """What a policy trainer samples from: each parameter's normal in its unit, bounds, and the covariance."""
+    """What a policy trainer samples from: each parameter's normal in its unit, its bounds, and the covariance.
+
+    ``targets`` says what the value is multiplied by for each target that it is written to."""
     import numpy as np
 
     space = problem.environment.space
@@ -128,7 +137,7 @@ def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str
     rows = [
         {
             "name": p.name,
-            "target": list(s.targets),
+            "targets": problem.environment.multipliers(s),
             "unit": p.unit,
             "mean": p.mean,
             "sd": p.sd,

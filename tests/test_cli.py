@@ -231,7 +231,11 @@ WRONG: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
         [],
         ["measurements[0].unit", "'m' (length)", "use one of 'rad'"],
     ),
-    "not MJCF": (text("</mujoco>", "", "pendulum.xml"), [], ["model", "pendulum.xml", "not valid MJCF", "Line", "correct it"]),
+    "not MJCF": (
+        text("</mujoco>", "", "pendulum.xml"),
+        [],
+        ["model", "pendulum.xml", "not valid MJCF", "Line", "correct it"],
+    ),
     "does not compile": (
         text('joint="hinge"', 'joint="knee"', "pendulum.xml"),
         [],
@@ -410,7 +414,7 @@ def test_domain_randomization(finished: tuple[Path, Path, Any]) -> None:
     found = strict_json((out / "domain_randomization.json").read_text())
     parameters = strict_json(result.stdout)["parameters"]
     assert found["names"] == ["mass", "damping"]
-    assert [row["target"] for row in found["parameters"]] == [["body:rod.mass"], ["joint:hinge.damping"]]
+    assert [row["targets"] for row in found["parameters"]] == [{"body:rod.mass": 1.0}, {"joint:hinge.damping": 1.0}]
     assert [(row["low"], row["high"]) for row in found["parameters"]] == [(0.3, 0.8), (0.01, 0.2)]
     for row, p in zip(found["parameters"], parameters, strict=True):
         assert {k: row[k] for k in ("name", "unit", "mean", "sd", "q05", "q95")} == {

@@ -6,6 +6,10 @@ parameter that differs between logs takes the mean of the calibrated ones there.
 
 from __future__ import annotations
 
+import warnings
+from typing import Any
+
+import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,17 +24,45 @@ FloatArray = NDArray[np.float64]
 _BAND_DRAWS = 64
 
 
-def errors(windows: Windows, theta: FloatArray) -> FloatArray:
-    """RMSE (B, logs, C) of theta (B, N) over the windows of each log from measured starts; NaN where it diverges."""
+def measured_starts(windows: Windows, theta: FloatArray) -> FloatArray:
+    """Starts (B, W, D) of theta (B, N): what was measured there, less the sensor bias that theta claims."""
+    simulator, model = windows.simulator, windows.simulator.model
     starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
-    residual, valid = windows.residuals(theta, starts)
+    tangent = _tangents(model)
+    columns = [tangent.get(column) for column in simulator.environment.state_columns(model) if column is not None]
+    channels = [c for c, column in enumerate(simulator.environment.state_columns(model)) if column is not None]
+    for b, values in enumerate(simulator.space.values(theta)):
+        for name in set(windows.names):
+            bias = simulator.environment.bias(values, name)
+            mine = [w for w, log in enumerate(windows.names) if log == name]
+            for channel, column in zip(channels, columns, strict=True):
+                if column is not None and bias[channel]:
+                    starts[b, mine, column] = -bias[channel]
+    return starts
+
+
+def _tangents(model: Any) -> dict[int, int]:
+    """Column of the physics state -> column of a start, for hinge and slide joints."""
+    found = {1 + model.nq + dof: model.nv + dof for dof in range(model.nv)}
+    for joint in range(model.njnt):
+        if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            found[1 + int(model.jnt_qposadr[joint])] = int(model.jnt_dofadr[joint])
+    return found
+
+
+def errors(windows: Windows, theta: FloatArray) -> FloatArray:
+    """RMSE (B, logs, C) of theta (B, N) over the windows of each log from measured starts.
+
+    Infinite where one of the log's windows diverges, NaN where a channel has no sample."""
+    predicted, _ = windows.predict(theta, measured_starts(windows, theta))
+    square = np.where(windows.observed, (windows.measured - predicted) ** 2, 0.0)
     out = np.full((len(theta), len(windows.trajectories), len(windows.channels)), np.nan)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
         count = windows.observed[mine].sum(axis=(0, 1))
-        out[:, k] = np.sqrt((residual[:, mine] ** 2).sum(axis=(1, 2)) / np.maximum(count, 1))
+        total = square[:, mine].sum(axis=(1, 2))
+        out[:, k] = np.where(np.isfinite(total), np.sqrt(total / np.maximum(count, 1)), np.inf)
         out[:, k, count == 0] = np.nan
-    out[~valid] = np.nan
     return out
 
 
@@ -46,7 +78,7 @@ def channel_scores(windows: Windows, theta: FloatArray) -> list[ChannelScore]:
         ChannelScore(log, name, _unit(windows, c), float(found[0, k, c]), float(found[1, k, c]))
         for k, log in enumerate(windows.trajectories.names)
         for c, name in enumerate(windows.fitted)
-        if np.isfinite(found[0, k, c])
+        if not np.isnan(found[0, k, c])
     ]
 
 
@@ -61,11 +93,13 @@ def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior,
     space = windows.simulator.space
     draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
     thetas = np.concatenate([theta[None], np.clip(space.default_theta, 0, 1)[None], draws])
-    predicted, _ = windows.predict(thetas, np.tile(windows.no_starts(), (len(thetas), 1, 1)))
+    predicted, _ = windows.predict(thetas, measured_starts(windows, thetas))
     out = []
     for k, trajectory in enumerate(windows.trajectories):
         lines = _stitched(windows, predicted, k)
-        low, high = np.nanquantile(lines[2:], [0.05, 0.95], axis=0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
+            low, high = np.nanquantile(lines[2:], [0.05, 0.95], axis=0)
         begins = windows.start[windows.log == k] * trajectory.dt
         for c, name in enumerate(windows.fitted):
             measured = trajectory.observations[:, windows.channels[c]]

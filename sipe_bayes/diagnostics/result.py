@@ -127,6 +127,7 @@ class Calibration:
             "train": [asdict(s) for s in self.train],
             "warnings": list(self.warnings),
             "noise": self.noise,
+            "logs": self.logs,
             "mixing": None if self.mixing is None else {k: _finite(v) for k, v in self.mixing.items()},
             "rollouts": self.rollouts,
             "seconds": round(self.seconds, 3),

@@ -41,9 +41,14 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
                 _copy(spec, model, target)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.xml")
     try:
-        spec.compile()
-        temporary.write_text(spec.to_xml())
-        differing = differing_fields(model, mujoco.MjModel.from_xml_path(str(temporary)))
+        try:
+            spec.compile()
+            temporary.write_text(spec.to_xml())
+            written = mujoco.MjModel.from_xml_path(str(temporary))
+        except ValueError as error:  # six digits can break A + B >= C of a flat body
+            reason = " ".join(str(error).split())
+            raise ExportError(f"identified.xml: the written model does not compile: {reason}") from None
+        differing = differing_fields(model, written)
         if differing:
             raise ExportError(
                 f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written"

@@ -182,6 +182,18 @@ class MjcfEnvironment(Environment):
                 found.append((j, multiplier, target))
         return sorted(found, key=lambda item: item[2].order)
 
+    def uneven(self, parameter: Parameter) -> bool:
+        """Whether targets that all get the parameter's value have different values in the model."""
+        index = self.parameters.index(parameter.name)
+        values = [target.value for j, _, target in self._targets if j == index]
+        return not parameter.relative and len(values) > 1 and bool(np.ptp(values) > 1e-9 * np.abs(values).max())
+
+    def multipliers(self, parameter: Parameter) -> dict[str, float]:
+        """What a parameter's value is multiplied by for each of its targets."""
+        index = self.parameters.index(parameter.name)
+        found = {target.spec: multiplier for j, multiplier, target in self._targets if j == index}
+        return {spec: found.get(spec, 1.0) for spec in parameter.targets}
+
     @cached_property
     def _readers(self) -> tuple[_Reader, ...]:
         return tuple(_reader(self._model, c) for c in self.measurements)

@@ -14,7 +14,7 @@ Several starting points (the model as given and the best of a few draws from the
 not the same become components of a mixture, weighted by their restricted likelihood.
 
 Simulations are what a fit costs, so they are spared where they add nothing. Where the log tells the windows' starts, theta
-moves alone first, until a step gains little. The Jacobian of the starts is kept as long as it foretells the gain of a step
+moves alone first, on every other window, until a step gains little. The Jacobian of the starts is kept as long as it foretells the gain of a step
 to a fifth; an optimum is only accepted where what was foretold since it was taken is wrong by less than half a nat. A later starting point is dropped once
 the search has all but come to an optimum that is already known.
 
@@ -63,7 +63,7 @@ _DROP = 10.0  # nats below the best optimum
 _MAX_ITERATIONS = 80
 _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move along, as foretold or not
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
-_NEAR = 0.05  # of the way to a known optimum
+_NEAR = 0.1  # of the way to a known optimum
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
@@ -88,14 +88,10 @@ class Laplace(Estimator):
         **settings: Any,
     ) -> None:
         if restarts < 1 or candidates < 0:
-            raise ValueError(
-                f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}"
-            )
+            raise ValueError(f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}")
         super().__init__(simulator, **settings)
         self.restarts, self.candidates = restarts, candidates
-        self.initial = (
-            None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
-        )
+        self.initial = None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
 
     def settings(self) -> dict[str, Any]:
         initial = None if self.initial is None else self.initial.tolist()
@@ -140,8 +136,13 @@ class Laplace(Estimator):
 
         Rough search first: white noise with the sd of the present residuals, to a relative tolerance."""
         windows, prior = self.windows(trajectories), self.quadratic_prior
-        theta, starts, rough, held = state["theta"], state["starts"], state["rough"], state["held"]
+        if state["held"]:
+            return self._held_step(state, windows, prior)
+        theta, starts, rough = state["theta"], state["starts"], state["rough"]
         linearisation, stale, drift = self._linearise(state, windows)
+        if not linearisation.valid and state["peeked"]:  # every other window went well, but not all
+            begin = _begin(windows, state["points"][state["point"]])
+            return {**state, **begin, "held": False, "peeked": False}
         moments = windows.moments(linearisation, white=rough)
         noise = before = Noise(state["sd"], state["tau"])
         if rough:
@@ -149,16 +150,15 @@ class Laplace(Estimator):
         elif state["due"]:
             noise = _noise(windows, moments, before, theta, starts, prior, self.likelihood.noise == "ar1")
         value = energy_of(windows, noise, prior, theta, starts, linearisation.residual)
-        tolerance = _ROUGH * value if rough else 0.0
+        tolerance = max(_ROUGH * value, _TOLERANCE) if rough else _TOLERANCE
         here = Fit(theta, starts, value, state["damping"], residual=linearisation.residual)
-        fit = step(windows, noise, prior, here, moments, max(tolerance, _TOLERANCE), stale)
-        surprise = abs(fit.gained - fit.expected)
-        drift = drift + surprise
-        converged = fit.converged and drift < _DRIFT and not held
-        foretold = surprise < _FAIR * max(fit.expected, _TOLERANCE)
-        held = held and not fit.converged and fit.gained > (_HALF if foretold else _LITTLE) * value
+        fit = step(windows, noise, prior, here, moments, tolerance, stale)
+        drift = drift + abs(fit.gained - fit.expected)
+        converged = fit.converged and drift < _DRIFT
         iteration = state["iteration"] + 1
-        settled = converged and not rough and state["due"] and _same(noise, before)
+        # where theta does not move for the noise that is best there, both are
+        best_of_both = not fit.gained or _same(noise, before)
+        settled = converged and not rough and state["due"] and best_of_both
         state = {
             **state,
             "theta": fit.theta,
@@ -167,13 +167,13 @@ class Laplace(Estimator):
             "sd": noise.sd,
             "tau": noise.tau,
             "iteration": iteration,
-            "held": held,
             "rough": rough and not converged and iteration < _MAX_ITERATIONS // 2,
             "due": converged,
             "residual": fit.residual,
-            "jacobian": np.empty(0) if state["held"] else linearisation.jacobian,
+            "jacobian": linearisation.jacobian,
+            "peeked": False,
             "drift": np.inf if fit.converged and not converged else drift,
-            "keep_starts": foretold,
+            "keep_starts": _foretold(fit),
             "moved": fit.gained > 0,
         }
         if settled or iteration >= _MAX_ITERATIONS:
@@ -181,14 +181,40 @@ class Laplace(Estimator):
             return self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
         return self._next(state, windows) if _known(state) else state
 
+    def _held_step(self, state: State, windows: Windows, prior: QuadraticPrior) -> State:
+        """A step of theta alone, the starts as the log tells them, on every other window; near the optimum the search goes
+        on with all."""
+        view, theta = windows.glimpse(), state["theta"]
+        before = view.rollouts
+        found = view.linearise(
+            theta, view.no_starts(), with_starts=False, residual=state["residual"] if state["residual"].size else None
+        )
+        still = np.zeros((*found.residual.shape, windows.num_start))
+        found = replace(found, jacobian=np.concatenate([found.jacobian, still], axis=-1))
+        noise = _present_noise(view, found.residual)
+        value = energy_of(view, noise, prior, theta, view.no_starts(), found.residual)
+        here = Fit(theta, view.no_starts(), value, state["damping"], residual=found.residual)
+        fit = step(view, noise, prior, here, view.moments(found, white=True), max(_ROUGH * value, _TOLERANCE))
+        if view is not windows:
+            share = view.steps.sum() / windows.steps.sum()
+            windows.rollouts += int(np.ceil((view.rollouts - before) * share))
+        held = not fit.converged and fit.gained > (_HALF if _foretold(fit) else _LITTLE) * value
+        held &= state["iteration"] + 1 < _MAX_ITERATIONS // 4
+        state = {
+            **state,
+            "theta": fit.theta,
+            "damping": fit.damping,
+            "iteration": state["iteration"] + 1,
+            "held": held,
+            "peeked": True,
+            "residual": fit.residual if held or view is windows else np.empty(0),
+        }
+        return self._next(state, windows) if _known(state) else state
+
     def _linearise(self, state: State, windows: Windows) -> tuple[Linearisation, bool, float]:
         """Linearisation at the state's point, whether part of it is of an earlier one, and the drift of that part."""
         theta, starts, jacobian, n = state["theta"], state["starts"], state["jacobian"], windows.num_theta
         residual = state["residual"] if state["residual"].size else None
-        if state["held"]:
-            found = windows.linearise(theta, starts, with_starts=False, residual=residual)
-            still = np.zeros((*found.residual.shape, windows.num_start))
-            return replace(found, jacobian=np.concatenate([found.jacobian, still], axis=-1)), False, 0.0
         if not jacobian.size or not np.isfinite(state["drift"]) or not state["keep_starts"]:
             return windows.linearise(theta, starts, residual=residual), False, 0.0
         if not state["moved"]:
@@ -217,9 +243,7 @@ class Laplace(Estimator):
         """Record the optimum at the last linearisation and turn to the next starting point."""
         prior, pull = self.quadratic_prior, -windows.start_precision * starts
         arrow = eliminate(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
-        everything = replace(
-            pulls(windows, prior, theta, starts, arrow.gradient), free=np.full(len(theta), True)
-        )
+        everything = replace(pulls(windows, prior, theta, starts, arrow.gradient), free=np.full(len(theta), True))
         evidence = restricted(moments, noise, everything) - prior.energy(theta)
         here = pulls(windows, prior, theta, starts, arrow.gradient)
         white = noise.sd
@@ -249,9 +273,9 @@ class Laplace(Estimator):
             "tau": noise.tau,
             "evidence": np.array(evidence),
         }
-        middle = None if state["centred"] else self._middle(windows, theta, starts, noise, mean, covariance)
-        if middle is not None:
-            return {**state, "theta": middle, "centred": True, "moved": True, **_AFRESH}
+        further = None if state["centred"] else self._middle(windows, theta, starts, noise, mean, covariance)
+        if further is not None:
+            return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
         modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in found.items()}
         return self._next({**state, **modes}, windows)
 
@@ -296,15 +320,11 @@ class Laplace(Estimator):
             "noise_tau": state["mode_tau"][kept[0]].tolist(),
         }
         if len(kept) > 1:
-            self.warnings.append(
-                f"the search found {len(kept)} separate optima; the posterior is a mixture of them"
-            )
+            self.warnings.append(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         weights = torch.tensor(np.array(evidence) - np.max(evidence))
         return GaussianMixture(weights, np.stack(means), np.stack(covariances), self.space)
 
-    def _normal(
-        self, theta: FloatArray, precision: FloatArray, gradient: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance, before truncation, of the quadratic model of data and prior at theta."""
         prior = self.quadratic_prior
         covariance = np.linalg.inv(precision + prior.precision + _FLAT_PRECISION * np.eye(len(theta)))
@@ -371,6 +391,7 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "tau": np.zeros(len(sd)),
         "iteration": 0,
         "held": windows.starts_measured,
+        "peeked": False,
         "rough": True,
         "due": False,
         "residual": np.empty(0),
@@ -390,9 +411,7 @@ def fixed_sd(windows: Windows) -> FloatArray:
     return np.array([np.nan if given[c] is None else given[c] for c in windows.channels], float)
 
 
-def pulls(
-    windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray
-) -> Pulls:
+def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
     """Prior and bounds at (theta, starts); ``force`` (N,): the data's pull on theta, which holds it at a bound."""
     flat = _FLAT_PRECISION * np.eye(len(theta))
     total = force + prior.pull(theta)
@@ -456,9 +475,14 @@ def distinct_modes(state: State) -> list[int]:
     return kept
 
 
+def _foretold(fit: Fit) -> bool:
+    """Whether a step gained what the linearisation foretold, to a fifth."""
+    return abs(fit.gained - fit.expected) < _FAIR * max(fit.expected, _TOLERANCE)
+
+
 def _known(state: State) -> bool:
     """Whether the search has come to one of the optima found earlier: in each principal direction of its normal within
-    one sd, or within a twentieth of the way that it had to come."""
+    one sd, or within a tenth of the way that it had to come."""
     begin = state["points"][state["point"]]
     for mean, covariance in zip(state["mode_mean"], state["mode_covariance"], strict=True):
         eigenvalues, axes = np.linalg.eigh(covariance)

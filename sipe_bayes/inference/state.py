@@ -46,15 +46,3 @@ def load_state(path: Path, fingerprint: str) -> State:
             f"checkpoint {path}: belongs to another run; choose another folder or delete it"
         )
     return state
-
-
-def generator_state(generator: np.random.Generator) -> str:
-    """A NumPy generator as text."""
-    return json.dumps(generator.bit_generator.state)
-
-
-def restore_generator(text: str) -> np.random.Generator:
-    """The generator that ``generator_state`` wrote down."""
-    generator = np.random.default_rng()
-    generator.bit_generator.state = json.loads(text)
-    return generator

@@ -7,6 +7,9 @@ channel's root mean square: sysid scales its residuals by just that and assumes 
 
 from __future__ import annotations
 
+import contextlib
+import io
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,10 +85,11 @@ def arm_log(seed: int) -> ArmLog:
 
 @dataclass(frozen=True)
 class Estimate:
-    """value (5,) and the half-width (5,) of its 95 % interval, in kg m^2."""
+    """value (5,) and the half-width (5,) of its 95 % interval, in kg m^2; seconds of the fit alone."""
 
     value: FloatArray
     half: FloatArray
+    seconds: float
     rollouts: int = 0
 
     @property
@@ -105,16 +109,20 @@ def arm_simulator() -> Simulator:
 
 
 def ours(simulator: Simulator, log: ArmLog, likelihood: Segments, **settings: Any) -> Estimate:
-    """``laplace`` on the log."""
+    """``laplace`` on the log; timed is ``fit``."""
     estimator = Laplace(simulator, likelihood=likelihood, **settings)
-    posterior = estimator.fit(Trajectory(log.measured, log.torque, simulator.model.opt.timestep))
+    trajectory = Trajectory(log.measured, log.torque, simulator.model.opt.timestep)
+    begin = time.perf_counter()
+    posterior = estimator.fit(trajectory)
+    seconds = time.perf_counter() - begin
     low, high = (posterior.space.values(posterior.quantile(q).numpy()) for q in (0.025, 0.975))
     value = posterior.space.values(posterior.mode.numpy())
-    return Estimate(value, (high - low) / 2, estimator.rollouts)
+    return Estimate(value, (high - low) / 2, seconds, estimator.rollouts)
 
 
 def rival(log: ArmLog) -> Estimate:
-    """mujoco.sysid on the log, as its test calls it, with its default optimiser and its own intervals."""
+    """mujoco.sysid on the log, as its test calls it, with its default optimiser and its own intervals; timed is
+    ``optimize``."""
     from mujoco import sysid
 
     spec = mujoco.MjSpec.from_string(arm_xml())
@@ -133,10 +141,10 @@ def rival(log: ArmLog) -> Estimate:
     measured = sysid.TimeSeries.from_names(times, log.measured[: len(times)], model)
     sequence = sysid.ModelSequences("arm", spec, "log", start, sysid.TimeSeries(log.time, controls), measured)
     residual = sysid.build_residual_fn(models_sequences=[sequence])
-    found, result = sysid.optimize(params, residual, optimizer="mujoco", verbose=False, **QUIET)
+    with contextlib.redirect_stdout(io.StringIO()):
+        begin = time.perf_counter()
+        found, result = sysid.optimize(params, residual, optimizer="mujoco", verbose=False)
+        seconds = time.perf_counter() - begin
     final, _, _ = residual(result.x, found)
     _, half = sysid.calculate_intervals(final, result.jac, alpha=0.05)
-    return Estimate(np.asarray(result.x, float), np.asarray(half, float))
-
-
-QUIET: dict[str, Any] = {}
+    return Estimate(np.asarray(result.x, float), np.asarray(half, float), seconds)

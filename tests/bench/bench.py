@@ -51,13 +51,14 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def side_by_side(ours: Callable[[], Any], other: Callable[[], Any], pairs: int) -> Seconds:
-    """Median seconds of each and the median of the pairs' ratios, after one warm-up of each."""
-    ours(), other()
+def side_by_side(ours: Callable[[int], float], other: Callable[[int], float], pairs: int) -> Seconds:
+    """Median seconds of each and the median of the pairs' ratios, after one warm-up of each. Both are given the number of
+    the pair and return seconds."""
+    ours(0), other(0)
     times = []
     for k in range(pairs):
         first, second = (ours, other) if k % 2 == 0 else (other, ours)
-        a, b = seconds(first), seconds(second)
+        a, b = first(k), second(k)
         times.append((a, b) if k % 2 == 0 else (b, a))
     mine, theirs = zip(*times, strict=True)
     return statistics.median(mine), statistics.median(theirs), statistics.median(a / b for a, b in times)
@@ -101,7 +102,7 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
         return simulator.rollout(theta, actions, start, dt)
 
     np.testing.assert_array_equal(ours().states[:, 1:], bare()[:, substeps - 1 :: substeps])
-    return side_by_side(ours, bare, max(pairs, 21))
+    return side_by_side(lambda _: seconds(ours), lambda _: seconds(bare), max(pairs, 21))
 
 
 def rival(pairs: int) -> None:
@@ -109,43 +110,42 @@ def rival(pairs: int) -> None:
         "\nlaplace against mujoco.sysid: the arm of sysid's own test, five armatures from 0.01 kg m^2, bounds 0.001 and 1,"
     )
     print(
-        "2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: its default"
+        "2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: optimize with"
     )
-    print("optimiser ('mujoco'), start state given, white noise. laplace: start states estimated.")
-    import contextlib
-    import io
-
-    simulator = arm.arm_simulator()
+    print(
+        "its default 'mujoco', start state given, white noise. laplace: fit; start states and noise estimated with theta."
+    )
+    simulator, single = arm.arm_simulator(), {"restarts": 1, "candidates": 0}
+    white = Segments(window=None, noise="white")
     settings: dict[str, tuple[Segments, dict[str, Any]]] = {
         "default: windows 0.5 s, ar1, 2 starts": (Segments(), {}),
-        "windows 0.5 s, ar1, 1 start": (Segments(), {"restarts": 1, "candidates": 0}),
-        "one window, white, 2 starts": (Segments(window=None, noise="white"), {}),
-        "one window, white, 1 start": (Segments(window=None, noise="white"), {"restarts": 1, "candidates": 0}),
+        "windows 0.5 s, ar1, 1 start": (Segments(), single),
+        "one window, white, 2 starts": (white, {}),
+        "one window, white, 1 start": (white, single),
     }
+    logs = [arm.arm_log(seed) for seed in range(pairs)]
     print(f"{'laplace settings':<40}{'ours s':>8}{'sysid s':>9}{'ratio':>7}{'rollouts':>10}")
-    found: dict[str, list[arm.Estimate]] = {}
+    found: dict[str, dict[int, arm.Estimate]] = {"mujoco.sysid": {}}
     for name, (likelihood, more) in settings.items():
-        mine, theirs = found.setdefault(name, []), found.setdefault("mujoco.sysid", [])
-        count = {"ours": 0, "sysid": 0}
+        mine = found.setdefault(name, {})
 
-        def ours(out: Any = mine, lik: Any = likelihood, kw: Any = more, n: Any = count) -> None:
-            out.append(arm.ours(simulator, arm.arm_log(n["ours"]), lik, **kw))
-            n["ours"] += 1
+        def ours(k: int, likelihood: Segments = likelihood, more: Any = more, mine: Any = mine) -> float:
+            mine[k] = arm.ours(simulator, logs[k], likelihood, **more)
+            return float(mine[k].seconds)
 
-        def other(out: Any = theirs, n: Any = count) -> None:
-            with contextlib.redirect_stdout(io.StringIO()):
-                out.append(arm.rival(arm.arm_log(n["sysid"])))
-            n["sysid"] += 1
+        def other(k: int) -> float:
+            found["mujoco.sysid"][k] = arm.rival(logs[k])
+            return found["mujoco.sysid"][k].seconds
 
         a, b, ratio = side_by_side(ours, other, pairs)
-        rollouts = int(statistics.median(e.rollouts for e in mine))
+        rollouts = round(statistics.median(e.rollouts for e in mine.values()))
         print(f"{name:<40}{a:>8.2f}{b:>9.2f}{ratio:>7.2f}{rollouts:>10}")
-    print(f"\n{'':<40}{'mean |error|':>14}{'mean half-width':>17}{'truths inside':>15}   (95 % intervals, g m^2)")
+    print(f"\n{'95 % intervals, g m^2':<40}{'mean |error|':>14}{'mean half-width':>17}{'truths inside':>15}")
     for name, estimates in found.items():
-        error = 1e3 * np.mean([e.error for e in estimates])
-        half = 1e3 * np.mean([e.half for e in estimates])
-        inside = sum(e.inside for e in estimates)
-        print(f"{name:<40}{error:>14.3f}{half:>17.3f}{inside:>9} of {5 * len(estimates):<5}")
+        error = 1e3 * np.mean([e.error for e in estimates.values()])
+        half = 1e3 * np.mean([e.half for e in estimates.values()])
+        inside = sum(e.inside for e in estimates.values())
+        print(f"{name:<40}{error:>14.3f}{half:>17.3f}{inside:>9} of {5 * len(estimates)}")
 
 
 @contextmanager
