@@ -26,7 +26,7 @@ HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
 NOISE_SD = 0.01  # rad
 WINDOW = 0.5  # s
-BUDGET = {"laplace": 5000, "mcmc": 900}  # rollouts; 900 give the chain about 100 effective draws
+BUDGET = {"laplace": 5000, "mcmc": 900}  # rollouts; 900 are a short chain of 20 to 60 steps of 24 walkers
 
 
 def simulated_log(problem: Problem, theta: np.ndarray, rho: float, rng: np.random.Generator) -> sipe.Trajectory:
@@ -66,6 +66,11 @@ def one_fit(problem: Problem, estimator: str, rho: float, seed: int) -> dict[str
     }
 
 
+def _steps(rows: list[dict[str, Any]]) -> dict[str, float]:
+    steps = [r["mixing"]["steps"] for r in rows]
+    return {"min": min(steps), "median": float(np.median(steps))}
+
+
 def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any]:
     """Pooled coverage with its standard error clustered by fit."""
     covered = np.array([r["covered"] for r in rows], float)
@@ -77,6 +82,7 @@ def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any
         "coverage_by_parameter": dict(zip(names, covered.mean(0).round(3).tolist(), strict=True)),
         "mean_contraction": round(float(contraction.mean()), 4),
         "contraction_by_parameter": dict(zip(names, contraction.mean(0).round(3).tolist(), strict=True)),
+        **({"chain_steps": _steps(rows)} if rows[0]["mixing"] else {}),
         "mean_rollouts": round(float(np.mean([r["rollouts"] for r in rows])), 1),
     }
 
