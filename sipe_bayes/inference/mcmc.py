@@ -81,6 +81,7 @@ class MCMC(Estimator):
         windows = self.windows(trajectories)
         first._bound = (trajectories, windows)
         found = first.fit(trajectories)
+        self.warnings += first.warnings
         if not first._state or not len(first._state["mode_theta"]):
             raise BudgetExhausted("the budget did not suffice for the first laplace fit")
         best = distinct_modes(first._state)[0]
