@@ -10,7 +10,6 @@ three chirps made before this library existed (theta .076, alpha .029 on the -1.
 from __future__ import annotations
 
 import json
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import sipe_bayes as sipe
 from sipe_bayes.calibration import Problem
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.likelihood import Windows
+from sipe_bayes.output import write_text
 
 HERE = Path(__file__).parent
 REFERENCE = {"theta": 0.076, "alpha": 0.029}
@@ -76,9 +76,7 @@ def main() -> None:
         "seconds": round(seconds, 1),
     }
     result = HERE / "results" / "furuta_heldout.json"
-    temporary = result.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found, indent=2) + "\n")
-    os.replace(temporary, result)
+    write_text(result, json.dumps(found, indent=2) + "\n")
     print(json.dumps(found, indent=2))
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 
 import sipe_bayes as sipe
 from sipe_bayes.calibration import Problem
+from sipe_bayes.output import write_text
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
@@ -114,9 +114,7 @@ def main() -> None:
         **summary(rows[: arguments.truths], problem.environment.space.names),
     }
     result = HERE / "results" / f"{name}.json"
-    temporary = result.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found, indent=2) + "\n")
-    os.replace(temporary, result)
+    write_text(result, json.dumps(found, indent=2) + "\n")
     print(json.dumps(found, indent=2))
 
 

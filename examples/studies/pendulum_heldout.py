@@ -11,7 +11,6 @@ ridge between mass and distance is freed, to see whether it is named.
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from sipe_bayes.calibration import Problem
 from sipe_bayes.config import load_config
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.likelihood import Windows
+from sipe_bayes.output import write_text
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
@@ -88,9 +88,7 @@ def main() -> None:
     ridge = sipe.calibrate(with_distance())
     found["mass_and_distance_free"] = {"ridges": [r.text for r in ridge.ridges], "warnings": ridge.warnings}
     result = HERE / "results" / "pendulum_heldout.json"
-    temporary = result.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found, indent=2) + "\n")
-    os.replace(temporary, result)
+    write_text(result, json.dumps(found, indent=2) + "\n")
     print(json.dumps(found, indent=2))
 
 
