@@ -177,6 +177,10 @@ class Laplace(Estimator):
             "moved": fit.gained > 0,
         }
         if settled or iteration >= _MAX_ITERATIONS:
+            if not settled:
+                self.warnings.append(
+                    f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
+                )
             moments = windows.moments(linearisation) if rough else moments
             return self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
         return self._next(state, windows) if _known(state) else state
