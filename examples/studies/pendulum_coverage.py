@@ -11,6 +11,7 @@ and its standard error is clustered by fit.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
 NOISE_SD = 0.01  # rad
 WINDOW = 0.5  # s
-BUDGET = {"laplace": 5000, "mcmc": 900}  # rollouts; 900 are a short chain of 20 to 60 steps of 24 walkers
+BUDGET = {"laplace": 5000, "mcmc": 2000}  # rollouts; 2000 are 60 steps of 24 walkers or more after the first fit
 
 
 def simulated_log(problem: Problem, theta: np.ndarray, rho: float, rng: np.random.Generator) -> sipe.Trajectory:
@@ -66,9 +67,27 @@ def one_fit(problem: Problem, estimator: str, rho: float, seed: int) -> dict[str
     }
 
 
-def _steps(rows: list[dict[str, Any]]) -> dict[str, float]:
-    steps = [r["mixing"]["steps"] for r in rows]
-    return {"min": min(steps), "median": float(np.median(steps))}
+def _setting(estimator: str) -> dict[str, Any]:
+    """What every fit of one table must share: budget, window and the code that made it."""
+    code = hashlib.sha256()
+    for file in sorted(Path(sipe.__file__).parent.glob("**/*.py")):
+        if file.parent.name in ("sipe_bayes", "inference", "posterior"):
+            code.update(file.read_bytes())
+    return {"budget": BUDGET[estimator], "window_s": WINDOW, "code": code.hexdigest()[:12]}
+
+
+def _mixing(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Quantiles over the fits of what the chains say of themselves."""
+    return {
+        key: dict(
+            zip(
+                ("q10", "q50", "q90"),
+                np.quantile([r["mixing"][key] for r in rows], (0.1, 0.5, 0.9)).round(3).tolist(),
+                strict=True,
+            )
+        )
+        for key in ("steps", "rhat", "ess", "linearisation_error")
+    }
 
 
 def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any]:
@@ -82,7 +101,7 @@ def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any
         "coverage_by_parameter": dict(zip(names, covered.mean(0).round(3).tolist(), strict=True)),
         "mean_contraction": round(float(contraction.mean()), 4),
         "contraction_by_parameter": dict(zip(names, contraction.mean(0).round(3).tolist(), strict=True)),
-        **({"chain_steps": _steps(rows)} if rows[0]["mixing"] else {}),
+        **({"mixing": _mixing(rows)} if rows[0]["mixing"] else {}),
         "mean_rollouts": round(float(np.mean([r["rollouts"] for r in rows])), 1),
     }
 
@@ -98,9 +117,12 @@ def main() -> None:
     name = f"pendulum_coverage_{arguments.estimator}_rho{arguments.rho:g}"
     kept = Path("runs") / f"{name}.jsonl"
     kept.parent.mkdir(exist_ok=True)
+    setting = _setting(arguments.estimator)
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
+    if any(row["setting"] != setting for row in rows):
+        raise SystemExit(f"{kept}: holds fits of other code or settings than {setting}; delete it to start again")
     for seed in range(len(rows), arguments.truths):
-        rows.append(one_fit(problem, arguments.estimator, arguments.rho, seed))
+        rows.append({**one_fit(problem, arguments.estimator, arguments.rho, seed), "setting": setting})
         with kept.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
         found = summary(rows, problem.environment.space.names)
@@ -109,8 +131,7 @@ def main() -> None:
         "command": f"python examples/studies/pendulum_coverage.py --estimator {arguments.estimator} "
         f"--rho {arguments.rho:g} --truths {arguments.truths}",
         "noise_sd_rad": NOISE_SD,
-        "window_s": WINDOW,
-        "budget": BUDGET[arguments.estimator],
+        **setting,
         **summary(rows[: arguments.truths], problem.environment.space.names),
     }
     result = HERE / "results" / f"{name}.json"

@@ -105,6 +105,7 @@ class Estimator(ABC):
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)
             self.rollouts = self.windows(batch).rollouts = int(state["rollouts"])
+            self.warnings = list(state["warnings"])
         saved = time.monotonic()
         try:
             if state is None:
@@ -145,6 +146,7 @@ class Estimator(ABC):
             raise ValueError(
                 "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
             )
+        self.warnings = list(self._state["warnings"])
         return self.posterior(self._state, Trajectories.stack(trajectories))
 
     def describe(self, state: State) -> str:
@@ -162,7 +164,7 @@ class Estimator(ABC):
     def _counted(self, state: State, trajectories: Trajectories) -> State:
         if self._bound is not None:
             self.rollouts = self._bound[1].rollouts
-        return {**state, "rollouts": self.rollouts}
+        return {**state, "rollouts": self.rollouts, "warnings": list(self.warnings)}
 
     def settings(self) -> dict[str, Any]:
         """Whatever changes the result besides the trajectories, as plain data; subclasses add theirs."""

@@ -83,7 +83,7 @@ class Laplace(Estimator):
         simulator: Any,
         *,
         restarts: int = 2,
-        candidates: int = 8,
+        candidates: int = 4,
         initial: FloatArray | None = None,
         **settings: Any,
     ) -> None:
@@ -181,6 +181,11 @@ class Laplace(Estimator):
                 self.warnings.append(
                     f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
                 )
+            elif fit.refused > _DRIFT:
+                self.warnings.append(
+                    f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
+                    "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
+                )
             moments = windows.moments(linearisation) if rough else moments
             return self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
         return self._next(state, windows) if _known(state) else state
@@ -248,7 +253,8 @@ class Laplace(Estimator):
         prior, pull = self.quadratic_prior, -windows.start_precision * starts
         arrow = eliminate(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
         everything = replace(pulls(windows, prior, theta, starts, arrow.gradient), free=np.full(len(theta), True))
-        evidence = restricted(moments, noise, everything) - prior.energy(theta)
+        prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
+        evidence = restricted(moments, noise, everything) - prior_energy
         here = pulls(windows, prior, theta, starts, arrow.gradient)
         white = noise.sd
         if self.likelihood.noise == "sandwich":

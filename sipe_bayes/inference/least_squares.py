@@ -43,7 +43,8 @@ class Fit:
     """A point of the search: theta (N,), starts (W, D), energy = -log of likelihood x prior up to a constant.
 
     residual (W, L, C): that of the simulation there, if it was done. expected, gained: nats by which the step that led
-    here was to lower the energy and did; both zero where no step was taken."""
+    here was to lower the energy and did; both zero where no step was taken. refused: nats that a step was to gain when even
+    the shortest gained nothing."""
 
     theta: FloatArray
     starts: FloatArray
@@ -53,6 +54,7 @@ class Fit:
     residual: FloatArray | None = None
     expected: float = 0.0
     gained: float = 0.0
+    refused: float = 0.0
 
 
 def energy_of(
@@ -84,7 +86,7 @@ def step(
     ``expected``."""
     normal = moments.normal(noise)
     pull = -windows.start_precision * fit.starts
-    damping = fit.damping
+    damping, refused = fit.damping, 0.0
     while damping <= _DAMPING_MAX:
         arrow = eliminate(normal, moments.num_theta, windows.start_precision, pull, damping)
         hessian = arrow.precision + prior.precision
@@ -102,8 +104,8 @@ def step(
             return Fit(theta, starts, value, damping, gained < tolerance, residual[0], expected, gained)
         if stale:
             return replace(fit, expected=np.inf)
-        damping *= _DAMPING_UP
-    return replace(fit, damping=fit.damping, converged=True)
+        damping, refused = damping * _DAMPING_UP, max(refused, expected)
+    return replace(fit, converged=True, refused=refused)
 
 
 def box_step(hessian: FloatArray, gradient: FloatArray, theta: FloatArray, damping: float) -> FloatArray:

@@ -106,12 +106,14 @@ class MCMC(Estimator):
         dimensions = len(self.space) + len(spread)
         count = self.walkers or max(24, 2 * dimensions + 2)
         walkers, log_prob = self._place(windows, state, count, random)
+        centre = np.concatenate([picked["theta"], _Proposal(self, windows, state).centre])
         return {
             **state,
             "walkers": walkers,
             "log_prob": log_prob,
+            "best": picked["theta"],
+            "best_log_prob": float(_Target(self, windows, state)(centre[None])[0]),
             "chain": np.empty((0, *walkers.shape)),
-            "chain_log_prob": np.empty((0, count)),
             **_random_state(random),
         }
 
@@ -168,12 +170,16 @@ class MCMC(Estimator):
         end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
         random = np.random.RandomState()
         random.set_state(end.random_state)
+        chain, log_prob = sampler.get_chain(), sampler.get_log_prob()
+        top = np.unravel_index(log_prob.argmax(), log_prob.shape)
+        better = log_prob[top] > state["best_log_prob"]
         state = {
             **state,
             "walkers": end.coords,
             "log_prob": end.log_prob,
-            "chain": np.concatenate([state["chain"], sampler.get_chain()]),
-            "chain_log_prob": np.concatenate([state["chain_log_prob"], sampler.get_log_prob()]),
+            "best": chain[top][: len(self.space)] if better else state["best"],
+            "best_log_prob": float(max(log_prob[top], state["best_log_prob"])),
+            "chain": np.concatenate([state["chain"], chain]),
             "accepted": int(state["accepted"] + sampler.backend.accepted.sum()),
             **_random_state(random),
         }
@@ -213,10 +219,9 @@ class MCMC(Estimator):
                 f"budget: {self.budget} rollouts were not enough for one block of steps; raise it"
             )
         n = len(self.space)
-        chain, log_prob = self._kept(state), state["chain_log_prob"][-len(self._kept(state)) :]
+        chain = self._kept(state)
         thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
         theta = np.swapaxes(chain[::-thin][::-1], 0, 1)[:, :, :n]
-        density = np.swapaxes(log_prob[::-thin][::-1], 0, 1)
         mixing = self._mixing(state)
         mixing["linearisation_error"] = self._linearisation_error(state, trajectories)
         self.diagnostics = {"mixing": mixing, **self._noise_summary(state, trajectories)}
@@ -231,7 +236,7 @@ class MCMC(Estimator):
                 "use shorter windows"
             )
         flat = np.clip(theta.reshape(-1, n), 0, 1)
-        return Particles(flat, self.space, chains=len(theta), log_density=density.reshape(-1))
+        return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1))
 
     def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
         target = _Target(self, self.windows(trajectories), state)

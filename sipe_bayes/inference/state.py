@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 State = dict[str, Any]
-"""Arrays, numbers, text and booleans by name; nothing nested."""
+"""Arrays, numbers, text, booleans and lists of text by name; nothing nested."""
 
 
 class CheckpointError(ValueError):

@@ -28,8 +28,8 @@ class Particles(Posterior):
     """Points ``theta`` (M, N) with ``weights`` (M,), equal if not given. No density: ``log_prob`` raises.
 
     chains: the rows are this many equal consecutive Markov chains (their weights must be equal).
-    log_density: (M,) values up to a constant; ``mode`` is the best row. Without it, ``mode`` is the row
-    closest to the weighted mean in the metric of the covariance.
+    best: (N,) the point of highest density that the method found, which is then the ``mode``. Without it, ``mode`` is
+    the row closest to the weighted mean in the metric of the covariance.
     """
 
     has_density: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class Particles(Posterior):
         space: ParameterSpace,
         weights: Any = None,
         chains: int | None = None,
-        log_density: Any = None,
+        best: Any = None,
     ) -> None:
         super().__init__(space)
         self.theta = as_theta("theta", theta, (None, len(space)))
@@ -48,7 +48,7 @@ class Particles(Posterior):
         if rows == 0:
             raise ValueError(f"theta: expected at least one row, got shape {tuple(self.theta.shape)}")
         self.weights = _normalised(weights, rows)
-        self.log_density = None if log_density is None else as_float64("log_density", log_density, (rows,))
+        self.best = None if best is None else as_theta("best", best, (len(space),))
         self.chains = chains
         if chains is not None and (chains < 1 or rows % chains):
             raise ValueError(
@@ -88,7 +88,7 @@ class Particles(Posterior):
         return self.theta[rows], torch.full((MAX_KERNELS,), 1 / MAX_KERNELS, dtype=torch.float64)
 
     def marginal(self, names: Iterable[str]) -> Particles:
-        """The same points in fewer parameters; weights and chains stay, joint log densities do not."""
+        """The same points in fewer parameters; weights and chains stay, ``best`` of the whole does not."""
         columns, space = self._columns(names)
         return Particles(self.theta[:, columns], space, self.weights, self.chains)
 
@@ -111,8 +111,8 @@ class Particles(Posterior):
         return torch.from_numpy(np.stack(columns, -1))
 
     def _mode(self) -> Tensor:
-        if self.log_density is not None:
-            return self.theta[self.log_density.argmax()]
+        if self.best is not None:
+            return self.best
         mean, covariance = self._cached_moments
         deviation = self.theta - mean
         distance = ((deviation @ torch.linalg.pinv(covariance, hermitian=True)) * deviation).sum(-1)
@@ -125,13 +125,13 @@ class Particles(Posterior):
 
     def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {"theta": self.theta, "weights": self.weights}
-        if self.log_density is not None:
-            tensors["log_density"] = self.log_density
+        if self.best is not None:
+            tensors["best"] = self.best
         return tensors, {"chains": self.chains}
 
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
-        return cls(tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("log_density"))
+        return cls(tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("best"))
 
 
 def _normalised(weights: Any, rows: int) -> Tensor:
