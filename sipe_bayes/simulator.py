@@ -16,6 +16,7 @@ import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -78,6 +79,7 @@ class Simulator:
         self.model = environment.compile()
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show
+        self._physics_size = int(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self.diverged = 0
         self.control_steps = 0
         self._pool: list[Any] = []
@@ -93,20 +95,29 @@ class Simulator:
 
     @property
     def state_size(self) -> int:
-        """S: the numbers of MuJoCo's full physics state."""
-        return int(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        """S: the numbers of MuJoCo's full physics state, and of a stepwise environment's memory."""
+        return self._physics_size + self.environment.memory_size
 
     def default_state(self) -> FloatArray:
         """State (S,) after a reset of the default model."""
-        data, state = mujoco.MjData(self.model), np.empty(self.state_size)
+        data, state = mujoco.MjData(self.model), np.empty(self._physics_size)
         mujoco.mj_getState(self.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        return state
+        if not self.environment.memory_size:
+            return state
+        memory = self.environment.remember(self._sensors([self.model], state[None]))
+        return np.concatenate([state, memory[0]])
+
+    @property
+    def dt(self) -> float:
+        """Seconds of a control step where none are given."""
+        return float(self.environment.frame_skip * self.model.opt.timestep)
 
     def physics_steps(self, dt: float) -> tuple[int, float]:
         """How many physics steps make one control step of ``dt`` seconds, and how long each is; never longer
         than the model's own."""
         steps = max(1, math.ceil(dt / self.model.opt.timestep - 1e-3))
-        return steps, dt / steps
+        own = float(self.model.opt.timestep)
+        return steps, own if math.isclose(dt, steps * own, rel_tol=1e-12) else dt / steps
 
     def rollout(
         self,
@@ -116,11 +127,12 @@ class Simulator:
         dt: FloatArray | float | None = None,
         logs: Sequence[str | None] | None = None,
         allow_outside: bool = False,
+        goals: FloatArray | None = None,
     ) -> Trajectories:
         """Open loop, whole horizon.
 
         theta (B, N), actions (B, T, A) and initial_state (B, S), each also with B = 1 for all lanes; dt:
-        seconds per control step, (B,) or one number, default the model's timestep; logs: the log that each
+        seconds per control step, (B,) or one number, default the environment's; goals (B, G) of a task that has them; logs: the log that each
         lane belongs to, for parameters that differ between logs. Returns Trajectories with observations,
         states and ``valid``. A lane whose parameters are unphysical or whose start is not finite is never
         simulated: NaN, and not valid from sample 0. Raises ValueError for shapes that do not fit, theta
@@ -128,26 +140,33 @@ class Simulator:
         """
         theta, actions, initial_state = self._check(theta, actions, initial_state, allow_outside)
         batch = max(len(theta), len(actions), len(initial_state))
+        goals = self._check_goals(batch, goals)
         dts, names = self._check_lanes(batch, dt, logs)
         theta, actions, initial_state = (
             np.broadcast_to(a, (batch, *a.shape[1:])) for a in (theta, actions, initial_state)
         )
         steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(d) for d in dts.tolist()), strict=True))
         horizon = actions.shape[1]
-        states = np.empty((batch, horizon + 1, self.state_size))
-        observations = np.empty((batch, horizon + 1, len(self.environment.channels)))
-        sound = np.empty((batch, horizon + 1), bool)
+        whole = _Motion.empty(batch, horizon, self)
         with _quiet():
             for skip, chunk in self._chunks(steps, horizon):
                 lanes = self._models(theta[chunk], timesteps[chunk], [names[i] for i in chunk])
-                states[chunk], observations[chunk], sound[chunk] = self._run(
-                    skip, lanes, timesteps[chunk], actions[chunk], initial_state[chunk]
+                targets = None if goals is None else goals[chunk]
+                part = self._run(skip, lanes, timesteps[chunk], actions[chunk], initial_state[chunk], targets)
+                whole.states[chunk], whole.observations[chunk], whole.sound[chunk] = (
+                    part.states,
+                    part.observations,
+                    part.sound,
                 )
-        valid = np.logical_and.accumulate(sound, axis=1)
+                if whole.derived is not None:
+                    whole.derived[chunk] = part.derived
+        valid = np.logical_and.accumulate(whole.sound, axis=1)
         self.diverged += int((~valid[:, -1]).sum())
         self.control_steps += batch * horizon
         length = np.full(batch, horizon)
-        return Trajectories(observations, actions, dts, length, valid, states, (), self.environment.channels)
+        rewards = self.environment.rewards(whole.states, whole.derived, actions, goals)
+        channels = self.environment.channels
+        return Trajectories(whole.observations, actions, dts, length, valid, whole.states, (), channels, rewards)
 
     def _check(
         self, theta: FloatArray, actions: FloatArray, initial_state: FloatArray, allow_outside: bool
@@ -181,10 +200,19 @@ class Simulator:
             )
         return theta, actions, initial_state
 
+    def _check_goals(self, batch: int, goals: FloatArray | None) -> FloatArray | None:
+        size = self.environment.goal_size
+        if not size and goals is None:
+            return None
+        given = np.atleast_2d(np.asarray(np.empty((1, 0)) if goals is None else goals, float))
+        if given.shape not in ((1, size), (batch, size)):
+            raise ValueError(f"goals: expected ({batch}, {size}), got {given.shape if goals is not None else None}")
+        return np.broadcast_to(given, (batch, size))
+
     def _check_lanes(
         self, batch: int, dt: FloatArray | float | None, logs: Sequence[str | None] | None
     ) -> tuple[FloatArray, list[str | None]]:
-        dts = np.asarray(self.model.opt.timestep if dt is None else dt, float)
+        dts = np.asarray(self.dt if dt is None else dt, float)
         if dts.shape not in ((), (1,), (batch,)):
             raise ValueError(f"dt: expected one number or ({batch},), one for each lane, got shape {dts.shape}")
         if not (np.isfinite(dts) & (dts > 0)).all():
@@ -240,38 +268,107 @@ class Simulator:
         timesteps: FloatArray,
         actions: FloatArray,
         initial_state: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """States (B, T+1, S), observations (B, T+1, O) and which samples (B, T+1) are sound."""
+        goals: FloatArray | None,
+    ) -> _Motion:
+        """Lanes that all take ``skip`` physics steps a control step."""
         environment, (batch, horizon, _) = self.environment, actions.shape
-        states = np.full((batch, horizon + 1, self.state_size), np.nan)
-        observations = np.full((batch, horizon + 1, len(environment.channels)), np.nan)
-        sound = np.zeros((batch, horizon + 1), bool)
+        motion = _Motion.empty(batch, horizon, self)
         run = np.array(self._physical)[lanes] & np.isfinite(initial_state).all(1)
         if not run.any():
-            return states, observations, sound
-        start = initial_state[run]
-        controls = np.repeat(environment.control(self.model, start, actions[run]), skip, axis=1)
+            return motion
+        models = [self._pool[k] for k in lanes[run]]
+        advance = self._stepwise if environment.stepwise else self._open_loop
+        states, derived, sound = advance(skip, models, timesteps[run], actions[run], initial_state[run])
+        targets = None if goals is None else goals[run, None]
+        observations = environment.observe(self.model, states, derived, targets)
+        biases = np.stack([self._biases[k] for k in lanes[run]])[:, None]
+        motion.states[run], motion.observations[run], motion.sound[run] = states, observations + biases, sound
+        if derived is not None and motion.derived is not None:
+            motion.derived[run] = derived
+        return motion
+
+    def _open_loop(
+        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
+        """States (B, T+1, S), sensordata aligned with them (B, T+1, D) and which samples are sound."""
+        environment, horizon = self.environment, actions.shape[1]
+        controls = np.repeat(environment.control(self.model, start, actions), skip, axis=1)
         # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one
         # shows it. Sensordata belongs to the state before the step, so the last sample's comes with the next
         # step as well.
-        if environment.needs_derived or (horizon * skip == 1 and not start[:, 0].all()):
+        aligned = environment.needs_derived and not environment.derived_late
+        if aligned or (horizon * skip == 1 and not start[:, 0].all()):
             controls = np.concatenate([controls, controls[:, -1:]], axis=1)
+        out, sensors = self._native(models, start, controls)
+        states = np.concatenate([start[:, None], out[:, skip - 1 : horizon * skip : skip]], axis=1)
+        derived = None
+        if aligned:
+            derived = sensors[:, ::skip][:, : horizon + 1]
+        elif environment.needs_derived:
+            derived = np.concatenate([sensors[:, :1], sensors[:, skip - 1 : horizon * skip : skip]], axis=1)
+        return states, derived, _sound(states, out, skip, timesteps[:, None], aligned)
+
+    def _stepwise(
+        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
+        """The same for an environment whose control depends on the state."""
+        environment, horizon, own = self.environment, actions.shape[1], self._physics_size
+        states = np.empty((len(start), horizon + 1, start.shape[1]))
+        derived = np.empty((len(start), horizon + 1, self.model.nsensordata))
+        sound = np.ones((len(start), horizon + 1), bool)
+        states[:, 0], derived[:, 0] = start, self._sensors(models, start[:, :own])
+        sound[:, 0] = (np.abs(start) <= _HUGE).all(1)
+        for t in range(horizon):
+            begin = np.ascontiguousarray(states[:, t, :own])
+            control = environment.control(self.model, states[:, t], actions[:, t])
+            out, _ = self._native(models, begin, np.repeat(control[:, None], skip, axis=1))
+            ends = np.stack([begin, out[:, -1]], axis=1)
+            sound[:, t : t + 2] &= _sound(ends, out, skip, timesteps[:, None], False)
+            after = environment.settle(self.model, out[:, -1])
+            before = out[:, -2] if skip > 1 else begin
+            derived[:, t + 1] = self._sensors(models, environment.probe(self.model, before, after))
+            states[:, t + 1, :own], states[:, t + 1, own:] = after, environment.remember(derived[:, t + 1])
+        return states, derived, sound
+
+    def _sensors(self, models: list[Any], states: FloatArray) -> FloatArray:
+        """Sensordata (B, D) of states (B, S), without control."""
+        width = mujoco.mj_stateSize(self.model, self.environment.control_spec)
+        return np.asarray(self._native(models, states, np.zeros((len(states), 1, width)))[1][:, 0])
+
+    def _native(self, models: list[Any], start: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States (B, P, S) and sensordata (B, P, D) of physics steps with controls (B, P, U)."""
         out, sensors = mujoco.rollout.rollout(
-            [self._pool[k] for k in lanes[run]],
+            models,
             self._datas,
             initial_state=start,
             control=controls,
+            control_spec=self.environment.control_spec,
             persistent_pool=True,
         )
-        kept = np.concatenate([start[:, None], out[:, skip - 1 : horizon * skip : skip]], axis=1)
-        derived = sensors[:, ::skip][:, : horizon + 1] if environment.needs_derived else None
-        biases = np.stack([self._biases[k] for k in lanes[run]])
-        states[run], observations[run] = (
-            kept,
-            environment.observe(self.model, kept, derived) + biases[:, None],
+        return out, sensors
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """states (B, T+1, S), observations (B, T+1, O), sound (B, T+1), derived (B, T+1, D) or None; NaN and not sound
+    where a lane was never simulated."""
+
+    states: FloatArray
+    observations: FloatArray
+    sound: BoolArray
+    derived: FloatArray | None
+
+    @classmethod
+    def empty(cls, batch: int, horizon: int, simulator: Simulator) -> _Motion:
+        environment = simulator.environment
+        shape = (batch, horizon + 1)
+        derived = np.full((*shape, simulator.model.nsensordata), np.nan) if environment.needs_derived else None
+        return cls(
+            np.full((*shape, simulator.state_size), np.nan),
+            np.full((*shape, len(environment.channels)), np.nan),
+            np.zeros(shape, bool),
+            derived,
         )
-        sound[run] = _sound(kept, out, skip, timesteps[run, None], environment.needs_derived)
-        return states, observations, sound
 
 
 def _sound(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:

@@ -90,7 +90,7 @@ class Trajectory:
 @dataclass(frozen=True, eq=False)
 class Trajectories(Sequence[Trajectory]):
     """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,),
-    length (B,).
+    length (B,), rewards (B, T) or None, of simulated tasks.
 
     Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first
     sample of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index
@@ -105,6 +105,7 @@ class Trajectories(Sequence[Trajectory]):
     states: FloatArray | None = None
     names: tuple[str, ...] = ()
     channels: tuple[str, ...] = field(default=())
+    rewards: FloatArray | None = None
 
     @classmethod
     def stack(cls, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Trajectories:
@@ -167,6 +168,7 @@ class Trajectories(Sequence[Trajectory]):
             None if self.states is None else self.states[chosen, : steps + 1],
             tuple(self.names[i] for i in chosen) if self.names else (),
             self.channels,
+            None if self.rewards is None else self.rewards[chosen, :steps],
         )
 
     def __iter__(self) -> Iterator[Trajectory]:
@@ -185,6 +187,8 @@ class Trajectories(Sequence[Trajectory]):
         }
         if self.states is not None:
             arrays["states"] = self.states
+        if self.rewards is not None:
+            arrays["rewards"] = self.rewards
         path = Path(path)
         temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
         try:
@@ -203,7 +207,7 @@ class Trajectories(Sequence[Trajectory]):
                 arrays = {key: data[key] for key in data.files}
         except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as error:
             raise ValueError(f"{path}: expected an npz file of trajectories, got {error}") from None
-        if arrays.keys() - {"states"} != needed:
+        if arrays.keys() - {"states", "rewards"} != needed:
             raise ValueError(f"{path}: expected the arrays {sorted(needed)}, got {sorted(arrays)}")
         names, channels = (tuple(str(s) for s in arrays.pop(key)) for key in ("names", "channels"))
         return cls(**arrays, names=names, channels=channels)

@@ -5,7 +5,9 @@ in place, how actions become controls and how states become observations. The en
 batching, threads, model pools and the flagging of diverged rollouts.
 
 To add one: subclass, set ``space``, ``channels`` and ``num_actions``, and define the abstract methods below as pure
-functions of their arguments. ``derived`` is MuJoCo's sensordata, aligned by the engine with the state it belongs to.
+functions of their arguments. ``derived`` is MuJoCo's sensordata, aligned by the engine with the state it belongs to;
+an environment that reproduces a published one may have it ``late``. The benchmark's tasks add rewards, goals and starting
+states (``sipe_bayes.envs.task``).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from sipe_bayes.parameters import ParameterSpace
 
 FloatArray = NDArray[np.float64]
+_CONTROL = 1 << 6  # mjSTATE_CTRL, without importing mujoco here
 
 
 class Environment(ABC):
@@ -29,6 +32,16 @@ class Environment(ABC):
     channels: tuple[str, ...]
     num_actions: int
     needs_derived: bool = False
+    derived_late: bool = False  # derived belongs to the state before the last physics step, as Gymnasium reads it
+    frame_skip: int = 1  # physics steps of a control step where no dt is given
+    stepwise: bool = False  # control needs the state: control steps are simulated one by one
+    memory_size: int = 0  # M, columns of a stepwise environment's states behind MuJoCo's own
+    goal_size: int = 0  # G
+
+    @property
+    def control_spec(self) -> int:
+        """MuJoCo's mjtState bits of what ``control`` returns."""
+        return _CONTROL
 
     @abstractmethod
     def compile(self) -> Any:
@@ -48,11 +61,32 @@ class Environment(ABC):
 
     @abstractmethod
     def control(self, model: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
-        """Controls (..., nu) of actions (..., A)."""
+        """Controls (..., U) of actions (..., A), and of states (..., S) where the environment is ``stepwise``."""
 
     @abstractmethod
-    def observe(self, model: Any, states: FloatArray, derived: FloatArray | None) -> FloatArray:
-        """Observations (..., O) of states (..., S) and sensordata (..., D), without sensor bias."""
+    def observe(
+        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+    ) -> FloatArray:
+        """Observations (..., O) of states (..., S), sensordata (..., D) and goals (..., G), without sensor bias."""
+
+    def rewards(
+        self, states: FloatArray, derived: FloatArray | None, actions: FloatArray, goals: FloatArray | None
+    ) -> FloatArray | None:
+        """Rewards (B, T) of states (B, T+1, S), sensordata (B, T+1, D), actions (B, T, A), goals (B, G); None without."""
+        return None
+
+    def settle(self, model: Any, states: FloatArray) -> FloatArray:
+        """States (B, S) as a stepwise environment edits them after each control step."""
+        return states
+
+    def probe(self, model: Any, before: FloatArray, states: FloatArray) -> FloatArray:
+        """The states (B, S) whose sensordata a stepwise environment reads: of those after a control step and those one
+        physics step ``before``."""
+        return states
+
+    def remember(self, derived: FloatArray) -> FloatArray:
+        """What a stepwise environment keeps of the sensordata (B, D) for its next control: (B, M)."""
+        return derived[:, :0]
 
     def bias(self, values: FloatArray, log: str | None = None) -> FloatArray:
         """Sensor bias (O,) added to every observation."""

@@ -267,7 +267,9 @@ class MjcfEnvironment(Environment):
         controls[..., self._controls] = actions
         return controls
 
-    def observe(self, model: Any, states: FloatArray, derived: FloatArray | None) -> FloatArray:
+    def observe(
+        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+    ) -> FloatArray:
         out = np.empty((*states.shape[:-1], len(self._readers)))
         for k, reader in enumerate(self._readers):
             source = derived if reader.derived else states

@@ -1,0 +1,37 @@
+"""The one list of the benchmark's tasks: name -> module and the function that makes it."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sipe_bayes.envs.task import Task
+
+TASKS = {
+    "FetchPush": ("sipe_bayes.envs.fetch", "push"),
+    "FetchSlide": ("sipe_bayes.envs.fetch", "slide"),
+    "FetchPickAndPlace": ("sipe_bayes.envs.fetch", "pick_and_place"),
+    "Relocate": ("sipe_bayes.envs.adroit", "relocate"),
+    "Door": ("sipe_bayes.envs.adroit", "door"),
+    "HalfCheetahLinks": ("sipe_bayes.envs.half_cheetah", "links"),
+    "HalfCheetahJoints": ("sipe_bayes.envs.half_cheetah", "joints"),
+    "HalfCheetahAllJoints": ("sipe_bayes.envs.half_cheetah", "all_joints"),
+    "HumanoidLinks": ("sipe_bayes.envs.humanoid", "links"),
+    "HumanoidJoints": ("sipe_bayes.envs.humanoid", "joints"),
+    "Hopper": ("sipe_bayes.envs.hopper", "hopper"),
+    "CartPole": ("sipe_bayes.envs.classic", "cart_pole"),
+    "Pendulum": ("sipe_bayes.envs.classic", "pendulum"),
+}
+
+
+def make_task(name: str) -> Task:
+    """The task called ``name``; raises ValueError that suggests the nearest."""
+    if name not in TASKS:
+        close = difflib.get_close_matches(name, TASKS, 1, 0.5)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(TASKS)}"
+        raise ValueError(f"environment: no {name!r}; {hint}")
+    module, function = TASKS[name]
+    task: Task = getattr(importlib.import_module(module), function)()
+    return task

@@ -1,0 +1,189 @@
+"""The benchmark's tasks: an Environment with starting states, rewards, goals, variants and a documented parameter table.
+
+A task is one file of a robot family plus one line in ``sipe_bayes.envs.registry``. Subclass ``Task``; define ``compile``,
+``observe``, ``initial_states`` and ``reward``, and where they apply ``control``, ``terminated``, ``success`` and ``bind``;
+all are pure functions of batches. A function in the same file returns the instance with its parameters, each of which
+describes itself: name, unit, default, bounds, the MuJoCo field it writes, what it does to the motion and what it
+trades off against.
+"""
+
+from __future__ import annotations
+
+import zlib
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.envs.base import Environment
+from sipe_bayes.envs.targets import Target, bind
+from sipe_bayes.parameters import Parameter, ParameterSpace
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Variant = Literal["default", "in_distribution", "out_of_distribution"]
+VARIANTS: tuple[Variant, ...] = ("default", "in_distribution", "out_of_distribution")
+
+_INSIDE = (0.1, 0.9)  # of an in-distribution theta
+_AWAY = 0.1  # its least distance from 0.5
+_OUTSIDE = (0.05, 0.2)  # how far beyond the bounds an out-of-distribution theta lies
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Control steps of any leading shape (...,): states (..., S), derived (..., D) or None, actions (..., A), what
+    followed, and goals (..., G) or None."""
+
+    states: FloatArray
+    derived: FloatArray | None
+    actions: FloatArray
+    next_states: FloatArray
+    next_derived: FloatArray | None
+    goals: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Solved:
+    """When a task counts as solved: the mean return of an episode, or the share of successful ones, at or above
+    ``threshold``."""
+
+    measure: Literal["return", "success"]
+    threshold: float
+
+
+@dataclass(frozen=True, eq=False)
+class Task(Environment):
+    """One of the benchmark's environments. Immutable and picklable.
+
+    parameters: theta = 0.5 is the model as published. episode_steps: control steps of an episode. solved: its threshold.
+    action_low, action_high: bounds of each action, the same for all. reference: the published environment that
+    theta = 0.5 reproduces. outside_sign: per parameter -1 or 1, the side on which the out-of-distribution variant
+    lies; default by a seed of the name.
+    """
+
+    name: str
+    parameters: ParameterSpace
+    summary: str
+    episode_steps: int
+    solved: Solved
+    reference: str = ""
+    action_low: float = -1.0
+    action_high: float = 1.0
+    outside_sign: tuple[int, ...] | None = None
+
+    @property
+    def space(self) -> ParameterSpace:  # type: ignore[override]
+        return self.parameters
+
+    @abstractmethod
+    def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
+        """Starting states (count, S) and goals (count, G), if the task has goals."""
+
+    @abstractmethod
+    def reward(self, step: Transition) -> FloatArray:
+        """(...,)."""
+
+    def rewards(
+        self, states: FloatArray, derived: FloatArray | None, actions: FloatArray, goals: FloatArray | None
+    ) -> FloatArray:
+        before, after = (None, None) if derived is None else (derived[:, :-1], derived[:, 1:])
+        targets = None if goals is None else goals[:, None]
+        return self.reward(Transition(states[:, :-1], before, actions, states[:, 1:], after, targets))
+
+    def terminated(self, step: Transition) -> BoolArray:
+        """(...,): whether the episode ends there; by default never."""
+        return np.zeros(step.actions.shape[:-1], bool)
+
+    def success(self, step: Transition) -> BoolArray | None:
+        """(...,): whether the task is done at the end of the step; None where only the return counts."""
+        return None
+
+    def achieved_goals(self, states: FloatArray, derived: FloatArray | None) -> FloatArray | None:
+        """(..., G): where a goal would have been reached; None without goals."""
+        return None
+
+    def goal_reward(self, achieved: FloatArray, goals: FloatArray) -> FloatArray:
+        """(...,) of achieved and desired goals (..., G), for hindsight relabelling."""
+        raise NotImplementedError(f"{self.name} has no goals")
+
+    def control(self, model: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
+        return actions
+
+    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+        """By default no channel is known to be a column of the state."""
+        return (None,) * len(self.channels)
+
+    @cached_property
+    def published(self) -> Any:
+        """The mujoco.MjModel at theta = 0.5; not to be written to."""
+        return self.compile()
+
+    def bind(self, target: str) -> Target:
+        """How a parameter's target is written; override for targets of the family's own, such as links."""
+        return bind(self.published, target)
+
+    @cached_property
+    def _writes(self) -> list[tuple[int, float, Target]]:
+        """(parameter, multiplier, target) in the order they must be done; several targets keep their proportions."""
+        found = []
+        for j, parameter in enumerate(self.parameters):
+            targets = [self.bind(t) for t in parameter.targets]
+            found += [(j, target.value / targets[0].value, target) for target in targets]
+        return sorted(found, key=lambda item: item[2].order)
+
+    @property
+    def needs_constants(self) -> bool:
+        return any(target.constants for _, _, target in self._writes)
+
+    def write(self, model: Any, values: FloatArray, log: str | None = None) -> bool:
+        physical = True
+        for j, multiplier, target in self._writes:
+            value = multiplier * float(values[j])
+            physical &= value >= target.minimum
+            target.write(model, value)
+        return physical
+
+    def theta(self, variant: str) -> FloatArray:
+        """Theta (N,) of a variant; raises ValueError for an unknown one."""
+        if variant not in VARIANTS:
+            raise ValueError(f"variant: no {variant!r}; expected one of {', '.join(VARIANTS)}")
+        n = len(self.parameters)
+        if variant == "default":
+            return np.full(n, 0.5)
+        rng = np.random.default_rng(zlib.crc32(f"{self.name}/{variant}".encode()))
+        sign = rng.choice((-1.0, 1.0), n)
+        if variant == "in_distribution":
+            return 0.5 + sign * rng.uniform(_AWAY, _INSIDE[1] - 0.5, n)
+        sign = sign if self.outside_sign is None else np.array(self.outside_sign, float)
+        return 0.5 + sign * (0.5 + rng.uniform(*_OUTSIDE, n))
+
+    def states(self, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
+        """Physics states (B, S) at time 0 of positions (B, nq) and velocities (B, nv), activations and memory zero."""
+        model, count = self.published, len(qpos)
+        rest = np.zeros((count, model.na + model.nhistory + self.memory_size))
+        return np.concatenate([np.zeros((count, 1)), qpos, qvel, rest], axis=1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+
+def scaled(
+    name: str,
+    default: float,
+    targets: Sequence[str],
+    unit: str,
+    description: str,
+    low: float = 0.5,
+    high: float = 1.5,
+) -> Parameter:
+    """A parameter between ``low`` and ``high`` times the published value, which is theta = 0.5."""
+    return Parameter(
+        name, low * default, high * default, default, unit, targets=tuple(targets), description=description
+    )
