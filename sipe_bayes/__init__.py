@@ -4,6 +4,7 @@
 """
 
 import importlib
+import sys
 from typing import Any
 
 __version__ = "0.1.0"
@@ -15,6 +16,9 @@ _PUBLIC = {
     "Trajectories": "sipe_bayes.trajectory",
     "Channel": "sipe_bayes.envs.mjcf",
     "MjcfEnvironment": "sipe_bayes.envs.mjcf",
+    "make": "sipe_bayes.gym",
+    "make_vec": "sipe_bayes.gym",
+    "make_task": "sipe_bayes.envs.registry",
     "Simulator": "sipe_bayes.simulator",
     "Segments": "sipe_bayes.likelihood",
     "Posterior": "sipe_bayes.posterior",
@@ -32,6 +36,8 @@ __all__ = ["__version__", *_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "gym":
+        return importlib.import_module("sipe_bayes.gym")
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'sipe_bayes' has no attribute {name!r}")
@@ -39,3 +45,7 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+if "gymnasium" in sys.modules:  # its ids are wanted; importing it here would double the time of the import
+    importlib.import_module("sipe_bayes.gym")

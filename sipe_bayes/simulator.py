@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.episodes import Episodes, Step
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.trajectory import Trajectories
 
@@ -88,6 +89,10 @@ class Simulator:
         self._datas = [mujoco.MjData(self.model) for _ in range(self.num_threads)]
         self._physical: list[bool] = []
         self._biases: list[FloatArray] = []
+        self.episodes: Episodes | None = None
+
+    def __reduce__(self) -> Any:
+        return Simulator, (self.environment, self.num_threads)
 
     @property
     def space(self) -> ParameterSpace:
@@ -104,7 +109,7 @@ class Simulator:
         mujoco.mj_getState(self.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if not self.environment.memory_size:
             return state
-        memory = self.environment.remember(self._sensors([self.model], state[None]))
+        memory = self.environment.remember(self.sensors([self.model], state[None]))
         return np.concatenate([state, memory[0]])
 
     @property
@@ -171,14 +176,7 @@ class Simulator:
     def _check(
         self, theta: FloatArray, actions: FloatArray, initial_state: FloatArray, allow_outside: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        theta = np.atleast_2d(self.space.check_shape(theta))
-        if not np.isfinite(theta).all():
-            raise ValueError("theta: expected finite numbers, got NaN or infinity")
-        if not allow_outside and not ((theta >= 0) & (theta <= 1)).all():
-            raise ValueError(
-                f"theta: expected values in [0, 1], got {theta.min():.4g} to {theta.max():.4g}; "
-                "clip them, or pass allow_outside=True"
-            )
+        theta = self.check_theta(np.atleast_2d(theta), allow_outside)
         actions = np.asarray(actions, float)
         if actions.ndim == 2:
             actions = actions[None]
@@ -199,6 +197,18 @@ class Simulator:
                 f"batch sizes differ: theta {len(theta)}, actions {len(actions)}, initial_state {len(initial_state)}"
             )
         return theta, actions, initial_state
+
+    def check_theta(self, theta: FloatArray, allow_outside: bool) -> FloatArray:
+        """theta (B, N); raises ValueError for another shape, NaN, or values outside [0, 1] that are not allowed."""
+        theta = self.space.check_shape(theta)
+        if not np.isfinite(theta).all():
+            raise ValueError("theta: expected finite numbers, got NaN or infinity")
+        if not allow_outside and not ((theta >= 0) & (theta <= 1)).all():
+            raise ValueError(
+                f"theta: expected values in [0, 1], got {theta.min():.4g} to {theta.max():.4g}; "
+                "clip them, or pass allow_outside=True"
+            )
+        return theta
 
     def _check_goals(self, batch: int, goals: FloatArray | None) -> FloatArray | None:
         size = self.environment.goal_size
@@ -251,15 +261,22 @@ class Simulator:
             self._biases.append(np.zeros(len(self.environment.channels)))
         if self._keys[slot] == key:
             return
-        model, self._keys[slot] = self._pool[slot], b""
-        # a number at a time: the last bit of a vectorised exponential may depend on the length of the batch
-        values = np.array([p.value(t) for p, t in zip(self.space, theta.tolist(), strict=True)])
-        self._physical[slot] = self.environment.write(model, values, log)
-        self._biases[slot] = self.environment.bias(values, log)
-        model.opt.timestep = timestep
-        if self._physical[slot] and self.environment.needs_constants:
-            mujoco.mj_setConst(model, self._scratch)
+        self._keys[slot] = b""
+        self._physical[slot] = self._write_into(self._pool[slot], theta, timestep, log)
+        self._biases[slot] = self.environment.bias(self._values(theta), log)
         self._keys[slot] = key
+
+    def _values(self, theta: FloatArray) -> FloatArray:
+        # a number at a time: the last bit of a vectorised exponential may depend on the length of the batch
+        return np.array([p.value(t) for p, t in zip(self.space, theta.tolist(), strict=True)])
+
+    def _write_into(self, model: Any, theta: FloatArray, timestep: float, log: str | None) -> bool:
+        """Write theta (N,) and return whether it is physical."""
+        physical = self.environment.write(model, self._values(theta), log)
+        model.opt.timestep = timestep
+        if physical and self.environment.needs_constants:
+            mujoco.mj_setConst(model, self._scratch)
+        return physical
 
     def _run(
         self,
@@ -277,8 +294,7 @@ class Simulator:
         if not run.any():
             return motion
         models = [self._pool[k] for k in lanes[run]]
-        advance = self._stepwise if environment.stepwise else self._open_loop
-        states, derived, sound = advance(skip, models, timesteps[run], actions[run], initial_state[run])
+        states, derived, sound = self.advance(skip, models, timesteps[run], actions[run], initial_state[run])
         targets = None if goals is None else goals[run, None]
         observations = environment.observe(self.model, states, derived, targets)
         biases = np.stack([self._biases[k] for k in lanes[run]])[:, None]
@@ -286,6 +302,47 @@ class Simulator:
         if derived is not None and motion.derived is not None:
             motion.derived[run] = derived
         return motion
+
+    def advance(
+        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
+    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
+        """States (B, T+1, S), sensordata aligned as the environment has it (B, T+1, D) or None, and which samples
+        (B, T+1) are sound, of lanes with ``models`` and ``skip`` physics steps a control step."""
+        run = self._stepwise if self.environment.stepwise else self._open_loop
+        return run(skip, models, timesteps, actions, start)
+
+    def written(self, theta: FloatArray) -> Any:
+        """A mujoco.MjModel of one's own with theta (N,) written in; raises ValueError for an unphysical one."""
+        model = copy.copy(self.model)
+        if not self._write_into(model, theta, float(model.opt.timestep), None):
+            named = ", ".join(f"{p.name} = {p.value(t):.4g} {p.unit}" for p, t in zip(self.space, theta, strict=True))
+            raise ValueError(f"theta: unphysical parameters ({named}); choose values within the bounds")
+        return model
+
+    def reset(
+        self,
+        theta: FloatArray | None = None,
+        seed: int = 0,
+        count: int | None = None,
+        allow_outside: bool = False,
+    ) -> Step:
+        """Begin episodes in closed loop: theta (B, N) or (N,), default the published model's; count: lanes B where theta
+        does not say. Lane i is seeded with seed + i. Go on with ``step``; ``rollout`` may be used in between."""
+        space = self.space
+        given = space.default_theta if theta is None else space.check_shape(theta)
+        lanes = (1 if given.ndim == 1 else len(given)) if count is None else count
+        if given.ndim == 2 and len(given) != lanes:
+            raise ValueError(f"count: got {lanes} for theta {given.shape}; leave it out or give theta ({len(space)},)")
+        generators = [np.random.default_rng(seed + i) for i in range(lanes)]
+        self.episodes = Episodes(self, given, generators, allow_outside)
+        return self.episodes.first()
+
+    def step(self, actions: FloatArray) -> Step:
+        """One control step of all lanes with actions (B, A); see ``sipe_bayes.episodes``."""
+        if self.episodes is None:
+            raise ValueError("step: nothing has begun yet; call reset first")
+        with _quiet():
+            return self.episodes.step(actions)
 
     def _open_loop(
         self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
@@ -316,7 +373,7 @@ class Simulator:
         states = np.empty((len(start), horizon + 1, start.shape[1]))
         derived = np.empty((len(start), horizon + 1, self.model.nsensordata))
         sound = np.ones((len(start), horizon + 1), bool)
-        states[:, 0], derived[:, 0] = start, self._sensors(models, start[:, :own])
+        states[:, 0], derived[:, 0] = start, self.sensors(models, start)
         sound[:, 0] = (np.abs(start) <= _HUGE).all(1)
         for t in range(horizon):
             begin = np.ascontiguousarray(states[:, t, :own])
@@ -326,14 +383,15 @@ class Simulator:
             sound[:, t : t + 2] &= _sound(ends, out, skip, timesteps[:, None], False)
             after = environment.settle(self.model, out[:, -1])
             before = out[:, -2] if skip > 1 else begin
-            derived[:, t + 1] = self._sensors(models, environment.probe(self.model, before, after))
+            derived[:, t + 1] = self.sensors(models, environment.probe(self.model, before, after))
             states[:, t + 1, :own], states[:, t + 1, own:] = after, environment.remember(derived[:, t + 1])
         return states, derived, sound
 
-    def _sensors(self, models: list[Any], states: FloatArray) -> FloatArray:
+    def sensors(self, models: list[Any], states: FloatArray) -> FloatArray:
         """Sensordata (B, D) of states (B, S), without control."""
         width = mujoco.mj_stateSize(self.model, self.environment.control_spec)
-        return np.asarray(self._native(models, states, np.zeros((len(states), 1, width)))[1][:, 0])
+        own = np.ascontiguousarray(states[:, : self._physics_size])
+        return np.asarray(self._native(models, own, np.zeros((len(states), 1, width)))[1][:, 0])
 
     def _native(self, models: list[Any], start: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States (B, P, S) and sensordata (B, P, D) of physics steps with controls (B, P, U)."""

@@ -1,0 +1,303 @@
+"""One contract over the registry of tasks; nothing here names a task except the published sizes."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import sipe_bayes as sipe
+from sipe_bayes.envs.registry import TASKS, make_task
+from sipe_bayes.envs.task import VARIANTS, Task
+from sipe_bayes.simulator import Simulator
+
+STEPS = 12
+PUBLISHED = {  # parameters, observation, action: Table 1 of the paper, Relocate's 30 actions as the model has them
+    "FetchPush": (2, 31, 4),
+    "FetchSlide": (2, 31, 4),
+    "FetchPickAndPlace": (2, 31, 4),
+    "Relocate": (2, 39, 30),
+    "Door": (7, 39, 28),
+    "HalfCheetahLinks": (5, 17, 6),
+    "HalfCheetahJoints": (15, 17, 6),
+    "HalfCheetahAllJoints": (18, 17, 6),
+    "HumanoidLinks": (17, 376, 17),
+    "HumanoidJoints": (51, 376, 17),
+}
+INERT = {"Door": {"frame_mass"}}
+
+_simulators: dict[str, Simulator] = {}
+
+
+@pytest.fixture(params=TASKS)
+def simulator(request: pytest.FixtureRequest) -> Simulator:
+    name = request.param
+    if name not in _simulators:
+        _simulators[name] = Simulator(make_task(name), num_threads=2)
+    return _simulators[name]
+
+
+@pytest.fixture
+def task(simulator: Simulator) -> Task:
+    assert isinstance(simulator.environment, Task)
+    return simulator.environment
+
+
+class Case:
+    """Random lanes of a task: theta (B, N), actions (B, T, A), start (B, S), goals (B, G) or None."""
+
+    def __init__(self, task: Task, lanes: int = 5, steps: int = STEPS, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.theta = rng.random((lanes, len(task.space)))
+        self.actions = rng.uniform(task.action_low, task.action_high, (lanes, steps, task.num_actions))
+        self.start, self.goals = task.initial_states(rng, lanes)
+
+    def rollout(self, simulator: Simulator, lanes: Any = slice(None)) -> sipe.Trajectories:
+        goals = None if self.goals is None else self.goals[lanes]
+        return simulator.rollout(self.theta[lanes], self.actions[lanes], self.start[lanes], goals=goals)
+
+
+def same(a: sipe.Trajectories, b: sipe.Trajectories) -> None:
+    for name in ("states", "observations", "rewards", "valid"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def test_sizes_are_the_published_ones() -> None:
+    for name, sizes in PUBLISHED.items():
+        task = make_task(name)
+        assert (len(task.space), len(task.channels), task.num_actions) == sizes, name
+
+
+def test_description_is_complete(task: Task) -> None:
+    assert task.name in TASKS and task.summary and task.reference
+    assert task.solved.measure in ("return", "success") and task.episode_steps > 0
+    for parameter in task.space:
+        assert parameter.description and parameter.targets, parameter.name
+        assert parameter.default is not None and float(parameter.normalise(parameter.default)) == pytest.approx(0.5)
+    assert len(set(task.channels)) == len(task.channels)
+
+
+def test_variants(task: Task, simulator: Simulator) -> None:
+    default, inside, outside = (task.theta(v) for v in VARIANTS)
+    assert (default == 0.5).all()
+    assert ((inside >= 0.1) & (inside <= 0.9) & (np.abs(inside - 0.5) >= 0.1)).all()
+    assert ((outside < 0) | (outside > 1)).all()
+    np.testing.assert_array_equal(inside, make_task(task.name).theta("in_distribution"))
+    case = Case(task, lanes=2, steps=min(200, task.episode_steps))
+    case.theta = np.tile(outside, (2, 1))
+    motion = simulator.rollout(case.theta, case.actions, case.start, goals=case.goals, allow_outside=True)
+    assert motion.valid.all(), "the out-of-distribution variant is not stable"
+
+
+def test_same_bits_whatever_the_threads_the_batch_and_the_past(task: Task, simulator: Simulator) -> None:
+    case = Case(task)
+    together = case.rollout(simulator)
+    same(case.rollout(Simulator(task, num_threads=1)), together)
+    order = np.array([3, 0, 4, 2, 1])
+    same(case.rollout(simulator, order), together[order])
+    for lane in (0, 4):
+        same(case.rollout(simulator, slice(lane, lane + 1)), together[[lane]])
+    same(case.rollout(simulator), together)  # after the pool was used for other lanes
+    same(case.rollout(pickle.loads(pickle.dumps(simulator))), together)
+
+
+def test_one_step_windows_and_stepping_give_the_bits_of_a_rollout(task: Task, simulator: Simulator) -> None:
+    case = Case(task)
+    whole = case.rollout(simulator)
+    assert whole.states is not None and whole.rewards is not None
+    step = simulator.reset(case.theta, count=len(case.theta))
+    episodes = simulator.episodes
+    assert episodes is not None
+    episodes.states[:], episodes.observations[:] = case.start, whole.observations[:, 0]
+    if episodes.goals is not None and case.goals is not None:
+        episodes.goals[:] = case.goals
+    if episodes._derived is not None:
+        episodes._derived[:] = simulator.sensors(episodes._models, case.start)
+    for t in range(STEPS):
+        lanes = len(case.theta)
+        window = simulator.rollout(
+            case.theta, case.actions[:, t : t + 1], whole.states[:, t], goals=case.goals, allow_outside=True
+        )
+        assert window.states is not None
+        np.testing.assert_array_equal(window.states[:, 1, 1:], whole.states[:, t + 1, 1:])
+        np.testing.assert_array_equal(window.observations[:, 1], whole.observations[:, t + 1])
+        step = simulator.step(case.actions[:, t])
+        going = ~step.terminated & ~episodes._over
+        np.testing.assert_array_equal(episodes.states[going], whole.states[going, t + 1])
+        np.testing.assert_array_equal(step.observations[going], whole.observations[going, t + 1])
+        np.testing.assert_array_equal(step.rewards[going], whole.rewards[going, t])
+        assert step.observations.shape == (lanes, len(task.channels))
+        if not going.all():
+            break
+
+
+def test_a_diverging_lane_is_marked_and_disturbs_no_other(task: Task, simulator: Simulator) -> None:
+    case = Case(task)
+    before = case.rollout(simulator)
+    wild = Case(task)
+    wild.start[2, 1 + simulator.model.nq] = 1e9  # an enormous velocity
+    after = wild.rollout(simulator)
+    assert not after.valid[2, -1] and after.valid[2, 0]
+    others = np.array([0, 1, 3, 4])
+    same(after[others], before[others])
+    ends = np.flatnonzero(~after.valid[2])
+    assert (np.diff(ends) == 1).all() and ends[-1] == STEPS
+    step = simulator.reset(case.theta)
+    assert simulator.episodes is not None
+    simulator.episodes.states[2] = wild.start[2]
+    for t in range(3):
+        step = simulator.step(case.actions[:, t])
+        if not step.valid[2]:
+            break
+    assert not step.valid[2] and step.terminated[2] and step.rewards[2] == 0
+    assert step.valid[others].all() and np.isfinite(step.observations).all()
+
+
+def test_states_and_derived_are_those_of_plain_mujoco(task: Task, simulator: Simulator) -> None:
+    """The engine against mj_step, one lane: states bit for bit, sensordata of the substep that the task declares."""
+    if task.stepwise:
+        pytest.skip("compared with the published class in its family's test")
+    case = Case(task, lanes=1, steps=3)
+    model, skip = simulator.written(case.theta[0]), task.frame_skip
+    _, derived, _ = simulator.advance(skip, [model], np.array([model.opt.timestep]), case.actions, case.start)
+    whole = case.rollout(simulator)
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, case.start[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    mujoco.mj_forward(model, data)
+    if derived is not None:
+        np.testing.assert_array_equal(derived[0, 0], data.sensordata)
+    for t in range(3):
+        data.ctrl[:] = task.control(model, case.start, case.actions[:, t : t + 1])[0, 0]
+        for _ in range(skip):
+            mujoco.mj_step(model, data)
+        state = np.empty(simulator.state_size)
+        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        assert whole.states is not None
+        np.testing.assert_array_equal(whole.states[0, t + 1], state)
+        if derived is not None:
+            assert task.derived_late
+            np.testing.assert_array_equal(derived[0, t + 1], data.sensordata)
+
+
+def test_writing_leaves_nothing_behind(task: Task, simulator: Simulator) -> None:
+    """A model that held other parameters before equals one that never did, field by field."""
+    rng = np.random.default_rng(1)
+    theta = rng.random(len(task.space))
+    fresh, used = simulator.written(theta), simulator.written(rng.random(len(task.space)))
+    for values in (rng.random(len(task.space)), theta):
+        simulator._write_into(used, values, float(used.opt.timestep), None)
+    for name in dir(fresh):
+        array = getattr(fresh, name)
+        if isinstance(array, np.ndarray):
+            np.testing.assert_allclose(getattr(used, name), array, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_every_parameter_moves_the_task(task: Task, simulator: Simulator) -> None:
+    case = Case(task, lanes=2, steps=40 if task.stepwise else 100)
+    n = len(task.space)
+    theta = np.full((n + 1, n), 0.5)
+    theta[np.arange(n), np.arange(n)] = 0.9
+    still = set(task.space.names)
+    for lane in range(2):
+        motion = simulator.rollout(
+            theta, case.actions[[lane]], case.start[[lane]], goals=None if case.goals is None else case.goals[[lane]]
+        )
+        assert motion.states is not None
+        change = np.abs(motion.states[:-1] - motion.states[-1]).max((1, 2))
+        still -= {p.name for p, c in zip(task.space, change, strict=True) if c > 0}
+    assert still == INERT.get(task.name, set())
+
+
+def test_seeds_and_autoreset(task: Task) -> None:
+    short = dataclasses.replace(task, episode_steps=3)
+    simulator = Simulator(short)
+    first = simulator.reset(seed=5, count=3)
+    again = Simulator(short).reset(seed=6, count=2)
+    np.testing.assert_array_equal(first.observations[1:], again.observations)  # lane i has seed + i
+    simulator.reset(seed=5, count=3)
+    rng = np.random.default_rng(0)
+    for t in range(1, 9):
+        step = simulator.step(rng.uniform(task.action_low, task.action_high, (3, task.num_actions)))
+        over = step.truncated | step.terminated
+        assert not (step.truncated & step.terminated).any()
+        if not step.terminated.any() and t <= 3:
+            assert over.all() == (t == 3)
+        if over.all():
+            begun = simulator.step(np.zeros((3, task.num_actions)))
+            assert (begun.rewards == 0).all() and not begun.truncated.any() and not begun.terminated.any()
+            assert simulator.episodes is not None
+            assert (simulator.episodes.states[:, 0] == simulator.episodes.task.initial_states(rng, 1)[0][0, 0]).all()
+            break
+
+
+@pytest.mark.filterwarnings("ignore:.*")
+def test_gymnasium_environments(task: Task) -> None:
+    env = gymnasium.make(f"sipe/{task.name}-v0")
+    check_env(env.unwrapped, skip_render_check=True)
+    plain: Any = env.unwrapped
+    theta = task.theta("in_distribution")
+    plain.reset(seed=0, options={"theta": theta})
+    np.testing.assert_array_equal(plain.theta, theta)
+    observation, info = plain.reset(seed=0)
+    vector = gymnasium.make_vec(f"sipe/{task.name}-v0", num_envs=2)
+    assert vector.unwrapped.simulator is not None
+    vector.unwrapped.set_parameters(theta)
+    observations, _ = vector.reset(seed=[0, 1])
+    if not task.goal_size:
+        np.testing.assert_array_equal(observations[0], observation)
+    action = plain.action_space.sample()
+    actions = np.stack([action, action])
+    mine, theirs = plain.step(action), vector.step(actions)
+    np.testing.assert_array_equal(theirs[0][0], mine[0])
+    assert theirs[1][0] == mine[1] and info["valid"] is True
+    assert ("success" in mine[4]) == (task.solved.measure == "success")
+    if task.goal_size:
+        achieved, goals = theirs[4]["achieved_goal"], theirs[4]["desired_goal"]
+        assert achieved.shape == goals.shape == (2, task.goal_size)
+        np.testing.assert_array_equal(vector.unwrapped.compute_reward(achieved, goals), theirs[1])
+
+
+def push() -> sipe.Simulator:
+    return _simulators.setdefault("Pendulum", Simulator(make_task("Pendulum"), num_threads=2))
+
+
+BAD: list[tuple[Callable[[], Any], list[str]]] = [
+    (lambda: sipe.make("FetchPsh"), ["FetchPsh", "FetchPush"]),
+    (lambda: sipe.make("FetchPush", variant="defualt"), ["variant", "defualt", "default"]),
+    (lambda: sipe.make_vec("Pendulum", 0), ["num_envs", "0"]),
+    (lambda: push().reset(count=0), ["count", "0"]),
+    (lambda: push().reset(np.full(len(push().space), 1.5)), ["theta", "[0, 1]", "allow_outside"]),
+    (lambda: push().reset(np.zeros(1 + len(push().space))), ["parameters", "shape"]),
+    (lambda: push().reset(np.full(len(push().space), np.nan)), ["theta", "NaN"]),
+    (lambda: push().reset() and push().step(np.full((1, 1), np.nan)), ["actions", "NaN"]),
+    (lambda: push().reset() and push().step(np.zeros((2, 1))), ["actions", "(1, 1)", "(2, 1)"]),
+    (lambda: Simulator(make_task("Pendulum")).step(np.zeros((1, 1))), ["step", "reset"]),
+    (lambda: sipe.make("Pendulum").set_parameters(np.full(len(push().space), 2.0)), ["theta", "[0, 1]"]),
+]
+
+
+@pytest.mark.parametrize("call, words", BAD)
+def test_bad_input(call: Callable[[], Any], words: list[str]) -> None:
+    with pytest.raises(ValueError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message, message
+
+
+def test_stable_baselines3_trains_unchanged() -> None:
+    from stable_baselines3 import DDPG
+
+    env = gymnasium.make("sipe/Pendulum-v0")
+    agent = DDPG("MlpPolicy", env, learning_starts=100, seed=0, device="cpu")
+    agent.learn(300)
+    assert agent.num_timesteps == 300 and agent.replay_buffer is not None and agent.replay_buffer.size() == 300
+    assert np.isfinite(agent.replay_buffer.rewards[:300]).all()
