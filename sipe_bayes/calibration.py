@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
-from sipe_bayes.output import CHECKPOINT, claim, describe_run, release, write_all
+from sipe_bayes.output import CHECKPOINT, RUN, claim, describe_run, release, write_all
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
@@ -51,6 +52,7 @@ class Problem:
     train: Trajectories
     holdout: Trajectories | None
     reports: tuple[LogReport, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def prepare(config: Config | str | Path, num_threads: int | None = None) -> Problem:
@@ -64,15 +66,18 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
     read = [load_log(config, log, dimensions) for log in (*train_logs, *held_logs)]
     trajectories = [t for t, _ in read]
     held = trajectories[len(train_logs) :]
+    reports = tuple(report for _, report in read)
+    prior, doubts = _prior(config, environment.space, reports[: len(train_logs)])
     return Problem(
         config,
         environment,
         Simulator(environment, num_threads),
         _likelihood(config),
-        _prior(config, environment.space),
+        prior,
         Trajectories.stack(trajectories[: len(train_logs)]),
         Trajectories.stack(held) if held else None,
-        tuple(report for _, report in read),
+        reports,
+        doubts,
     )
 
 
@@ -130,11 +135,12 @@ def _likelihood(config: Config) -> Segments:
     )
 
 
-def _prior(config: Config, space: ParameterSpace) -> Posterior:
-    """The parameters' own priors, or an earlier posterior for the parameters that it knows, matched by name."""
+def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) -> tuple[Posterior, tuple[str, ...]]:
+    """The parameters' own priors, or the normal of an earlier posterior for the parameters that it knows, matched by name;
+    and warnings."""
     own = default_prior(space)
     if config.prior is None:
-        return own
+        return own, ()
     earlier = load_posterior(config.prior.source)
     shared = [n for n in space.names if n in earlier.space.names]
     if not shared:
@@ -148,16 +154,37 @@ def _prior(config: Config, space: ParameterSpace) -> Posterior:
     new, old = [space.index(n) for n in shared], [earlier.space.index(n) for n in shared]
     slope, shift = np.empty(len(shared)), np.empty(len(shared))
     for k, (i, j) in enumerate(zip(new, old, strict=True)):
-        if space[i].scale != earlier.space[j].scale:
-            raise ConfigError(
-                f"{config.path}: key `prior.from`: {space[i].name!r} was on a {earlier.space[j].scale} scale there and is on "
-                f"a {space[i].scale} scale here; use the same"
-            )
+        for what in ("scale", "unit"):
+            there, here = getattr(earlier.space[j], what), getattr(space[i], what)
+            if there != here:
+                raise ConfigError(
+                    f"{config.path}: key `prior.from`: {space[i].name!r} had the {what} {there!r} there and has {here!r} here; "
+                    "use the same"
+                )
         ends = space[i].normalise(earlier.space[j].value(np.array([0.0, 1.0])))
         slope[k], shift[k] = ends[1] - ends[0], ends[0]
     mean[new] = shift + slope * old_mean[old]
     covariance[np.ix_(new, new)] = slope[:, None] * old_covariance[np.ix_(old, old)] * slope
-    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
+    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space), _doubts(config, earlier, train)
+
+
+def _doubts(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> tuple[str, ...]:
+    """What is to be said of an earlier posterior as the prior."""
+    assert config.prior is not None
+    doubts = []
+    if isinstance(earlier, GaussianMixture) and len(earlier.means) > 1:
+        doubts.append(
+            f"the earlier posterior has {len(earlier.means)} separate modes; one normal with its mean and covariance stands for it"
+        )
+    record = Path(config.prior.source).parent / RUN
+    if record.is_file():
+        before = set(json.loads(record.read_text(encoding="utf-8")).get("logs_sha256", {}).values())
+        again = [report.name for report in train if report.sha256 in before]
+        if again:
+            doubts.append(
+                f"the earlier posterior has seen {', '.join(again)} already: counted twice, the intervals come out too narrow"
+            )
+    return tuple(doubts)
 
 
 def _method(
@@ -288,7 +315,7 @@ def _warnings(
     conflict: Disagreement | None,
     holdout: Sequence[ChannelScore],
 ) -> list[str]:
-    words = list(method.warnings) + [
+    words = [*problem.warnings, *method.warnings] + [
         f"{p.name}: its targets have different values in the model, so 'the model as given' stands for all at {p.default:.4g} {p.unit}"
         for p in problem.environment.space
         if problem.environment.uneven(p)

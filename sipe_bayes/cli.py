@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sipe_bayes.inference.registry import ESTIMATORS
+
 if TYPE_CHECKING:
     from sipe_bayes.diagnostics.result import Calibration
 
@@ -36,7 +38,9 @@ def _root() -> None:
 @app.command()
 def calibrate(
     config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
-    estimator: Annotated[str | None, typer.Option(help="laplace or mcmc; default: the configuration's.")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help=f"{', '.join(ESTIMATORS)}; default: the configuration's.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Default: the configuration's.")] = None,
     budget: Annotated[int | None, typer.Option(help="Rollouts: logs times parameter values simulated.")] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-ESTIMATOR.")] = None,
@@ -55,12 +59,36 @@ def calibrate(
             found = run(config, estimator, seed, budget, out, threads, progress.update)
         except (ValueError, OSError) as error:
             progress.stop()
+            if type(error).__name__ == "LinAlgError":  # a ValueError to NumPy, but no input is at fault
+                raise
             print(f"sipe: {_one_line(error)}", file=sys.stderr)
             raise typer.Exit(BAD_INPUT) from None
     if as_json:
         print(to_json(found.to_dict()))
     else:
         print_calibration(found)
+
+
+@app.command()
+def envs(
+    name: Annotated[str | None, typer.Argument(help="A task; without it all are listed.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
+) -> None:
+    """The benchmark's environments; with NAME its parameters and how much each moves what is observed."""
+    from sipe_bayes.diagnostics.catalogue import describe, tasks
+    from sipe_bayes.output import to_json
+
+    try:
+        found: Any = tasks() if name is None else describe(name)
+    except ValueError as error:
+        print(f"sipe: {_one_line(error)}", file=sys.stderr)
+        raise typer.Exit(BAD_INPUT) from None
+    if as_json:
+        print(to_json(found))
+    elif name is None:
+        print_tasks(found)
+    else:
+        print_task(found)
 
 
 def _check(option: str, value: int | None, least: int) -> None:
@@ -104,17 +132,69 @@ class Progress:
             self._bar.update(self._task, description=what, completed=rollouts, total=budget)
 
 
+def _console() -> Any:
+    from rich.console import Console
+
+    console = Console(soft_wrap=True)
+    if not console.is_terminal:
+        console.width = _PIPED_WIDTH
+    return console
+
+
+def print_tasks(found: list[dict[str, Any]]) -> None:
+    """One line for every task, on standard output."""
+    from rich.table import Table
+
+    table = Table()
+    for heading in ("environment", "parameters", "observations", "actions", "steps", "solved at", "reproduces"):
+        table.add_column(heading, justify="left" if heading in ("environment", "reproduces") else "right")
+    for t in found:
+        solved = f"{t['solved_by']} {t['solved_at']:g}"
+        sizes = (str(t[k]) for k in ("parameters", "observations", "actions", "episode_steps"))
+        table.add_row(t["name"], *sizes, solved, t["reproduces"])
+    _console().print(table)
+
+
+def print_task(found: dict[str, Any]) -> None:
+    """A task's parameter table, what each does, its sensitivities and what changes nothing, on standard output."""
+    from rich.table import Table
+    from rich.text import Text
+
+    console = _console()
+    console.print(Text(f"{found['name']} ({found['id']}): {found['summary']}"))
+    console.print(
+        Text(
+            f"{found['observations']} observations, {found['actions']} actions, {found['episode_steps']} steps an episode; "
+            f"solved at a {found['solved_by']} of {found['solved_at']:g}; theta = 0.5 is {found['reproduces']}"
+        )
+    )
+    levels = found["sensitivity_at_theta"]
+    table = Table(
+        caption="moved at theta: rms change of the observations, in their spreads, for a 10 % change of the value"
+    )
+    for heading in ("parameter", "default", "from", "to", "unit", "writes", *(f"at {level:g}" for level in levels)):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit", "writes") else "right")
+    for p in found["parameters"]:
+        numbers = (f"{p[k]:.4g}" for k in ("default", "low", "high"))
+        moved = (f"{x:.2g}" for x in p["sensitivity"])
+        table.add_row(p["name"], *numbers, p["unit"], "\n".join(p["writes"]), *moved)
+    console.print(table)
+    for p in found["parameters"]:
+        console.print(Text(f"{p['name']}: {p['description']}"))
+    for name in found["changes_nothing"]:
+        console.print(Text(f"{name} changes nothing that is observed: its posterior should come out as the prior"))
+    for name, where in found["changes_nothing_at_theta"].items():
+        console.print(Text(f"{name} changes nothing at theta = {', '.join(f'{w:g}' for w in where)}"))
+
+
 def print_calibration(found: Calibration) -> None:
     """The table of parameters, the errors, the warnings and where the report lies, on standard output."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     from sipe_bayes.diagnostics.report import parameter_verdict, significant
 
-    console = Console(soft_wrap=True)
-    if not console.is_terminal:
-        console.width = _PIPED_WIDTH
+    console = _console()
     table = Table(title=Text(f"{found.name}: posterior by {found.estimator}"), title_justify="left")
     for heading in ("parameter", "estimate", "90 % interval", "unit", "contraction", "verdict"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit", "verdict") else "right")

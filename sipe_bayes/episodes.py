@@ -62,7 +62,7 @@ class Episodes:
         self.theta = np.full((self.count, len(simulator.space)), np.nan)
         self._models: list[Any] = [None] * self.count
         self.set_theta(np.arange(self.count), theta)
-        derived = simulator.model.nsensordata if task.needs_derived else 0
+        derived = simulator.derived_size if task.needs_derived else 0
         self._timesteps = np.full(self.count, self._timestep)
         self.states = np.zeros((self.count, simulator.state_size))
         self.goals = np.zeros((self.count, task.goal_size)) if task.goal_size else None
@@ -134,7 +134,7 @@ class Episodes:
         goals = None if self.goals is None else self.goals[lanes]
         old = None if self._derived is None else self._derived[lanes]
         states, derived, sound = self.simulator.advance(
-            self._skip, models, self._timesteps[lanes], actions[:, None], before
+            self._skip, models, self._timesteps[lanes], actions[:, None], before, first=False
         )
         after, new = states[:, 1], None if derived is None else derived[:, 1]
         good = np.asarray(sound[:, 0] & sound[:, 1])

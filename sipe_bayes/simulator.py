@@ -11,6 +11,7 @@ back meanwhile: nothing on the terminal, no MUJOCO_LOG.TXT; ``Simulator.diverged
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
 import os
 import threading
@@ -24,6 +25,7 @@ import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes import lanes as by_lane
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.episodes import Episodes, Step
 from sipe_bayes.parameters import ParameterSpace
@@ -35,6 +37,7 @@ BoolArray = NDArray[np.bool_]
 _CHUNK = 2**24  # numbers of state and sensor output held at once, 128 MiB
 _POOL = 2**29  # bytes of models held at once
 _TIME_TOLERANCE = 0.5  # of a physics step
+_FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 _HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
 
 
@@ -102,6 +105,18 @@ class Simulator:
     def state_size(self) -> int:
         """S: the numbers of MuJoCo's full physics state, and of a stepwise environment's memory."""
         return self._physics_size + self.environment.memory_size
+
+    @property
+    def derived_size(self) -> int:
+        """D: the numbers of ``derived``, sensordata or MjData's own."""
+        fields = self.environment.data_fields
+        return by_lane.fields_size(self._scratch, fields) if fields else int(self.model.nsensordata)
+
+    def checksum(self) -> str:
+        """SHA-256 of the compiled default model, with whatever files its MJCF includes."""
+        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, buffer)
+        return hashlib.sha256(buffer.tobytes()).hexdigest()
 
     def default_state(self) -> FloatArray:
         """State (S,) after a reset of the default model."""
@@ -236,7 +251,8 @@ class Simulator:
         """Lanes with as many physics ``steps`` (B,) per control step, no more than the memory holds."""
         for skip in np.unique(steps).tolist():
             group = np.flatnonzero(steps == skip)
-            width = (horizon * skip + 1) * (self.state_size + self.model.nsensordata + self.model.nu)
+            rows = horizon * (1 if self.environment.data_fields else skip) + 1
+            width = rows * (self.state_size + self.derived_size + self.model.nu)
             most = max(self.num_threads, min(_CHUNK // width, _POOL // mujoco.mj_sizeModel(self.model)))
             for chunk in np.array_split(group, math.ceil(len(group) / most)):
                 yield skip, chunk
@@ -304,10 +320,19 @@ class Simulator:
         return motion
 
     def advance(
-        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
+        self,
+        skip: int,
+        models: list[Any],
+        timesteps: FloatArray,
+        actions: FloatArray,
+        start: FloatArray,
+        first: bool = True,
     ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
         """States (B, T+1, S), sensordata aligned as the environment has it (B, T+1, D) or None, and which samples
-        (B, T+1) are sound, of lanes with ``models`` and ``skip`` physics steps a control step."""
+        (B, T+1) are sound, of lanes with ``models`` and ``skip`` physics steps a control step. Without ``first`` the
+        derived quantities of sample 0 may be missing."""
+        if self.environment.data_fields:
+            return self._by_lane(skip, models, timesteps, actions, start, first)
         run = self._stepwise if self.environment.stepwise else self._open_loop
         return run(skip, models, timesteps, actions, start)
 
@@ -371,9 +396,11 @@ class Simulator:
         """The same for an environment whose control depends on the state."""
         environment, horizon, own = self.environment, actions.shape[1], self._physics_size
         states = np.empty((len(start), horizon + 1, start.shape[1]))
-        derived = np.empty((len(start), horizon + 1, self.model.nsensordata))
+        derived = np.empty((len(start), horizon + 1, self.model.nsensordata)) if environment.needs_derived else None
         sound = np.ones((len(start), horizon + 1), bool)
-        states[:, 0], derived[:, 0] = start, self.sensors(models, start)
+        states[:, 0] = start
+        if derived is not None:
+            derived[:, 0] = self.sensors(models, start)
         sound[:, 0] = (np.abs(start) <= _HUGE).all(1)
         for t in range(horizon):
             begin = np.ascontiguousarray(states[:, t, :own])
@@ -383,15 +410,43 @@ class Simulator:
             sound[:, t : t + 2] &= _sound(ends, out, skip, timesteps[:, None], False)
             after = environment.settle(self.model, out[:, -1])
             before = out[:, -2] if skip > 1 else begin
-            derived[:, t + 1] = self.sensors(models, environment.probe(self.model, before, after))
-            states[:, t + 1, :own], states[:, t + 1, own:] = after, environment.remember(derived[:, t + 1])
+            seen = self.sensors(models, environment.probe(self.model, before, after))
+            states[:, t + 1, :own], states[:, t + 1, own:] = after, environment.remember(seen)
+            if derived is not None:
+                derived[:, t + 1] = seen
         return states, derived, sound
+
+    def _by_lane(
+        self,
+        skip: int,
+        models: list[Any],
+        timesteps: FloatArray,
+        actions: FloatArray,
+        start: FloatArray,
+        first: bool,
+    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
+        """The same for an environment that reads MjData itself."""
+        environment = self.environment
+        controls = environment.control(self.model, start, actions)
+        states, derived, clean = by_lane.advance(
+            models, self._datas, environment.data_fields, skip, controls, start, first
+        )
+        return states, derived, clean & _sound(states, states[:, 1:], 1, skip * timesteps[:, None], False)
 
     def sensors(self, models: list[Any], states: FloatArray) -> FloatArray:
         """Sensordata (B, D) of states (B, S), without control."""
+        if self.environment.data_fields:
+            return by_lane.forward(models, self._datas, self.environment.data_fields, states)
         width = mujoco.mj_stateSize(self.model, self.environment.control_spec)
         own = np.ascontiguousarray(states[:, : self._physics_size])
-        return np.asarray(self._native(models, own, np.zeros((len(states), 1, width)))[1][:, 0])
+        flags = int(self.model.opt.disableflags)
+        try:
+            for model in models:
+                model.opt.disableflags = flags | _FORCES if self.environment.kinematic else flags
+            return np.asarray(self._native(models, own, np.zeros((len(states), 1, width)))[1][:, 0])
+        finally:
+            for model in models:
+                model.opt.disableflags = flags
 
     def _native(self, models: list[Any], start: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States (B, P, S) and sensordata (B, P, D) of physics steps with controls (B, P, U)."""
@@ -420,7 +475,7 @@ class _Motion:
     def empty(cls, batch: int, horizon: int, simulator: Simulator) -> _Motion:
         environment = simulator.environment
         shape = (batch, horizon + 1)
-        derived = np.full((*shape, simulator.model.nsensordata), np.nan) if environment.needs_derived else None
+        derived = np.full((*shape, simulator.derived_size), np.nan) if environment.needs_derived else None
         return cls(
             np.full((*shape, simulator.state_size), np.nan),
             np.full((*shape, len(environment.channels)), np.nan),

@@ -379,7 +379,7 @@ def test_output_folder(finished: tuple[Path, Path, Any]) -> None:
     assert (run["status"], run["estimator"], run["seed"]) == ("complete", "laplace", 0)
     assert run["versions"]["mujoco"] == mujoco.__version__
     assert run["config_sha256"] == hashlib.sha256(config.read_bytes()).hexdigest()
-    assert run["model_sha256"] == hashlib.sha256((config.parent / "pendulum.xml").read_bytes()).hexdigest()
+    assert run["model_sha256"] == sipe.prepare(config).simulator.checksum()
     assert run["logs_sha256"]["log"] == hashlib.sha256((config.parent / "log.csv").read_bytes()).hexdigest()
     assert run["configuration"]["window"] == tomllib.loads(CONFIG)["window"]
 

@@ -76,11 +76,15 @@ def test_sizes_are_the_published_ones() -> None:
 
 
 def test_description_is_complete(task: Task) -> None:
-    assert task.name in TASKS and task.summary and task.reference
-    assert task.solved.measure in ("return", "success") and task.episode_steps > 0
+    assert task.name in TASKS
+    assert task.summary
+    assert task.reference
+    assert task.solved.measure in ("return", "success")
+    assert task.episode_steps > 0
     for parameter in task.space:
         assert parameter.description and parameter.targets, parameter.name
-        assert parameter.default is not None and float(parameter.normalise(parameter.default)) == pytest.approx(0.5)
+        assert parameter.default is not None
+        assert float(parameter.normalise(parameter.default)) == pytest.approx(0.5)
     assert len(set(task.channels)) == len(task.channels)
 
 
@@ -105,13 +109,14 @@ def test_same_bits_whatever_the_threads_the_batch_and_the_past(task: Task, simul
     for lane in (0, 4):
         same(case.rollout(simulator, slice(lane, lane + 1)), together[[lane]])
     same(case.rollout(simulator), together)  # after the pool was used for other lanes
-    same(case.rollout(pickle.loads(pickle.dumps(simulator))), together)
+    same(case.rollout(pickle.loads(pickle.dumps(simulator))), together)  # noqa: S301
 
 
 def test_one_step_windows_and_stepping_give_the_bits_of_a_rollout(task: Task, simulator: Simulator) -> None:
     case = Case(task)
     whole = case.rollout(simulator)
-    assert whole.states is not None and whole.rewards is not None
+    assert whole.states is not None
+    assert whole.rewards is not None
     step = simulator.reset(case.theta, count=len(case.theta))
     episodes = simulator.episodes
     assert episodes is not None
@@ -144,11 +149,13 @@ def test_a_diverging_lane_is_marked_and_disturbs_no_other(task: Task, simulator:
     wild = Case(task)
     wild.start[2, 1 + simulator.model.nq] = 1e9  # an enormous velocity
     after = wild.rollout(simulator)
-    assert not after.valid[2, -1] and after.valid[2, 0]
+    assert not after.valid[2, -1]
+    assert after.valid[2, 0]
     others = np.array([0, 1, 3, 4])
     same(after[others], before[others])
     ends = np.flatnonzero(~after.valid[2])
-    assert (np.diff(ends) == 1).all() and ends[-1] == STEPS
+    assert (np.diff(ends) == 1).all()
+    assert ends[-1] == STEPS
     step = simulator.reset(case.theta)
     assert simulator.episodes is not None
     simulator.episodes.states[2] = wild.start[2]
@@ -156,8 +163,11 @@ def test_a_diverging_lane_is_marked_and_disturbs_no_other(task: Task, simulator:
         step = simulator.step(case.actions[:, t])
         if not step.valid[2]:
             break
-    assert not step.valid[2] and step.terminated[2] and step.rewards[2] == 0
-    assert step.valid[others].all() and np.isfinite(step.observations).all()
+    assert not step.valid[2]
+    assert step.terminated[2]
+    assert step.rewards[2] == 0
+    assert step.valid[others].all()
+    assert np.isfinite(step.observations).all()
 
 
 def test_states_and_derived_are_those_of_plain_mujoco(task: Task, simulator: Simulator) -> None:
@@ -231,7 +241,9 @@ def test_seeds_and_autoreset(task: Task) -> None:
             assert over.all() == (t == 3)
         if over.all():
             begun = simulator.step(np.zeros((3, task.num_actions)))
-            assert (begun.rewards == 0).all() and not begun.truncated.any() and not begun.terminated.any()
+            assert (begun.rewards == 0).all()
+            assert not begun.truncated.any()
+            assert not begun.terminated.any()
             assert simulator.episodes is not None
             assert (simulator.episodes.states[:, 0] == simulator.episodes.task.initial_states(rng, 1)[0][0, 0]).all()
             break
@@ -256,7 +268,8 @@ def test_gymnasium_environments(task: Task) -> None:
     actions = np.stack([action, action])
     mine, theirs = plain.step(action), vector.step(actions)
     np.testing.assert_array_equal(theirs[0][0], mine[0])
-    assert theirs[1][0] == mine[1] and info["valid"] is True
+    assert theirs[1][0] == mine[1]
+    assert info["valid"] is True
     assert ("success" in mine[4]) == (task.solved.measure == "success")
     if task.goal_size:
         achieved, goals = theirs[4]["achieved_goal"], theirs[4]["desired_goal"]
@@ -283,9 +296,9 @@ BAD: list[tuple[Callable[[], Any], list[str]]] = [
 ]
 
 
-@pytest.mark.parametrize("call, words", BAD)
+@pytest.mark.parametrize(("call", "words"), BAD)
 def test_bad_input(call: Callable[[], Any], words: list[str]) -> None:
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
         call()
     message = str(caught.value)
     assert "\n" not in message
@@ -299,5 +312,7 @@ def test_stable_baselines3_trains_unchanged() -> None:
     env = gymnasium.make("sipe/Pendulum-v0")
     agent = DDPG("MlpPolicy", env, learning_starts=100, seed=0, device="cpu")
     agent.learn(300)
-    assert agent.num_timesteps == 300 and agent.replay_buffer is not None and agent.replay_buffer.size() == 300
+    assert agent.num_timesteps == 300
+    assert agent.replay_buffer is not None
+    assert agent.replay_buffer.size() == 300
     assert np.isfinite(agent.replay_buffer.rewards[:300]).all()

@@ -32,9 +32,13 @@ class Environment(ABC):
     channels: tuple[str, ...]
     num_actions: int
     needs_derived: bool = False
+    data_fields: tuple[str, ...] = ()  # MjData arrays that are derived in place of sensordata, for what no sensor returns
     derived_late: bool = False  # derived belongs to the state before the last physics step, as Gymnasium reads it
     frame_skip: int = 1  # physics steps of a control step where no dt is given
     stepwise: bool = False  # control needs the state: control steps are simulated one by one
+    kinematic: bool = (
+        False  # a stepwise environment's sensors feel no forces: they are read without contacts and constraints
+    )
     memory_size: int = 0  # M, columns of a stepwise environment's states behind MuJoCo's own
     goal_size: int = 0  # G
 

@@ -174,7 +174,8 @@ class Estimator(ABC):
             "budget": self.budget,
             "likelihood": repr(self.likelihood),
             "space": self.space.to_dict(),
-            "prior": repr(self.prior.gaussian_moments()),
+            "prior": [x.tolist() for x in self.prior.gaussian_moments()],
+            "model": self.simulator.checksum(),
         }
 
     def _fingerprint(self, trajectories: Trajectories) -> str:

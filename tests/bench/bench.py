@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import arm
+import envs
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -214,7 +215,7 @@ def chain() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    tables = ("engine", "rival", "stages", "chain")
+    tables = ("engine", "rival", "stages", "chain", "envs", "memory")
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
     given = parser.parse_args()
@@ -228,6 +229,11 @@ def main() -> None:
             print("\nmujoco.sysid is not installed (pip install 'mujoco[sysid]'): no comparison")
         elif name == "chain":
             chain()
+        elif name == "memory":
+            envs.memory()
+        elif name == "envs":
+            envs.table(max(given.pairs, 7), side_by_side)
+            envs.against_parsing(max(given.pairs, 7), side_by_side)
         else:
             {"engine": engine, "rival": rival, "stages": stages}[name](max(given.pairs, 7))
 

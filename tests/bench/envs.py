@@ -1,0 +1,227 @@
+"""The benchmark's environments: tables of `bench.py envs` and `bench.py memory`.
+
+Bare: mujoco.rollout on the published model, parameters written beforehand, controls repeated beforehand, states alone
+read. Everything on 2 threads and 64 lanes.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from sipe_bayes.envs.registry import make_task
+from sipe_bayes.envs.task import Task
+from sipe_bayes.simulator import Simulator
+
+LANES, STEPS, THREADS = 64, 200, 2
+PUBLISHED = {  # task: model file, id of the published environment, bar against its AsyncVectorEnv
+    "HalfCheetahJoints": ("gymnasium/envs/mujoco/assets/half_cheetah.xml", "HalfCheetah-v5", 8.0),
+    "HumanoidJoints": ("gymnasium/envs/mujoco/assets/humanoid.xml", "Humanoid-v4", 2.0),
+    "Relocate": (
+        "gymnasium_robotics/envs/assets/adroit_hand/adroit_relocate.xml",
+        "AdroitHandRelocate-v1",
+        2.5,
+    ),
+    "FetchPush": ("gymnasium_robotics/envs/assets/fetch/push.xml", None, None),
+}
+SideBySide = Callable[[Callable[[int], float], Callable[[int], float], int], tuple[float, float, float]]
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+class Lanes:
+    """One task's lanes, ours and bare."""
+
+    def __init__(self, name: str) -> None:
+        self.simulator = Simulator(make_task(name), num_threads=THREADS)
+        assert isinstance(self.simulator.environment, Task)
+        self.task = self.simulator.environment
+        self.steps = min(STEPS, self.task.episode_steps)
+        rng = np.random.default_rng(0)
+        self.theta = rng.random((LANES, len(self.task.space)))
+        shape = (LANES, self.steps, self.task.num_actions)
+        self.actions = rng.uniform(self.task.action_low, self.task.action_high, shape)
+        self.start, self.goals = self.task.initial_states(rng, LANES)
+        file, self.id, self.bar = PUBLISHED[name]
+        package, _, rest = file.partition("/")
+        spec = importlib.util.find_spec(package)
+        assert spec is not None
+        assert spec.origin is not None
+        self.file = str(Path(spec.origin).parent / rest)
+        self.datas, self.models = self._bare_models()
+        self.controls = self._controls()
+
+    def _bare_models(self) -> tuple[list[Any], list[Any]]:
+        plain, models = mujoco.MjModel.from_xml_path(self.file), []
+        scratch = mujoco.MjData(plain)
+        for row in self.theta:
+            model = mujoco.MjModel.from_xml_path(self.file)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
+            self.task.write(model, self.task.space.values(row))
+            mujoco.mj_setConst(model, scratch)
+            models.append(model)
+        return [mujoco.MjData(plain) for _ in range(THREADS)], models
+
+    def _controls(self) -> np.ndarray:
+        """What the bare rollout is given: of a stepwise task, what our control was."""
+        task, model = self.task, self.simulator.model
+        if not task.stepwise:
+            return np.repeat(task.control(model, self.start, self.actions), task.frame_skip, axis=1)
+        states = self.ours().states
+        rows = [task.control(model, states[:, t], self.actions[:, t]) for t in range(self.steps)]
+        return np.repeat(np.stack(rows, axis=1), task.frame_skip, axis=1)
+
+    def bare(self) -> Any:
+        size = mujoco.mj_stateSize(self.models[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        return mujoco.rollout.rollout(
+            self.models,
+            self.datas,
+            initial_state=self.start[:, :size],
+            control=self.controls,
+            control_spec=self.task.control_spec,
+            persistent_pool=True,
+        )[0]
+
+    def ours(self) -> Any:
+        return self.simulator.rollout(self.theta, self.actions, self.start, goals=self.goals)
+
+    def stepping(self) -> float:
+        """Seconds of the episode in closed loop, without the reset."""
+        self.simulator.reset(self.theta)
+        begin = time.perf_counter()
+        for t in range(self.steps - 1):
+            self.simulator.step(self.actions[:, t])
+        return (time.perf_counter() - begin) * self.steps / (self.steps - 1)
+
+
+def table(pairs: int, side_by_side: SideBySide) -> None:
+    print(f"\nEnvironments: {LANES} lanes x {STEPS} control steps (Fetch: its 50), {THREADS} threads; k env steps/s")
+    print("'rollout', 'stepping' (observations and rewards included): share of the bare speed; bars .90 and .75")
+    print("'theta': share of a rollout that writing new parameters into every lane takes; bar 5 %")
+    print("'async': times the published environment's AsyncVectorEnv of 64 processes, stepping alone (its bar)")
+    heading = ("bare", "rollout", "share", "stepping", "share", "theta")
+    print(f"{'task':<20}" + "".join(f"{h:>10}" for h in heading) + f"{'async':>18}")
+    for name in PUBLISHED:
+        lanes = Lanes(name)
+        total = LANES * lanes.steps
+        a, bare, ratio = side_by_side(lambda _, w=lanes: seconds(w.ours), lambda _, w=lanes: seconds(w.bare), pairs)
+        b, _, stepped = side_by_side(lambda _, w=lanes: w.stepping(), lambda _, w=lanes: seconds(w.bare), pairs)
+        share = np.median([_writing(lanes) for _ in range(pairs)]) / a
+        row = (
+            f"{total / bare / 1e3:.1f}",
+            f"{total / a / 1e3:.1f}",
+            f"{1 / ratio:.2f}",
+            f"{total / b / 1e3:.1f}",
+            f"{1 / stepped:.2f}",
+            f"{100 * share:.1f} %",
+        )
+        against = "" if lanes.id is None else f"{_against_async(lanes, pairs, side_by_side):.1f} ({lanes.bar:g})"
+        print(f"{name:<20}" + "".join(f"{r:>10}" for r in row) + f"{against:>18}")
+
+
+def _writing(lanes: Lanes) -> float:
+    """Seconds to write new theta into 64 pooled models."""
+    rng = np.random.default_rng()
+    simulator, theta = lanes.simulator, rng.random(lanes.theta.shape)
+    timesteps = np.full(LANES, simulator.model.opt.timestep)
+    return seconds(lambda: simulator._models(theta, timesteps, [None] * LANES))
+
+
+def _against_async(lanes: Lanes, pairs: int, side_by_side: SideBySide) -> float:
+    """How many times faster 64 lanes step than 64 processes of the published environment."""
+    if str(lanes.id).startswith("Adroit"):
+        import gymnasium_robotics
+
+        gymnasium.register_envs(gymnasium_robotics)
+    rng = np.random.default_rng(1)
+    other = gymnasium.make_vec(lanes.id, LANES, vectorization_mode="async")
+    other.reset(seed=0)
+    steps = 50
+    actions = rng.uniform(-1, 1, (steps, *other.action_space.shape)).astype(np.float32)
+    lanes.simulator.reset(lanes.theta)
+
+    def theirs(_: int) -> float:
+        return seconds(lambda: [other.step(a) for a in actions])
+
+    def ours(_: int) -> float:
+        return seconds(lambda: [lanes.simulator.step(lanes.actions[:, t]) for t in range(steps)])
+
+    _, _, ratio = side_by_side(ours, theirs, pairs)
+    other.close()
+    return 1 / ratio
+
+
+def _parsing_worker(job: tuple[str, float, np.ndarray, np.ndarray]) -> np.ndarray:
+    """A rollout of the usual design: parse the XML with the new parameter, then step in Python."""
+    file, factor, state, actions = job
+    spec = mujoco.MjSpec.from_file(file)
+    for joint in spec.joints:
+        joint.damping = np.asarray(joint.damping) * factor
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    found = np.empty((len(actions), model.nq + model.nv))
+    for t, action in enumerate(actions):
+        data.ctrl[:] = action
+        mujoco.mj_step(model, data, nstep=5)
+        found[t] = np.concatenate([data.qpos, data.qvel])
+    return found
+
+
+def against_parsing(pairs: int, side_by_side: SideBySide) -> None:
+    lanes = Lanes("HalfCheetahJoints")
+    with multiprocessing.get_context("forkserver").Pool(THREADS) as pool:
+        factors = np.random.default_rng(0).uniform(0.5, 1.5, LANES)
+        jobs = [(lanes.file, f, s, a) for f, s, a in zip(factors, lanes.start, lanes.actions, strict=True)]
+        _, _, ratio = side_by_side(
+            lambda _: seconds(lanes.ours), lambda _: seconds(lambda: pool.map(_parsing_worker, jobs, 4)), pairs
+        )
+    print(
+        f"\nHalf-cheetah, {LANES} rollouts of {STEPS} steps: {1 / ratio:.1f} times as fast as XML parsed anew for each theta"
+    )
+    print(f"and stepped from Python in {THREADS} processes (bar 10)")
+
+
+def memory() -> None:
+    """Resident memory over 10,000 rollouts, then 100,000 rollouts of 50 steps in pieces of 1,000."""
+    simulator = Simulator(make_task("HalfCheetahJoints"), num_threads=THREADS)
+    task = simulator.environment
+    assert isinstance(task, Task)
+    rng = np.random.default_rng(0)
+
+    def piece(count: int, steps: int) -> None:
+        start, _ = task.initial_states(rng, count)
+        simulator.rollout(rng.random((count, len(task.space))), rng.uniform(-1, 1, (count, steps, 6)), start)
+
+    print("\nMemory, half-cheetah (resident MiB)")
+    readings = []
+    for k in range(101):
+        piece(100, 5)
+        if k % 20 == 0:
+            readings.append(_resident())
+    print(f"10,000 rollouts: {', '.join(f'{r:.0f}' for r in readings)} after 100, 2,100, 4,100, 6,100, 8,100, 10,100")
+    begin = time.perf_counter()
+    for _ in range(100):
+        piece(1000, 50)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 2**20)
+    print(f"100,000 rollouts of 50 steps in {time.perf_counter() - begin:.0f} s, peak {peak:.0f} MiB (bar 2,048)")
+
+
+def _resident() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
