@@ -172,15 +172,15 @@ def print_task(found: dict[str, Any]) -> None:
     table = Table(
         caption="moved at theta: rms change of the observations, in their spreads, for a 10 % change of the value"
     )
-    for heading in ("parameter", "default", "from", "to", "unit", "writes", *(f"at {level:g}" for level in levels)):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit", "writes") else "right")
+    for heading in ("parameter", "default", "from", "to", "unit", *(f"at {level:g}" for level in levels)):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
     for p in found["parameters"]:
         numbers = (f"{p[k]:.4g}" for k in ("default", "low", "high"))
         moved = (f"{x:.2g}" for x in p["sensitivity"])
-        table.add_row(p["name"], *numbers, p["unit"], "\n".join(p["writes"]), *moved)
+        table.add_row(p["name"], *numbers, p["unit"], *moved)
     console.print(table)
     for p in found["parameters"]:
-        console.print(Text(f"{p['name']}: {p['description']}"))
+        console.print(Text(f"{p['name']} ({', '.join(p['writes'])}): {p['description']}"))
     for name in found["changes_nothing"]:
         console.print(Text(f"{name} changes nothing that is observed: its posterior should come out as the prior"))
     for name, where in found["changes_nothing_at_theta"].items():

@@ -89,6 +89,7 @@ class Simulator:
         self._pool: list[Any] = []
         self._keys: list[bytes] = []
         self._scratch = mujoco.MjData(self.model)
+        self._threads = mujoco.rollout.Rollout(nthread=self.num_threads if self.num_threads > 1 else 0)
         self._datas = [mujoco.MjData(self.model) for _ in range(self.num_threads)]
         self._physical: list[bool] = []
         self._biases: list[FloatArray] = []
@@ -450,15 +451,22 @@ class Simulator:
 
     def _native(self, models: list[Any], start: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States (B, P, S) and sensordata (B, P, D) of physics steps with controls (B, P, U)."""
-        out, sensors = mujoco.rollout.rollout(
+        batch, steps = controls.shape[:2]
+        out = np.empty((batch, steps, self._physics_size))
+        read = self.environment.needs_derived or self.environment.stepwise
+        sensors = np.empty((batch, steps, self.model.nsensordata)) if read else None
+        self._threads.rollout(
             models,
             self._datas,
-            initial_state=start,
-            control=controls,
+            np.ascontiguousarray(start),
+            np.ascontiguousarray(controls),
             control_spec=self.environment.control_spec,
-            persistent_pool=True,
+            skip_checks=True,
+            nstep=steps,
+            state=out,
+            sensordata=sensors,
         )
-        return out, sensors
+        return out, np.empty((batch, steps, 0)) if sensors is None else sensors
 
 
 @dataclass(frozen=True)

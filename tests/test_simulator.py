@@ -302,13 +302,13 @@ def test_unphysical_parameters_are_never_simulated(
     parameter: Parameter, theta: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lanes = []
-    real: Callable[..., Any] = mujoco.rollout.rollout
+    real: Callable[..., Any] = Simulator._native
 
-    def counted(models: Any, *args: Any, **kwargs: Any) -> Any:
+    def counted(simulator: Simulator, models: Any, *args: Any) -> Any:
         lanes.append(len(models))
-        return real(models, *args, **kwargs)
+        return real(simulator, models, *args)
 
-    monkeypatch.setattr(mujoco.rollout, "rollout", counted)
+    monkeypatch.setattr(Simulator, "_native", counted)
     environment = MjcfEnvironment.build(PENDULUM, [parameter], ["motor"], HINGE)
     simulator, actions = Simulator(environment, 1), np.zeros((1, 3, 1))
     default = float(environment.space.default_theta[0])

@@ -218,7 +218,8 @@ def _ball_radius(model: Any, spec: str) -> Target:
     return Target(spec, "m", radius, write, order=1, constants=True, minimum=0.0)
 
 
-_FRAME_MASS = "Mass of the fixed frame. The frame cannot move, so this changes nothing: expect the prior back."
+_FRAME_MASS = """Mass of the fixed frame. The frame cannot move, so this changes nothing but rounding, which contact may \
+amplify: expect the prior back."""
 _DOOR_MASS = """Mass and, with it, inertia of the door leaf: how slowly it gains and loses speed. Trades off against the \
 latch mass, since the latch hangs on the leaf and turns with it."""
 _LATCH_MASS = """Mass and, with it, inertia of the latch and its handle: it turns with the door, and pulls on the latch \

@@ -36,7 +36,7 @@ _CLEARANCE = 0.1  # metres between gripper and object at the start
 _APPROACH = (-0.498, 0.005, -0.431)  # from the gripper's place in the MJCF to its place at the start, in metres
 _SETTLING = 200  # substeps in which it goes there
 _HIGHEST = 0.45  # metres above the table, of goals in the air
-_FINGERS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
+_FINGER = "robot0:r_gripper_finger_joint"  # the left one's follows it
 
 _GRIP, _LINK, _OBJECT = "robot0:grip", "robot0:gripper_link", "object0"
 _SIGHTS = (  # (name, sensor, kind of object, object, size): the memory's columns, in order
@@ -115,6 +115,10 @@ class Fetch(Task):
         return int(state.mjSTATE_CTRL) | int(state.mjSTATE_MOCAP_POS) | int(state.mjSTATE_MOCAP_QUAT)
 
     def compile(self) -> Any:
+        return self.spec().compile()
+
+    def spec(self) -> Any:
+        """The published mujoco.MjSpec, with a sensor for each sight."""
         spec = mujoco.MjSpec.from_file(str(_assets() / self.scene.file))
         for texture in list(spec.textures):  # a seventh of the model, of which every lane has its own
             spec.delete(texture)
@@ -127,7 +131,7 @@ class Fetch(Task):
                 objtype=getattr(mujoco.mjtObj, f"mjOBJ_{kind}"),
                 objname=seen,
             )
-        return spec.compile()
+        return spec
 
     @cached_property
     def _sights(self) -> dict[str, slice]:
@@ -139,7 +143,7 @@ class Fetch(Task):
     @cached_property
     def _fingers(self) -> tuple[slice, slice]:
         """Columns of the fingers' positions and velocities: right, left."""
-        right = self.published.joint(_FINGERS[0])
+        right = self.published.joint(_FINGER)
         position, velocity = 1 + int(right.qposadr[0]), 1 + self.published.nq + int(right.dofadr[0])
         return slice(position, position + 2), slice(velocity, velocity + 2)
 
@@ -207,14 +211,13 @@ class Fetch(Task):
         """Velocities are per control step, as published."""
         seen = {name: states[..., columns] for name, columns in self._sights.items()}
         period = self.frame_skip * model.opt.timestep
-        grip, place, speed = seen["grip"], seen["object"], seen["grip_velocity"] * period
-        parts = (
-            *(grip, place, place - grip, states[..., self._fingers[0]]),
-            _euler(seen["object_x_axis"], seen["object_y_axis"], seen["object_z_axis"]),
-            *(seen["object_velocity"] * period - speed, seen["object_turning"] * period, speed),
-            *(states[..., self._fingers[1]] * period, place, np.broadcast_to(np.asarray(goals), place.shape)),
-        )
-        return np.concatenate(parts, axis=-1)
+        grip, place, velocity = seen["grip"], seen["object"], seen["grip_velocity"] * period
+        fingers, fingers_velocity = (states[..., columns] for columns in self._fingers)
+        rotation = _euler(seen["object_x_axis"], seen["object_y_axis"], seen["object_z_axis"])
+        relative, turning = seen["object_velocity"] * period - velocity, seen["object_turning"] * period
+        moving = [relative, turning, velocity, fingers_velocity * period]
+        desired = np.broadcast_to(np.asarray(goals), place.shape)
+        return np.concatenate([grip, place, place - grip, fingers, rotation, *moving, place, desired], axis=-1)
 
     def achieved_goals(self, states: FloatArray, derived: FloatArray | None) -> FloatArray:
         """Where the object was seen."""
@@ -260,17 +263,16 @@ def _parameters(friction: float) -> ParameterSpace:
         2.0,
         ["body:object0.mass"],
         "kg",
-        "Mass of the object, its inertia with it: what the gripper feels when it hits, pushes or lifts the object. "
-        "Once the object slides alone, friction slows it as much whatever its mass, and the arm is far stronger than "
-        "what it moves, so the mass shows in collisions and little elsewhere; in a push it trades off against friction.",
+        "Mass of the object, its inertia with it: how far a knock sends it and how much it weighs on a lifting gripper. "
+        "Once it slides alone, its mass no longer matters; a light object and a slippery table both make it go farther.",
     )
     sliding = scaled(
         "sliding_friction",
         friction,
         ["geom:object0.friction", "geom:table0.friction"],
         "1",
-        "Sliding friction between object and table, written to both, as MuJoCo takes the larger. It sets how soon a "
-        "loose object stops and whether a pushed one turns. Above the fingers' own 1 it makes their grip firmer too.",
+        "Sliding friction between object and table, written to both, as MuJoCo takes the larger: how soon a loose object "
+        "stops and how a pushed one turns. Above 1, the fingers' own, it makes their grip firmer too.",
     )
     return ParameterSpace((mass, sliding))
 

@@ -2,24 +2,24 @@
 
 Model, observation and reward are those of Gymnasium's Humanoid-v4 without termination (Tassa, Erez and Todorov,
 Synthesis and Stabilization of Complex Behaviors through Online Trajectory Optimization, 2012,
-https://doi.org/10.1109/IROS.2012.6386025). An episode always lasts 1000 steps of 0.015 s: one that terminates at a fall
-would end after 20 to 60 steps of most policies, too few to infer from. The reward for being upright, 5 a step, is paid
-while the torso is between 1 and 2 m high.
+https://doi.org/10.1109/IROS.2012.6386025). An episode lasts 1000 steps of 0.015 s, fallen or not: with termination most
+policies end it within a second, too soon to infer from. The 5 a step for being upright are paid while the torso is
+between 1 and 2 m high.
 
 The observation's 376 numbers are 45 of position and velocity and 331 that MuJoCo derives: inertia and velocity of every
 body about the centre of mass of the whole robot, actuator and contact forces. The model is integrated with Runge-Kutta,
-and what MjData holds after a step belongs to the last stage of the last physics step, close to the new state but not
-at it. That is what Gymnasium reads, and what is read here. A sensor would give the state before that step instead. In an
-episode's first observation they belong to the starting state.
+and what MjData holds after a step belongs to the last stage of the last physics step: close to the new state, not at it.
+Gymnasium reads that, and so does this task; sensors would give the state before that physics step. The first
+observation of an episode has what belongs to the starting state.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,20 +31,181 @@ from sipe_bayes.parameters import Parameter, ParameterSpace
 
 FloatArray = NDArray[np.float64]
 
-_XYZ = ("x", "y", "z")
 _STEP = 0.015  # s, five physics steps
 _NOISE = 0.01  # half-width of the starting state's uniform distribution
 _HEALTHY = (1.0, 2.0)  # heights of the torso in m that are paid for
-_HEALTHY_REWARD, _FORWARD_REWARD, _CONTROL_COST = 5.0, 1.25, 0.1  # a step, per m/s, per squared action
-_NO_SPRING = 0.001  # N m/rad, what stands for "none" in the table of joints without a spring
+_UPRIGHT_REWARD, _FORWARD_REWARD, _CONTROL_COST = 5.0, 1.25, 0.1  # a step, per m/s, per squared action
+_SOLVED = 5000.0  # what 1000 upright steps earn: the robot hardly ever lies, or makes up for it by walking
+
+_HEIGHT = 3  # columns of the state
+_OBSERVED = slice(3, 48)  # qpos without x and y, qvel
+_FORCES = slice(0, 331)  # of the derived numbers: all that is observed
+_CENTRE = 331  # x of the whole robot's centre of mass, the first of subtree_com
+
+_AXES = ("x", "y", "z")
+_MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+_NO_SPRING = 0.001  # N m/rad, stands for the missing spring of the right knee and the elbows
+_MOVES = {
+    "abdomen_y": "bends the waist forward",
+    "abdomen_z": "turns the waist",
+    "abdomen_x": "bends the waist sideways",
+    "hip_x": "spreads the {side} leg",
+    "hip_z": "turns the {side} leg about its length",
+    "hip_y": "swings the {side} leg forward",
+    "knee": "bends the {side} knee",
+    "shoulder1": "swings the {side} arm across the body",
+    "shoulder2": "lifts the {side} arm",
+    "elbow": "bends the {side} elbow",
+}
+_JOINTS = (
+    *("abdomen_y", "abdomen_z", "abdomen_x"),
+    *("right_hip_x", "right_hip_z", "right_hip_y", "right_knee"),
+    *("left_hip_x", "left_hip_z", "left_hip_y", "left_knee"),
+    *("right_shoulder1", "right_shoulder2", "right_elbow"),
+    *("left_shoulder1", "left_shoulder2", "left_elbow"),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Humanoid(Task):
-    """Actions in [-0.4, 0.4], times the gear in N m."""
+    """Actions in [-0.4, 0.4]; times the gear they are torques in N m."""
 
-    frame_skip: ClassVar[int] = 5
-    num_actions: ClassVar[int] = 17
-    needs_derived: ClassVar[bool] = True
-    derived_late: ClassVar[bool] = True
-    data_fields: ClassVar[tuple[str, ...]] = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext", "subtree_com")
+    frame_skip = 5
+    num_actions = 17
+    needs_derived = True
+    derived_late = True
+    data_fields = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext", "subtree_com")
+
+    def compile(self) -> Any:
+        return _compiled()
+
+    @cached_property
+    def channels(self) -> tuple[str, ...]:  # type: ignore[override]
+        model = self.published
+        bodies = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) for i in range(model.nbody)]
+        joints = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, model.njnt)]
+        return (
+            *("torso_z", "torso_qw", "torso_qx", "torso_qy", "torso_qz"),
+            *(f"{joint}_angle" for joint in joints),
+            *(f"root_{kind}_{axis}" for kind in ("velocity", "angular_velocity") for axis in _AXES),
+            *(f"{joint}_velocity" for joint in joints),
+            *(f"{body}_{entry}" for body in bodies for entry in _inertia_entries()),
+            *(f"{body}_{kind}_velocity_{a}" for body in bodies for kind in ("angular", "linear") for a in _AXES),
+            *(f"root_actuator_{kind}_{axis}" for kind in ("force", "torque") for axis in _AXES),
+            *(f"{joint}_actuator_torque" for joint in joints),
+            *(f"{body}_contact_{kind}_{a}" for body in bodies for kind in ("torque", "force") for a in _AXES),
+        )
+
+    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+        observed: list[int | None] = list(range(_OBSERVED.start, _OBSERVED.stop))
+        return tuple(observed + [None] * (len(self.channels) - len(observed)))
+
+    def observe(
+        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+    ) -> FloatArray:
+        assert derived is not None
+        return np.concatenate([states[..., _OBSERVED], derived[..., _FORCES]], axis=-1)
+
+    def reward(self, step: Transition) -> FloatArray:
+        assert step.derived is not None
+        assert step.next_derived is not None
+        forward = (step.next_derived[..., _CENTRE] - step.derived[..., _CENTRE]) / _STEP
+        height = step.next_states[..., _HEIGHT]
+        upright = (height > _HEALTHY[0]) & (height < _HEALTHY[1])
+        effort = np.einsum("...a,...a->...", step.actions, step.actions)
+        return np.asarray(_FORWARD_REWARD * forward + _UPRIGHT_REWARD * upright - _CONTROL_COST * effort)
+
+    def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
+        model = self.published
+        qpos = model.qpos0 + rng.uniform(-_NOISE, _NOISE, (count, model.nq))
+        return self.states(qpos, rng.uniform(-_NOISE, _NOISE, (count, model.nv))), None
+
+    def bind(self, target: str) -> Target:
+        return _bind(self.published, target)
+
+
+def humanoid_file() -> Path:
+    """Gymnasium's humanoid.xml, found without importing Gymnasium."""
+    found = importlib.util.find_spec("gymnasium")
+    if found is None or found.origin is None:
+        raise FileNotFoundError("the humanoid's model is Gymnasium's: pip install gymnasium")
+    return Path(found.origin).parent / "envs/mujoco/assets/humanoid.xml"
+
+
+def _compiled() -> Any:
+    spec = mujoco.MjSpec.from_file(str(humanoid_file()))
+    spec.compiler.discardvisual = True  # textures, twelve times the size of the rest
+    return spec.compile()
+
+
+def _inertia_entries() -> list[str]:
+    return [*(f"inertia_{m}" for m in _MOMENTS), *(f"mass_offset_{a}" for a in _AXES), "mass"]
+
+
+def _bind(model: Any, target: str) -> Target:
+    """A joint without a spring has 0.001 N m/rad stand for none, and the difference is written: theta = 0.5 is the
+    published model, and the motion follows the parameter without a jump."""
+    bound = bind(model, target)
+    if bound.value or not target.endswith(".stiffness"):
+        return bound
+
+    def write(other: Any, value: float) -> None:
+        bound.write(other, value - _NO_SPRING)
+
+    return replace(bound, value=_NO_SPRING, write=write)
+
+
+def _parameter(model: Any, name: str, target: str, unit: str, description: str) -> Parameter:
+    return scaled(name, _bind(model, target).value, [target], unit, description)
+
+
+def _joint_parameters(model: Any, joint: str) -> list[Parameter]:
+    """Damping, stiffness and gear of a joint."""
+    side, _, kind = joint.partition("_") if joint not in _MOVES else ("", "", joint)
+    moves = _MOVES[kind].format(side=side)
+    spring = (
+        f"Pulls the joint that {moves} back to its rest angle. In slow motion it trades off against the gear."
+        if model.joint(joint).stiffness[0]
+        else f"The published joint that {moves} has no spring: 0.001 stands for none and only the difference to it is "
+        "written, too little to be seen in a log. The posterior should stay the prior."
+    )
+    return [
+        _parameter(
+            model,
+            f"{joint}_damping",
+            f"joint:{joint}.damping",
+            "N m s/rad",
+            f"Brakes the joint that {moves} in proportion to its speed. In fast motion it trades off against the gear.",
+        ),
+        _parameter(model, f"{joint}_stiffness", f"joint:{joint}.stiffness", "N m/rad", spring),
+        _parameter(
+            model,
+            f"{joint}_gear",
+            f"actuator:{joint}.gear",
+            "N m",
+            f"Torque of the joint that {moves} for a unit action. Raised together with damping and stiffness it changes "
+            "little but how the joint answers to inertia and contacts.",
+        ),
+    ]
+
+
+def _humanoid(name: str, summary: str, parameters: list[Parameter]) -> Humanoid:
+    return Humanoid(
+        name=name,
+        parameters=ParameterSpace(parameters),
+        summary=summary,
+        episode_steps=1000,
+        solved=Solved("return", _SOLVED),
+        reference="gymnasium Humanoid-v4 with terminate_when_unhealthy=False",
+        action_low=-0.4,
+        action_high=0.4,
+    )
+
+
+def joints() -> Humanoid:
+    """HumanoidJoints: damping, stiffness and gear of the 17 actuated joints, 51 parameters."""
+    model = _compiled()
+    parameters = [parameter for joint in _JOINTS for parameter in _joint_parameters(model, joint)]
+    summary = "A humanoid walks; damping, stiffness and gear of its 17 joints are unknown."
+    return _humanoid("HumanoidJoints", summary, parameters)

@@ -27,5 +27,11 @@ def estimator_class(name: str) -> type[Estimator]:
 
 
 def get_estimator(simulator: Any, name: str, **settings: Any) -> Estimator:
-    """The estimator called ``name`` on ``simulator``; settings as the class's own (budget, seed, prior, ...)."""
+    """The estimator called ``name`` on ``simulator``, or on the benchmark's task of that name; settings as the class's own
+    (budget, seed, prior, ...)."""
+    if isinstance(simulator, str):
+        from sipe_bayes.envs.registry import make_task
+        from sipe_bayes.simulator import Simulator
+
+        simulator = Simulator(make_task(simulator))
     return estimator_class(name)(simulator, **settings)

@@ -1,0 +1,315 @@
+"""Links of a robot, longer or shorter, in place: geometry, child frames, mass and inertia follow together.
+
+A link is a named capsule or sphere of a moving body. Its target is ``"link:GEOM.length"`` (the distance between the
+centres of a capsule's two ends, m) or ``"link:GEOM.radius"`` (of a sphere, m). Several links may share a body.
+
+The convention. A capsule is stretched along its own axis and keeps its radius; a sphere grows about its centre. What
+is attached to a link moves with the point of its axis that is nearest to it: not at all near the point that stays, as
+far as the end does when it is beyond the end, so a chain stays joined and keeps its offsets sideways. The point that
+stays is
+
+- of a body's first link, the point of its axis nearest to the joint that moves the body (its first hinge or ball joint,
+  or else the origin of its frame);
+- of a further link in the body, which rides on the first, the end of its axis nearer to the first's axis, or the centre
+  where no end is nearer.
+
+Child bodies and sites ride on the link of the body nearest to them: a child where its joint is (the origin of its frame
+where it has none), a site where it is. Frames do not turn, the joints of the body itself, cameras and lights stay.
+Everything moves linearly in the factors by which the links grow.
+
+Mass and inertia follow from the geoms at the density that they have in the model as compiled, with the compiler's own
+conventions: one geom gives the body its frame of inertia, several are added up and diagonalised by ``mju_eig3``.
+MuJoCo's mj_setConst, which must follow, refreshes what else depends on them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.envs.targets import Target, TargetError, bind
+from sipe_bayes.envs.task import FloatArray, Task
+
+_SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+_TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+_TARGET = re.compile(r"^link:(.+)\.(length|radius)$")
+_SAME = 1e-9  # relative, to the compiled model; a distance in m when comparing which is nearer
+_POWERS = np.arange(6)  # mass and moments of inertia are polynomials of a link's factor, up to a sphere's r^5
+
+
+@dataclass(frozen=True)
+class _Group:
+    """A body made of several geoms. rows: of the link arrays; turns (g, 3, 3): from geom to body axes."""
+
+    body: int
+    rows: NDArray[np.int64]
+    turns: FloatArray
+
+
+class Links:
+    """The links of a compiled model's ``bodies``, by default all whose geoms are capsules and spheres.
+
+    model: as published; it is never written to. Raises TargetError where the mass of a body is not that of its geoms.
+    """
+
+    def __init__(self, model: Any, bodies: Sequence[int] | None = None) -> None:
+        self.model = model
+        self._bodies = [b for b in range(1, model.nbody) if _linked(model, b)] if bodies is None else list(bodies)
+        for body in self._bodies:
+            if not _linked(model, body):
+                raise TargetError(f"link: the geoms of body {model.body(body).name!r} are not all capsules and spheres")
+        self._geoms = np.concatenate([_geoms(model, b) for b in self._bodies])
+        self._row = {int(g): i for i, g in enumerate(self._geoms)}
+        self._slot = np.where(model.geom_type[self._geoms] == _SPHERE, 0, 1)
+        self._size = model.geom_size[self._geoms, self._slot]
+        self._children = np.array([b for b in range(model.nbody) if model.body_parentid[b] in self._bodies], int)
+        self._sites = np.array([s for s in range(model.nsite) if model.site_bodyid[s] in self._bodies], int)
+        self._move = self._moves()
+        self._start = np.concatenate(
+            [model.geom_pos[self._geoms], model.body_pos[self._children], model.site_pos[self._sites]]
+        )
+        self._coefficients = self._polynomials()
+        self._at_one = self._coefficients.sum(-1)
+        groups = [self._group(b) for b in self._bodies]
+        self._check(groups)
+        self._single = np.array([g.rows[0] for g in groups if len(g.rows) == 1], int)
+        self._single_bodies = model.geom_bodyid[self._geoms[self._single]]
+        self._groups = [g for g in groups if len(g.rows) > 1]
+
+    def target(self, spec: str) -> Target:
+        """The target ``link:GEOM.length`` or ``link:GEOM.radius``. Its write changes the size of the geom alone:
+        ``refresh`` must follow, once for all links. Raises TargetError."""
+        match = _TARGET.match(spec)
+        if not match:
+            raise TargetError(f"target {spec!r}: expected link:GEOM.length or link:GEOM.radius")
+        name, attribute = match.groups()
+        names = [self.model.geom(int(g)).name for g in self._geoms]
+        if name not in names:
+            close = difflib.get_close_matches(name, names, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"the links are {[n for n in names if n]}"
+            raise TargetError(f"target {spec!r}: no link {name!r}; {hint}")
+        row = names.index(name)
+        geom, slot = int(self._geoms[row]), int(self._slot[row])
+        if (attribute == "radius") != (slot == 0):
+            raise TargetError(f"target {spec!r}: a capsule has a length and a sphere a radius to scale")
+        double = 2.0 if slot else 1.0
+
+        def write(other: Any, value: float) -> None:
+            other.geom_size[geom, slot] = value / double
+
+        return Target(spec, "m", double * float(self._size[row]), write, constants=True, minimum=1e-6)
+
+    def refresh(self, model: Any) -> None:
+        """Let everything follow the sizes of the links in ``model``, a copy of the published one."""
+        factors = model.geom_size[self._geoms, self._slot] / self._size
+        places = self._start + (self._move @ (factors - 1)).reshape(-1, 3)
+        number, moved = len(self._geoms), len(self._geoms) + len(self._children)
+        model.geom_pos[self._geoms], model.body_pos[self._children] = places[:number], places[number:moved]
+        model.site_pos[self._sites] = places[moved:]
+        inertial = self._inertial(factors)
+        single, bodies = self._single, self._single_bodies
+        ratio = inertial[single] / self._at_one[single]  # so that a factor of 1 leaves every bit
+        model.body_mass[bodies] = self.model.body_mass[bodies] * ratio[:, 0]
+        model.body_inertia[bodies] = self.model.body_inertia[bodies] * ratio[:, 1:]
+        model.body_ipos[bodies] = places[single]
+        for group in self._groups:
+            self._combine(model, group, places[group.rows], inertial[group.rows], factors[group.rows])
+
+    def _inertial(self, factors: FloatArray) -> FloatArray:
+        """Mass and the three moments of inertia of each link (G, 4)."""
+        powers = factors[:, None, None] ** _POWERS
+        return np.asarray((self._coefficients * powers).sum(-1))
+
+    def _combine(
+        self, model: Any, group: _Group, places: FloatArray, inertial: FloatArray, factors: FloatArray
+    ) -> None:
+        """Mass and inertia of a body of several geoms."""
+        body, fields = group.body, ("body_mass", "body_ipos", "body_iquat", "body_inertia")
+        if (factors == 1).all():
+            for field in fields:
+                getattr(model, field)[body] = getattr(self.model, field)[body]
+        else:
+            for field, value in zip(fields, _sum(group.turns, places, inertial), strict=True):
+                getattr(model, field)[body] = value
+
+    def _polynomials(self) -> FloatArray:
+        """Coefficients (G, 4, 6) of the powers of a link's factor in its mass and moments."""
+        model, found = self.model, np.zeros((len(self._geoms), 4, len(_POWERS)))
+        for i, geom in enumerate(self._geoms):
+            radius, half = model.geom_size[geom, :2]
+            ball = 4 / 3 * np.pi * radius**3
+            if self._slot[i] == 0:
+                found[i, 0, 3], found[i, 1:, 5] = ball, 0.4 * ball * radius**2
+                continue
+            length, tube = 2 * half, 2 * np.pi * radius**2 * half
+            found[i, 0, :2] = ball, tube
+            # of the tube and of its two half-balls, whose centres of mass lie 3/8 of the radius beyond its ends
+            across = [
+                0.4 * ball * radius**2,
+                tube * radius**2 / 4 + ball * 3 / 8 * length * radius,
+                ball * length**2 / 4,
+                tube * length**2 / 12,
+            ]
+            found[i, 1, :4] = found[i, 2, :4] = across
+            found[i, 3, :2] = 0.4 * ball * radius**2, tube * radius**2 / 2
+        owner = model.geom_bodyid[self._geoms]
+        volume = np.zeros(model.nbody)
+        np.add.at(volume, owner, found[:, 0].sum(-1))
+        return np.asarray(found * (model.body_mass[owner] / volume[owner])[:, None, None])
+
+    def _group(self, body: int) -> _Group:
+        rows = np.array([self._row[int(g)] for g in _geoms(self.model, body)])
+        return _Group(body, rows, np.stack([_matrix(self.model.geom_quat[self._geoms[i]]) for i in rows]))
+
+    def _moves(self) -> FloatArray:
+        """(3 (G + children + sites), G): how far each place moves as a link's factor grows by one."""
+        model, number = self.model, len(self._geoms)
+        moves = np.zeros((number + len(self._children) + len(self._sites), 3, number))
+        for body in self._bodies:
+            rows = [self._row[int(g)] for g in _geoms(model, body)]
+            axes = [_Axis.of(model, int(self._geoms[i])) for i in rows]
+            stays = [axes[0].nearest(_joint(model, body)), *(axis.seat(axes[0]) for axis in axes[1:])]
+
+            def ride(
+                point: FloatArray, link: int, stays: Any = stays, rows: Any = rows, axes: Any = axes
+            ) -> FloatArray:
+                """How a point that rides on a link of this body moves (3, G)."""
+                found = np.zeros((3, number))
+                found[:, rows[link]] = (axes[link].nearest(point) - stays[link]) * axes[link].direction
+                return found if link == 0 else found + ride(axes[link].at(stays[link]), 0)
+
+            for link, row in enumerate(rows):
+                moves[row] = ride(model.geom_pos[self._geoms[row]], link)
+            for k, child in enumerate(self._children):
+                if model.body_parentid[child] == body:
+                    point = model.body_pos[child] + _matrix(model.body_quat[child]) @ _joint(model, int(child))
+                    moves[number + k] = ride(point, _closest(axes, point))
+            for k, site in enumerate(self._sites):
+                if model.site_bodyid[site] == body:
+                    point = model.site_pos[site]
+                    moves[number + len(self._children) + k] = ride(point, _closest(axes, point))
+        return moves.reshape(-1, number)
+
+    def _check(self, groups: Sequence[_Group]) -> None:
+        """The published model must itself follow from its geoms."""
+        model, inertial = self.model, self._inertial(np.ones(len(self._geoms)))
+        for group in groups:
+            body, rows = group.body, group.rows
+            _, centre, axes, moments = _sum(group.turns, model.geom_pos[self._geoms[rows]], inertial[rows])
+            own = _matrix(model.body_iquat[body]) * model.body_inertia[body] @ _matrix(model.body_iquat[body]).T
+            tensor = _matrix(axes) * moments @ _matrix(axes).T
+            close = np.allclose(own, tensor, rtol=0, atol=_SAME * moments.max())
+            if not close or not np.allclose(centre, model.body_ipos[body], rtol=0, atol=_SAME):
+                raise TargetError(
+                    f"link: the inertia of body {model.body(body).name!r} is not that of its geoms at one density; "
+                    "take its inertial out of the MJCF and give its geoms one density"
+                )
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """The segment between the centres of a capsule's ends, of length 0 for a sphere, in the body's frame."""
+
+    centre: FloatArray
+    direction: FloatArray
+    half: float
+
+    @classmethod
+    def of(cls, model: Any, geom: int) -> _Axis:
+        half = 0.0 if model.geom_type[geom] == _SPHERE else float(model.geom_size[geom, 1])
+        return cls(model.geom_pos[geom].copy(), _matrix(model.geom_quat[geom])[:, 2], half)
+
+    def nearest(self, point: FloatArray) -> float:
+        """Coordinate along the axis, from its centre, of its point nearest to ``point`` (3,)."""
+        return float(np.clip((point - self.centre) @ self.direction, -self.half, self.half))
+
+    def at(self, coordinate: float) -> FloatArray:
+        return self.centre + coordinate * self.direction
+
+    def distance(self, point: FloatArray) -> float:
+        return float(np.linalg.norm(point - self.at(self.nearest(point))))
+
+    def seat(self, first: _Axis) -> float:
+        """Coordinate of the end nearer to another axis, or 0 where none is nearer than the centre."""
+        choices = (0.0, -self.half, self.half)
+        return min(choices, key=lambda c: first.distance(self.at(c)) + (_SAME if c else 0.0))
+
+
+class LinkTask(Task):
+    """A task whose parameters may be links. A body whose link is a parameter has no parameter for its mass."""
+
+    @cached_property
+    def links(self) -> Links | None:
+        """The bodies of the links among the parameters' targets; None without any."""
+        specs = [t for p in self.parameters for t in p.targets if t.startswith("link:")]
+        model = self.published
+        matches = [_TARGET.match(spec) for spec in specs]
+        ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, m.group(1)) for m in matches if m]
+        bodies = sorted({int(model.geom_bodyid[g]) for g in ids if g >= 0})
+        return Links(model, bodies) if bodies else None
+
+    def bind(self, target: str) -> Target:
+        if not target.startswith("link:"):
+            return bind(self.published, target)
+        return (self.links or Links(self.published)).target(target)
+
+    def write(self, model: Any, values: FloatArray, log: str | None = None) -> bool:
+        physical = super().write(model, values, log)
+        if self.links is not None and physical:
+            self.links.refresh(model)
+        return physical
+
+
+def _sum(
+    turns: FloatArray, places: FloatArray, inertial: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Mass, centre of mass, axes (quaternion) and principal moments of geoms with axes ``turns`` (g, 3, 3), centres
+    ``places`` (g, 3) and mass and moments ``inertial`` (g, 4), as the compiler adds them up."""
+    masses = inertial[:, 0]
+    mass = float(masses.sum())
+    centre = masses @ places / mass
+    away = places - centre
+    tensor = ((turns * inertial[:, None, 1:]) @ turns.transpose(0, 2, 1)).sum(0)
+    tensor = tensor + (masses * (away * away).sum(1)).sum() * np.eye(3) - (masses * away.T) @ away
+    moments, axes = np.empty(3), np.empty(4)
+    mujoco.mju_eig3(moments, np.empty(9), axes, tensor.ravel())
+    return mass, centre, axes, moments
+
+
+def _geoms(model: Any, body: int) -> NDArray[np.int64]:
+    first = int(model.body_geomadr[body])
+    return np.arange(first, first + int(model.body_geomnum[body]))
+
+
+def _linked(model: Any, body: int) -> bool:
+    """Whether all geoms of a body are capsules and spheres."""
+    types = model.geom_type[_geoms(model, body)]
+    return bool(len(types)) and bool(np.isin(types, (_SPHERE, _CAPSULE)).all())
+
+
+def _joint(model: Any, body: int) -> FloatArray:
+    """Where the body turns (3,): its first hinge or ball joint, or the origin of its frame."""
+    first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    for joint in range(first, first + count):
+        if int(model.jnt_type[joint]) in _TURNING:
+            return np.asarray(model.jnt_pos[joint], float)
+    return np.zeros(3)
+
+
+def _closest(axes: Sequence[_Axis], point: FloatArray) -> int:
+    """Which axis is nearest to the point; the first of equals."""
+    return min(range(len(axes)), key=lambda i: axes[i].distance(point) + i * _SAME)
+
+
+def _matrix(quaternion: Any) -> FloatArray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
