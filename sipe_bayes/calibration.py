@@ -220,13 +220,19 @@ def calibrate(
     began = time.monotonic()
     method = _method(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
-    tell = progress or (lambda *_: None)
-    tell("checking", method.rollouts, method.budget)
+
+    def tell(what: str) -> None:
+        if progress is not None:
+            progress(what, method.rollouts, method.budget)
+
+    tell("checking what each parameter changes")
     theta = posterior.mode.numpy()
     train = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.train)
     fitted = problem.likelihood.bind(problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
-    conflict = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed)
+    conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed, tell)
+    method.warnings += [f"log {name} could not be fitted by itself; whether it agrees is unknown" for name in skipped]
+    tell("simulating the posterior's band")
     draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(method.seed))
     summaries = _summaries(problem, posterior, draws, dead, conflict)
     found = ridges(problem.environment.space, draws, [p.contraction for p in summaries])

@@ -28,8 +28,8 @@ def alarms(heavier: float, rho: float) -> list[str]:
             ]
         )
         start = simulator.space.normalise(np.array([mass, damping, coulomb]))
-        found = compare_logs(simulator, Segments(0.5), logs, start)
-        named.append("" if found is None else found.parameter)
+        found, _ = compare_logs(simulator, Segments(0.5), logs, start)
+        named.append("" if found is None else found.parameter if "disagree about" in found.text("") else "no single one")
     return named
 
 
@@ -71,6 +71,15 @@ def test_the_most_economical_parameter_is_named() -> None:
     assert found.parameter == "a"
     assert "one says 0.4" in found.text("kg")
     assert "per_log = true" in found.text("kg")
+
+
+def test_two_differences_are_not_put_down_to_one_parameter() -> None:
+    space = ParameterSpace([Parameter("a", unit="kg"), Parameter("b")])
+    first = LogEstimate("one", np.array([0.40, 0.50]), 4000 * np.eye(2))
+    second = LogEstimate("two", np.array([0.60, 0.70]), 4000 * np.eye(2))
+    found = disagreement(space, [first, second])
+    assert found is not None
+    assert "no single parameter explains it" in found.text("kg")
 
 
 def test_a_log_that_says_nothing_disagrees_with_nobody() -> None:

@@ -3,11 +3,13 @@
 With m_k and L_k the optimum and information of log k (starts and its own nuisance parameters marginalised) and mu the
 combined estimate, Q = sum_k (m_k - mu)' L_k (m_k - mu) is chi-square with (K - 1) x (determined directions) degrees of
 freedom when the logs agree (Cochran's test). The parameter named is the one whose freedom to differ between logs lowers
-Q most: the most economical explanation, not merely the largest shift.
+Q most: the most economical explanation, not merely the largest shift. Where even that leaves the logs in disagreement, the
+text says that no single parameter explains it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,16 +40,22 @@ class LogEstimate:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """p: of Cochran's Q under agreement; parameter: its most economical explanation; per_log: (log, value, sd) in the
-    parameter's unit."""
+    """p: of Cochran's Q under agreement; parameter: its most economical explanation; p_left: the same with that parameter
+    free in every log; per_log: (log, value, sd) in the parameter's unit."""
 
     p: float
     parameter: str
+    p_left: float
     per_log: tuple[tuple[str, float, float], ...]
 
     def text(self, unit: str) -> str:
         """In words."""
         parts = ", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log)
+        if self.p_left < LEVEL:
+            return (
+                f"the logs disagree (p = {self.p:.1g}) and no single parameter explains it: the model lacks something that "
+                f"differs between them; {self.parameter} explains most ({parts} {unit})"
+            )
         return (
             f"the logs disagree about {self.parameter} (p = {self.p:.1g}): {parts} {unit}; "
             "give it per_log = true, model what changed, or leave a log out"
@@ -55,18 +63,26 @@ class Disagreement:
 
 
 def compare_logs(
-    simulator: Simulator, likelihood: Segments, trajectories: Trajectories, theta: FloatArray, seed: int = 0
-) -> Disagreement | None:
-    """Fit each log by itself, from theta (N,), and compare; a log that cannot be fitted alone is left out."""
-    estimates = []
+    simulator: Simulator,
+    likelihood: Segments,
+    trajectories: Trajectories,
+    theta: FloatArray,
+    seed: int = 0,
+    tell: Callable[[str], object] = lambda _: None,
+) -> tuple[Disagreement | None, list[str]]:
+    """Fit each log by itself, from theta (N,), and compare; and the names of logs that could not be fitted alone. tell: told
+    what is being done."""
+    estimates, skipped = [], []
     for trajectory in trajectories if len(trajectories) > 1 else ():
+        tell(f"checking log {trajectory.name} by itself")
         alone = Laplace(simulator, likelihood=likelihood, seed=seed, initial=theta, budget=_BUDGET)
         try:
             alone.fit(trajectory)
-        except (ValueError, np.linalg.LinAlgError):
+        except ValueError:  # LinAlgError is one
+            skipped.append(trajectory.name)
             continue
         estimates.append(LogEstimate(trajectory.name, *alone.information()))
-    return disagreement(simulator.space, estimates)
+    return disagreement(simulator.space, estimates), skipped
 
 
 def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
@@ -87,13 +103,14 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
         return None
     gains = [q - _scatter(means, informations, j)[0] for j in range(len(shared))]
     worst = int(np.argmax(gains))
-    values = _scatter(means, informations, worst)[1]
+    left, values = _scatter(means, informations, worst)
+    p_left = float(scipy.stats.chi2.sf(left, max(1, freedom - len(logs) + 1)))
     parameter = space[shared[worst]]
     per_log = []
     for log, (theta, sd) in zip(logs, values, strict=True):
         slope = float(parameter.value(theta + 1e-6) - parameter.value(theta - 1e-6)) / 2e-6
         per_log.append((log.name, float(parameter.value(theta)), sd * slope))
-    return Disagreement(p, parameter.name, tuple(per_log))
+    return Disagreement(p, parameter.name, p_left, tuple(per_log))
 
 
 def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:

@@ -35,23 +35,49 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.envs.targets import Target, TargetError, bind
+from sipe_bayes.envs.targets import Target, TargetError, bind, body_frame_inertia
 from sipe_bayes.envs.task import FloatArray, Task
 
 _SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 _TARGET = re.compile(r"^link:(.+)\.(length|radius)$")
 _SAME = 1e-9  # relative, to the compiled model; a distance in m when comparing which is nearer
-_POWERS = np.arange(6)  # mass and moments of inertia are polynomials of a link's factor, up to a sphere's r^5
+_POWERS = (0, 1, 2, 3, 5)  # of a link's factor in its mass and moments of inertia, the last of a sphere's
+_INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 
 
 @dataclass(frozen=True)
-class _Group:
-    """A body made of several geoms. rows: of the link arrays; turns (g, 3, 3): from geom to body axes."""
+class _Groups:
+    """The bodies (k,) of several geoms each. rows (n,): all their geoms among the links, body by body from ``starts``
+    (k,); body (n,): which of the k; along (n, 3, 3): u u^T of the geom's axis u in the body's frame."""
 
-    body: int
+    bodies: list[int]
     rows: NDArray[np.int64]
-    turns: FloatArray
+    starts: NDArray[np.int64]
+    body: NDArray[np.int64]
+    along: FloatArray
+
+    @classmethod
+    def of(cls, model: Any, bodies: list[int], row: dict[int, int]) -> _Groups:
+        geoms = [_geoms(model, b) for b in bodies]
+        counts = np.array([len(g) for g in geoms], int)
+        flat = np.concatenate([*geoms, np.empty(0, int)]).astype(int)
+        axes = np.array([_matrix(model.geom_quat[g])[:, 2] for g in flat]).reshape(-1, 3)
+        rows = np.array([row[int(g)] for g in flat], int)
+        order = np.repeat(np.arange(len(bodies)), counts)
+        return cls(bodies, rows, np.cumsum(counts) - counts, order, axes[:, :, None] * axes[:, None, :])
+
+    def add(self, places: FloatArray, inertial: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mass (k,), centre of mass (k, 3) and inertia about it (k, 3, 3) of the bodies, of the centres (G, 3) and
+        ``inertial`` (G, 3) of all links."""
+        at, (mass, across, along) = places[self.rows], inertial[self.rows].T
+        total = np.add.reduceat(mass, self.starts)
+        centre = np.add.reduceat(mass[:, None] * at, self.starts) / total[:, None]
+        away = at - centre[self.body]
+        round_ = across + mass * (away * away).sum(1)
+        tensor = round_[:, None, None] * np.eye(3) + (along - across)[:, None, None] * self.along
+        tensor -= (mass[:, None] * away)[:, :, None] * away[:, None, :]
+        return total, centre, np.add.reduceat(tensor, self.starts)
 
 
 class Links:
@@ -77,12 +103,13 @@ class Links:
             [model.geom_pos[self._geoms], model.body_pos[self._children], model.site_pos[self._sites]]
         )
         self._coefficients = self._polynomials()
-        self._at_one = self._coefficients.sum(-1)
-        groups = [self._group(b) for b in self._bodies]
-        self._check(groups)
-        self._single = np.array([g.rows[0] for g in groups if len(g.rows) == 1], int)
-        self._single_bodies = model.geom_bodyid[self._geoms[self._single]]
-        self._groups = [g for g in groups if len(g.rows) > 1]
+        self._check()
+        several = [b for b in self._bodies if model.body_geomnum[b] > 1]
+        self._groups = _Groups.of(model, several, self._row)
+        single = [b for b in self._bodies if model.body_geomnum[b] == 1]
+        self._single = _index([self._row[int(model.body_geomadr[b])] for b in single])
+        self._single_bodies = _index(single)
+        self._slices = _index(self._geoms), _index(self._children), _index(self._sites)
 
     def target(self, spec: str) -> Target:
         """The target ``link:GEOM.length`` or ``link:GEOM.radius``. Its write changes the size of the geom alone:
@@ -112,62 +139,54 @@ class Links:
         factors = model.geom_size[self._geoms, self._slot] / self._size
         places = self._start + (self._move @ (factors - 1)).reshape(-1, 3)
         number, moved = len(self._geoms), len(self._geoms) + len(self._children)
-        model.geom_pos[self._geoms], model.body_pos[self._children] = places[:number], places[number:moved]
-        model.site_pos[self._sites] = places[moved:]
+        geoms, children, sites = self._slices
+        model.geom_pos[geoms], model.body_pos[children] = places[:number], places[number:moved]
+        model.site_pos[sites] = places[moved:]
+        if (factors == 1).all():  # the published model to the last bit
+            for field in _INERTIAL:
+                getattr(model, field)[self._bodies] = getattr(self.model, field)[self._bodies]
+            return
         inertial = self._inertial(factors)
-        single, bodies = self._single, self._single_bodies
-        ratio = inertial[single] / self._at_one[single]  # so that a factor of 1 leaves every bit
-        model.body_mass[bodies] = self.model.body_mass[bodies] * ratio[:, 0]
-        model.body_inertia[bodies] = self.model.body_inertia[bodies] * ratio[:, 1:]
-        model.body_ipos[bodies] = places[single]
-        for group in self._groups:
-            self._combine(model, group, places[group.rows], inertial[group.rows], factors[group.rows])
+        single = inertial[self._single]
+        model.body_mass[self._single_bodies] = single[:, 0]
+        model.body_inertia[self._single_bodies] = single[:, (1, 1, 2)]
+        model.body_ipos[self._single_bodies] = places[self._single]
+        if self._groups.bodies:
+            for body, mass, centre, tensor in zip(
+                self._groups.bodies, *self._groups.add(places, inertial), strict=True
+            ):
+                model.body_mass[body], model.body_ipos[body] = mass, centre
+                mujoco.mju_eig3(model.body_inertia[body], np.empty(9), model.body_iquat[body], tensor.ravel())
 
     def _inertial(self, factors: FloatArray) -> FloatArray:
-        """Mass and the three moments of inertia of each link (G, 4)."""
-        powers = factors[:, None, None] ** _POWERS
-        return np.asarray((self._coefficients * powers).sum(-1))
-
-    def _combine(
-        self, model: Any, group: _Group, places: FloatArray, inertial: FloatArray, factors: FloatArray
-    ) -> None:
-        """Mass and inertia of a body of several geoms."""
-        body, fields = group.body, ("body_mass", "body_ipos", "body_iquat", "body_inertia")
-        if (factors == 1).all():
-            for field in fields:
-                getattr(model, field)[body] = getattr(self.model, field)[body]
-        else:
-            for field, value in zip(fields, _sum(group.turns, places, inertial), strict=True):
-                getattr(model, field)[body] = value
+        """Mass and the moments of inertia across and along the axis of each link (G, 3)."""
+        square = factors * factors
+        cube = square * factors
+        powers = np.stack([np.ones_like(factors), factors, square, cube, cube * square], axis=1)
+        return np.asarray((self._coefficients @ powers[:, :, None])[:, :, 0])
 
     def _polynomials(self) -> FloatArray:
-        """Coefficients (G, 4, 6) of the powers of a link's factor in its mass and moments."""
-        model, found = self.model, np.zeros((len(self._geoms), 4, len(_POWERS)))
+        """Coefficients (G, 3, 5) of the ``_POWERS`` of a link's factor in its mass and moments."""
+        model, found = self.model, np.zeros((len(self._geoms), 3, len(_POWERS)))
         for i, geom in enumerate(self._geoms):
             radius, half = model.geom_size[geom, :2]
             ball = 4 / 3 * np.pi * radius**3
             if self._slot[i] == 0:
-                found[i, 0, 3], found[i, 1:, 5] = ball, 0.4 * ball * radius**2
+                found[i, 0, 3], found[i, 1:, 4] = ball, 0.4 * ball * radius**2
                 continue
             length, tube = 2 * half, 2 * np.pi * radius**2 * half
             found[i, 0, :2] = ball, tube
             # of the tube and of its two half-balls, whose centres of mass lie 3/8 of the radius beyond its ends
-            across = [
+            found[i, 1, :4] = (
                 0.4 * ball * radius**2,
                 tube * radius**2 / 4 + ball * 3 / 8 * length * radius,
                 ball * length**2 / 4,
                 tube * length**2 / 12,
-            ]
-            found[i, 1, :4] = found[i, 2, :4] = across
-            found[i, 3, :2] = 0.4 * ball * radius**2, tube * radius**2 / 2
-        owner = model.geom_bodyid[self._geoms]
-        volume = np.zeros(model.nbody)
+            )
+            found[i, 2, :2] = 0.4 * ball * radius**2, tube * radius**2 / 2
+        owner, volume = model.geom_bodyid[self._geoms], np.zeros(model.nbody)
         np.add.at(volume, owner, found[:, 0].sum(-1))
         return np.asarray(found * (model.body_mass[owner] / volume[owner])[:, None, None])
-
-    def _group(self, body: int) -> _Group:
-        rows = np.array([self._row[int(g)] for g in _geoms(self.model, body)])
-        return _Group(body, rows, np.stack([_matrix(self.model.geom_quat[self._geoms[i]]) for i in rows]))
 
     def _moves(self) -> FloatArray:
         """(3 (G + children + sites), G): how far each place moves as a link's factor grows by one."""
@@ -198,15 +217,13 @@ class Links:
                     moves[number + len(self._children) + k] = ride(point, _closest(axes, point))
         return moves.reshape(-1, number)
 
-    def _check(self, groups: Sequence[_Group]) -> None:
+    def _check(self) -> None:
         """The published model must itself follow from its geoms."""
-        model, inertial = self.model, self._inertial(np.ones(len(self._geoms)))
-        for group in groups:
-            body, rows = group.body, group.rows
-            _, centre, axes, moments = _sum(group.turns, model.geom_pos[self._geoms[rows]], inertial[rows])
-            own = _matrix(model.body_iquat[body]) * model.body_inertia[body] @ _matrix(model.body_iquat[body]).T
-            tensor = _matrix(axes) * moments @ _matrix(axes).T
-            close = np.allclose(own, tensor, rtol=0, atol=_SAME * moments.max())
+        model, groups = self.model, _Groups.of(self.model, self._bodies, self._row)
+        _, centres, tensors = groups.add(model.geom_pos[self._geoms], self._inertial(np.ones(len(self._geoms))))
+        for body, centre, tensor in zip(self._bodies, centres, tensors, strict=True):
+            own = body_frame_inertia(model, body)
+            close = np.allclose(own, tensor, rtol=0, atol=_SAME * own.max())
             if not close or not np.allclose(centre, model.body_ipos[body], rtol=0, atol=_SAME):
                 raise TargetError(
                     f"link: the inertia of body {model.body(body).name!r} is not that of its geoms at one density; "
@@ -268,20 +285,12 @@ class LinkTask(Task):
         return physical
 
 
-def _sum(
-    turns: FloatArray, places: FloatArray, inertial: FloatArray
-) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Mass, centre of mass, axes (quaternion) and principal moments of geoms with axes ``turns`` (g, 3, 3), centres
-    ``places`` (g, 3) and mass and moments ``inertial`` (g, 4), as the compiler adds them up."""
-    masses = inertial[:, 0]
-    mass = float(masses.sum())
-    centre = masses @ places / mass
-    away = places - centre
-    tensor = ((turns * inertial[:, None, 1:]) @ turns.transpose(0, 2, 1)).sum(0)
-    tensor = tensor + (masses * (away * away).sum(1)).sum() * np.eye(3) - (masses * away.T) @ away
-    moments, axes = np.empty(3), np.empty(4)
-    mujoco.mju_eig3(moments, np.empty(9), axes, tensor.ravel())
-    return mass, centre, axes, moments
+def _index(ids: Sequence[int] | NDArray[np.int64]) -> Any:
+    """What indexes the rows ``ids``: a slice where they follow each other, which is several times as fast."""
+    ids = np.asarray(ids, int)
+    if len(ids) and (np.diff(ids) == 1).all():
+        return slice(int(ids[0]), int(ids[-1]) + 1)
+    return ids
 
 
 def _geoms(model: Any, body: int) -> NDArray[np.int64]:
