@@ -124,12 +124,7 @@ def test_leaving_out_what_is_only_seen_changes_no_bit(name: str) -> None:
 
 def compiled(task: Adroit, values: dict[str, float]) -> Any:
     """The model compiled from the XML with the values (in physical units) written into its elements."""
-    spec = task._spec()
-    spec.compiler.discardvisual = True
-    for sensor in list(spec.sensors):
-        spec.delete(sensor)
-    for name, kind in task.places:
-        spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=kind, objname=name)
+    spec = task._simulated(task._spec())
     if task.name == "Relocate":
         mass, radius = values["ball_mass"], values["ball_radius"]
         ball = spec.body("Object")
@@ -175,15 +170,15 @@ def test_in_place_equals_compiled(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["door_as_in_the_table", "relocate"])
 def test_each_parameter_changes_the_motion_over_its_whole_range(name: str) -> None:
-    """From a turning latch and a swinging door, and from a ball that falls on the hand. The frame's mass moves the
+    """From a latch that turns back and a door that swings, and from a ball that falls on the hand. The frame's mass moves the
     centre of mass about which MuJoCo computes: rounding, before contact amplifies it."""
     task = TASKS[name]
     simulator, (qpos, qvel) = Simulator(task), start(task, 0)
     if task.name == "Door":
-        qpos[-2:], qvel[-2:] = (0.3, 0.3), (3.0, 3.0)
+        qpos[-2:], qvel[-2:] = (0.0, 0.6), (3.0, -10.0)
     else:
         qpos[-6:-3] = (0, -0.2, 0.18)
-    horizon = 20 if task.name == "Door" else STEPS
+    horizon = 15 if task.name == "Door" else STEPS
     names, grid = task.space.names, np.array([0, 0.25, 0.5, 0.75, 1])
     for j, parameter in enumerate(names):
         theta = np.full((5, len(names)), 0.5)

@@ -131,7 +131,7 @@ def _equal(written: Any, compiled: Any) -> None:
             np.testing.assert_allclose(getattr(written, field), value, rtol=1e-10, atol=1e-10, err_msg=field)
 
 
-@pytest.mark.parametrize("theta", [(0.0, 1.0), (0.93, 0.14), (0.75, 0.14), (-0.25, 1.2)])
+@pytest.mark.parametrize("theta", [(0.0, 1.0), (0.93, 0.14), (-0.25, 1.2)])
 def test_writing_in_place_equals_compiling(simulator: Simulator, theta: tuple[float, float]) -> None:
     task = simulator.environment
     mass, friction = task.space.values(theta)
@@ -143,9 +143,9 @@ def test_writing_in_place_equals_compiling(simulator: Simulator, theta: tuple[fl
     compiled.opt.disableflags = written.opt.disableflags
     _equal(written, compiled)
 
-    # 500 physics steps of a sliding object. The puck's contacts with the table turn one bit into 1e-8 m at once, so
-    # they can be compared only where both ways round the inertia alike: for masses of a few bits.
-    if (8 * mass) % 1:
+    # 500 physics steps of a sliding object. The puck's contacts with the table turn one bit into 1e-8 m at once, so its
+    # can be compared only where scaling the inertia and computing it anew round alike: powers of two.
+    if task.name == "FetchSlide" and np.log2(mass) % 1:
         return
     start, _ = task.initial_states(np.random.default_rng(0), 1)
     velocity = 1 + written.nq + written.joint("object0:joint").dofadr[0]

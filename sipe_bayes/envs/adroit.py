@@ -71,17 +71,20 @@ class Adroit(Task):
     places: ClassVar[tuple[tuple[str, Any], ...]]  # (name, mjOBJ) of what the sensordata holds the positions of
 
     def compile(self) -> Any:
-        spec = self._spec()
+        return self._simulated(self._spec()).compile()
+
+    def scene(self) -> Any:
+        """The same model with its meshes and textures, to draw; its state is that of the simulated one."""
+        return self._spec().compile()
+
+    def _simulated(self, spec: Any) -> Any:
+        """The spec without what is only seen, measuring what is observed."""
         spec.compiler.discardvisual = True
         for sensor in list(spec.sensors):
             spec.delete(sensor)
         for name, kind in self.places:
             spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=kind, objname=name)
-        return spec.compile()
-
-    def scene(self) -> Any:
-        """The same model with its meshes and textures, to draw; its state is that of the simulated one."""
-        return self._spec().compile()
+        return spec
 
     def _spec(self) -> Any:
         found = importlib.util.find_spec("gymnasium_robotics")  # found, not imported: that is slow
@@ -226,12 +229,12 @@ _LATCH_MASS = """Mass and, with it, inertia of the latch and its handle: it turn
 because it hangs off its axis. Trades off against the door mass and, once the latch turns, its friction loss."""
 _DOOR_FRICTION = """Dry friction of the door hinge: the torque below which the door stands still. Trades off against the \
 door damping unless the door is seen to move at several speeds."""
-_LATCH_FRICTION = """Dry friction of the latch: the torque below which it stays where it is. Trades off against the latch \
-damping unless the latch is seen to turn at several speeds."""
+_LATCH_FRICTION = """Dry friction of the latch: the torque below which it stays where it is, so it shows only while a \
+hand turns the latch. Trades off against the latch damping unless the latch is seen to turn at several speeds."""
 _DOOR_DAMPING = """Friction of the door hinge in proportion to its speed: how soon a swinging door stops. Trades off \
 against the door friction loss."""
-_LATCH_DAMPING = """Friction of the latch in proportion to its speed. Small beside the latch friction loss, against which \
-it trades off, unless the latch turns fast."""
+_LATCH_DAMPING = """Friction of the latch in proportion to its speed: how fast a hand can turn it and how soon it stops. \
+Trades off against the latch friction loss, which hardly shows in a latch that coasts to rest under this damping."""
 _BALL_MASS = """Mass and, with it, inertia of the ball: how it answers a push and how it loads the hand. Shows only \
 while the hand touches it; trades off against the radius, which sets where that happens."""
 _BALL_RADIUS = """Radius of the ball at an unchanged mass, its inertia with the square of it: how high it lies and where \

@@ -221,7 +221,7 @@ class Fetch(Task):
 
     def achieved_goals(self, states: FloatArray, derived: FloatArray | None) -> FloatArray:
         """Where the object was seen."""
-        return states[..., self._sights["object"]]
+        return states[..., self._sights["object"]].copy()
 
     def goal_reward(self, achieved: FloatArray, goals: FloatArray) -> FloatArray:
         """-1, or 0 at the goal; NaN where nothing was simulated."""

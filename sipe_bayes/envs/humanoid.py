@@ -11,6 +11,9 @@ body about the centre of mass of the whole robot, actuator and contact forces. T
 and what MjData holds after a step belongs to the last stage of the last physics step: close to the new state, not at it.
 Gymnasium reads that, and so does this task; sensors would give the state before that physics step. The first
 observation of an episode has what belongs to the starting state.
+
+Episodes start with the torso at 1.4 m, as published, however long the legs are: legs much longer than the model's own
+begin in the ground, which throws the robot up. So the out-of-distribution variant has short ones.
 """
 
 from __future__ import annotations
@@ -25,8 +28,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.envs.links import LinkTask
 from sipe_bayes.envs.targets import Target, bind
-from sipe_bayes.envs.task import Solved, Task, Transition, scaled
+from sipe_bayes.envs.task import Solved, Transition, scaled
 from sipe_bayes.parameters import Parameter, ParameterSpace
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +50,55 @@ _AXES = ("x", "y", "z")
 _MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 _NO_SPRING = 0.001  # N m/rad, stands for the missing spring of the right knee and the elbows
+_TRUNK = (
+    (
+        "torso_width",
+        "torso1",
+        "Distance of the shoulders and mass of the chest. Its mass trades off against that of the upper waist and the head.",
+    ),
+    ("head_radius", "head", "Mass at the top of the trunk. It trades off against that of the chest."),
+    ("upper_waist_width", "uwaist", "Mass low in the torso. It trades off against that of the chest."),
+    ("lower_waist_width", "lwaist", "Mass between the joints of the waist. It trades off against that of the pelvis."),
+    (
+        "pelvis_width",
+        "butt",
+        "Distance of the hips and mass of the pelvis. Its mass trades off against that of the lower waist.",
+    ),
+)
+_LIMBS = (  # once for each side
+    (
+        "thigh_length",
+        "thigh1",
+        "Distance of the {side} knee from the hip, with the mass of the thigh. In the leg's reach it trades off against the shin.",
+    ),
+    (
+        "shin_length",
+        "shin1",
+        "Distance of the {side} foot from the knee, with the mass of the shin. In the leg's reach it trades off against the thigh and the foot.",
+    ),
+    (
+        "foot_radius",
+        "foot",
+        "Height of the {side} ankle above the ground and mass of the foot. In the leg's reach it trades off against the shin.",
+    ),
+    (
+        "upper_arm_length",
+        "uarm1",
+        "Distance of the {side} elbow from the shoulder, with the mass of the upper arm. In the arm's swing it trades off against the lower arm.",
+    ),
+    (
+        "lower_arm_length",
+        "larm",
+        "Distance of the {side} hand from the elbow, with the mass of the lower arm. In the arm's swing it trades off against the hand.",
+    ),
+    (
+        "hand_radius",
+        "hand",
+        "Mass at the end of the {side} arm. In the arm's swing it trades off against the length of the lower arm.",
+    ),
+)
+_OUTSIDE = (1, -1, 1, -1, 1, *(-1, -1, -1, 1, 1, -1), *(-1, -1, -1, 1, 1, -1))  # trunk, right and left limbs
+
 _MOVES = {
     "abdomen_y": "bends the waist forward",
     "abdomen_z": "turns the waist",
@@ -68,7 +121,7 @@ _JOINTS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Humanoid(Task):
+class Humanoid(LinkTask):
     """Actions in [-0.4, 0.4]; times the gear they are torques in N m."""
 
     frame_skip = 5
@@ -122,7 +175,7 @@ class Humanoid(Task):
         return self.states(qpos, rng.uniform(-_NOISE, _NOISE, (count, model.nv))), None
 
     def bind(self, target: str) -> Target:
-        return _bind(self.published, target)
+        return super().bind(target) if target.startswith("link:") else _bind(self.published, target)
 
 
 def humanoid_file() -> Path:
@@ -190,7 +243,9 @@ def _joint_parameters(model: Any, joint: str) -> list[Parameter]:
     ]
 
 
-def _humanoid(name: str, summary: str, parameters: list[Parameter]) -> Humanoid:
+def _humanoid(
+    name: str, summary: str, parameters: list[Parameter], outside_sign: tuple[int, ...] | None = None
+) -> Humanoid:
     return Humanoid(
         name=name,
         parameters=ParameterSpace(parameters),
@@ -200,7 +255,20 @@ def _humanoid(name: str, summary: str, parameters: list[Parameter]) -> Humanoid:
         reference="gymnasium Humanoid-v4 with terminate_when_unhealthy=False",
         action_low=-0.4,
         action_high=0.4,
+        outside_sign=outside_sign,
     )
+
+
+def links() -> Humanoid:
+    """HumanoidLinks: lengths of the capsules and radii of the spheres that the body is made of, 17 parameters."""
+    model = _compiled()
+    parameters = []
+    sides = [(f"{s}_{n}", f"{s}_{g}", d.format(side=s)) for s in ("right", "left") for n, g, d in _LIMBS]
+    for name, geom, description in (*_TRUNK, *sides):
+        ball = model.geom(geom).type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
+        size = float(model.geom(geom).size[0] if ball else 2 * model.geom(geom).size[1])
+        parameters.append(scaled(name, size, [f"link:{geom}.{'radius' if ball else 'length'}"], "m", description))
+    return _humanoid("HumanoidLinks", "A humanoid walks; the sizes of its 17 links are unknown.", parameters, _OUTSIDE)
 
 
 def joints() -> Humanoid:

@@ -42,42 +42,45 @@ _SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 _TARGET = re.compile(r"^link:(.+)\.(length|radius)$")
 _SAME = 1e-9  # relative, to the compiled model; a distance in m when comparing which is nearer
-_POWERS = (0, 1, 2, 3, 5)  # of a link's factor in its mass and moments of inertia, the last of a sphere's
+_POWERS = np.array(
+    [[0], [1], [2], [3], [5]]
+)  # of a link's factor in its mass and moments of inertia, the last of a sphere's
+_UNIT = np.eye(3)
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 
 
 @dataclass(frozen=True)
 class _Groups:
     """The bodies (k,) of several geoms each. rows (n,): all their geoms among the links, body by body from ``starts``
-    (k,); body (n,): which of the k; along (n, 3, 3): u u^T of the geom's axis u in the body's frame."""
+    (k,); shape (n, 2, 9): what the moments of inertia across and along a geom's axis add to its second moments."""
 
     bodies: list[int]
     rows: NDArray[np.int64]
     starts: NDArray[np.int64]
-    body: NDArray[np.int64]
-    along: FloatArray
+    shape: FloatArray
 
     @classmethod
     def of(cls, model: Any, bodies: list[int], row: dict[int, int]) -> _Groups:
         geoms = [_geoms(model, b) for b in bodies]
-        counts = np.array([len(g) for g in geoms], int)
-        flat = np.concatenate([*geoms, np.empty(0, int)]).astype(int)
+        starts = np.cumsum([0] + [len(g) for g in geoms])[:-1]
+        flat = [int(g) for own in geoms for g in own]
         axes = np.array([_matrix(model.geom_quat[g])[:, 2] for g in flat]).reshape(-1, 3)
-        rows = np.array([row[int(g)] for g in flat], int)
-        order = np.repeat(np.arange(len(bodies)), counts)
-        return cls(bodies, rows, np.cumsum(counts) - counts, order, axes[:, :, None] * axes[:, None, :])
+        along = axes[:, :, None] * axes[:, None, :]
+        shape = np.stack([along, _UNIT / 2 - along], axis=1).reshape(-1, 2, 9)
+        return cls(bodies, np.array([row[g] for g in flat], int), starts, shape)
 
     def add(self, places: FloatArray, inertial: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mass (k,), centre of mass (k, 3) and inertia about it (k, 3, 3) of the bodies, of the centres (G, 3) and
         ``inertial`` (G, 3) of all links."""
-        at, (mass, across, along) = places[self.rows], inertial[self.rows].T
-        total = np.add.reduceat(mass, self.starts)
-        centre = np.add.reduceat(mass[:, None] * at, self.starts) / total[:, None]
-        away = at - centre[self.body]
-        round_ = across + mass * (away * away).sum(1)
-        tensor = round_[:, None, None] * np.eye(3) + (along - across)[:, None, None] * self.along
-        tensor -= (mass[:, None] * away)[:, :, None] * away[:, None, :]
-        return total, centre, np.add.reduceat(tensor, self.starts)
+        at, inertial = places[self.rows], inertial[self.rows]
+        moment = inertial[:, :1] * at
+        # second moments C of the mass about the body's origin; the inertia is tr(C) - C
+        second = moment[:, :, None] * at[:, None, :] + (inertial[:, None, 1:] @ self.shape).reshape(-1, 3, 3)
+        second = np.add.reduceat(second, self.starts)
+        total, first = np.add.reduceat(inertial[:, 0], self.starts), np.add.reduceat(moment, self.starts)
+        centre = first / total[:, None]
+        second -= first[:, :, None] * centre[:, None, :]
+        return total, centre, second.trace(axis1=1, axis2=2)[:, None, None] * _UNIT - second
 
 
 class Links:
@@ -95,7 +98,8 @@ class Links:
         self._geoms = np.concatenate([_geoms(model, b) for b in self._bodies])
         self._row = {int(g): i for i, g in enumerate(self._geoms)}
         self._slot = np.where(model.geom_type[self._geoms] == _SPHERE, 0, 1)
-        self._size = model.geom_size[self._geoms, self._slot]
+        self._flat = 3 * self._geoms + self._slot  # in the flattened geom_size
+        self._size = model.geom_size.ravel()[self._flat]
         self._children = np.array([b for b in range(model.nbody) if model.body_parentid[b] in self._bodies], int)
         self._sites = np.array([s for s in range(model.nsite) if model.site_bodyid[s] in self._bodies], int)
         self._move = self._moves()
@@ -136,13 +140,14 @@ class Links:
 
     def refresh(self, model: Any) -> None:
         """Let everything follow the sizes of the links in ``model``, a copy of the published one."""
-        factors = model.geom_size[self._geoms, self._slot] / self._size
-        places = self._start + (self._move @ (factors - 1)).reshape(-1, 3)
+        factors = model.geom_size.ravel()[self._flat] / self._size
+        growth = factors - 1
+        places = self._start + (self._move @ growth).reshape(-1, 3)
         number, moved = len(self._geoms), len(self._geoms) + len(self._children)
         geoms, children, sites = self._slices
         model.geom_pos[geoms], model.body_pos[children] = places[:number], places[number:moved]
         model.site_pos[sites] = places[moved:]
-        if (factors == 1).all():  # the published model to the last bit
+        if not growth.any():  # the published model to the last bit
             for field in _INERTIAL:
                 getattr(model, field)[self._bodies] = getattr(self.model, field)[self._bodies]
             return
@@ -160,10 +165,7 @@ class Links:
 
     def _inertial(self, factors: FloatArray) -> FloatArray:
         """Mass and the moments of inertia across and along the axis of each link (G, 3)."""
-        square = factors * factors
-        cube = square * factors
-        powers = np.stack([np.ones_like(factors), factors, square, cube, cube * square], axis=1)
-        return np.asarray((self._coefficients @ powers[:, :, None])[:, :, 0])
+        return np.asarray((self._coefficients @ factors[:, None, None] ** _POWERS)[:, :, 0])
 
     def _polynomials(self) -> FloatArray:
         """Coefficients (G, 3, 5) of the ``_POWERS`` of a link's factor in its mass and moments."""
