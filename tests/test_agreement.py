@@ -29,7 +29,9 @@ def alarms(heavier: float, rho: float) -> list[str]:
         )
         start = simulator.space.normalise(np.array([mass, damping, coulomb]))
         found, _ = compare_logs(simulator, Segments(0.5), logs, start)
-        named.append("" if found is None else found.parameter if "disagree about" in found.text("") else "no single one")
+        named.append(
+            "" if found is None else found.parameter if "disagree about" in found.text("") else "no single one"
+        )
     return named
 
 

@@ -17,7 +17,7 @@ from sipe_bayes.simulator import Simulator
 from tests.lengthened import compiled, differences, read
 
 TASKS = {"Pendulum": ("rod", "hinge", PENDULUM), "CartPole": ("pole", "slider", CART_POLE)}
-NO_FRICTION = np.array([0.5, 0.5, 0.0])
+NO_FRICTION = np.array([0.5, 0.5, -0.5 + 1e-15])  # rounding must not make it negative
 
 
 @pytest.fixture(params=TASKS)
@@ -38,7 +38,7 @@ def test_parity_of_the_pendulum(seed: int) -> None:
     env.reset()
     env.state = start[0, 1:].copy()
     actions = rng.uniform(-3, 3, (100, 1))  # beyond the motor's limit as well
-    ours = Simulator(task).rollout(NO_FRICTION, actions, start)
+    ours = Simulator(task).rollout(NO_FRICTION, actions, start, allow_outside=True)
     assert ours.states is not None
     assert ours.rewards is not None
     fastest = 0.0
@@ -62,7 +62,7 @@ def test_parity_of_the_cart_pole(seed: int) -> None:
     env.reset()
     env.state = start[0, [1, 3, 2, 4]]
     pushes = rng.integers(0, 2, 100)
-    ours = Simulator(task).rollout(NO_FRICTION, np.where(pushes, 1.0, -1.0)[:, None], start)
+    ours = Simulator(task).rollout(NO_FRICTION, np.where(pushes, 1.0, -1.0)[:, None], start, allow_outside=True)
     assert ours.states is not None
     ends = task.terminated(Transition(ours.states[:, :-1], None, ours.actions, ours.states[:, 1:], None))[0]
     for t, push in enumerate(pushes):
@@ -81,7 +81,6 @@ def test_in_place_equals_compiled(simulator: Simulator, seed: int) -> None:
     task, rng = task_of(simulator), np.random.default_rng(seed)
     body, joint, source = TASKS[task.name]
     theta = rng.uniform(-0.2, 1.2, 3)
-    theta[2] = abs(theta[2])
     mass, length, damping = task.space.values(theta)
     spec = read(source)
     across = mass * length**2 / 12

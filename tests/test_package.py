@@ -27,6 +27,7 @@ from sipe_bayes.config import (
     Table,
     TimeColumn,
 )
+from sipe_bayes.diagnostics.catalogue import tasks
 from sipe_bayes.envs.targets import _ATTRIBUTES
 from sipe_bayes.inference import ESTIMATORS, estimator_class
 from sipe_bayes.units import UNITS
@@ -160,6 +161,12 @@ def test_readme_lists_every_estimator() -> None:
     assert {name: cls for name, (_, cls) in ESTIMATORS.items()} == {
         name: re.findall(r"`(\w+)`", line)[1] for name, line in rows("Estimators").items()
     }
+
+
+def test_readme_lists_every_environment() -> None:
+    for row in tasks():
+        cells = [row[k] for k in ("parameters", "observations", "actions", "reproduces")]
+        assert rows("Environments")[row["name"]] == f"| `{row['name']}` | {' | '.join(map(str, cells))} |"
 
 
 TABLES: dict[str, type[Table]] = {

@@ -4,8 +4,8 @@ Both are rigid uniform rods with the masses, lengths, torques and time steps of 
 (Barto, Sutton and Anderson, Neuronlike Adaptive Elements That Can Solve Difficult Learning Control Problems, 1983,
 https://doi.org/10.1109/TSMC.1983.6313077), as MuJoCo models, one physics step a control step. What differs, on purpose:
 
-- There is friction: viscous damping at the pendulum's hinge and between cart and track, between nothing (theta = 0, which
-  is the published motion) and twice its default.
+- There is friction: viscous damping at the pendulum's hinge and between cart and track. Without it the motion is the
+  published one.
 - MuJoCo steps velocity first (semi-implicit Euler): so does Pendulum-v1, and CartPole-v1 where its ``kinematics_integrator``
   is set so; by default that one steps forward (explicit Euler).
 - The pendulum's speed has no limit; Pendulum-v1's is 8 rad/s.
@@ -46,7 +46,7 @@ CART_POLE = """
   <option timestep="0.02" gravity="0 0 -9.8"/>
   <worldbody>
     <body name="cart">
-      <joint name="slider" type="slide" axis="1 0 0" damping="0.1"/>
+      <joint name="slider" type="slide" axis="1 0 0" damping="0.5"/>
       <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
       <geom name="cart" type="box" size="0.25 0.15 0.1" contype="0" conaffinity="0"/>
       <body name="pole">
@@ -170,17 +170,15 @@ def pendulum() -> Pendulum:
                 scaled(
                     *("damping", 0.1, ["joint:hinge.damping"], "N m s/rad"),
                     "Torque against the speed, which takes energy from every swing; a heavier rod loses it more slowly.",
-                    *(0.0, 2.0),
                 ),
             ]
         ),
-        summary="A rod is swung up and held by a motor too weak to lift it; mass, length and damping are unknown.",
+        summary="A rod is swung up and held by a weak motor; mass, length and damping are unknown.",
         episode_steps=200,
         solved=Solved("return", -200.0),
         reference="gymnasium Pendulum-v1, damped",
         action_low=-_TORQUE,
         action_high=_TORQUE,
-        outside_sign=(-1, 1, 1),
     )
 
 
@@ -201,10 +199,8 @@ def cart_pole() -> CartPole:
                     "fully.",
                 ),
                 scaled(
-                    *("cart_friction", 0.1, ["joint:slider.damping"], "N s/m"),
-                    "Force against the speed of the cart; on short drives it is small, and it trades off against the pole's "
-                    "mass.",
-                    *(0.0, 2.0),
+                    *("cart_friction", 0.5, ["joint:slider.damping"], "N s/m"),
+                    "Force against the speed of the cart, small on short drives; it trades off against the pole's mass.",
                 ),
             ]
         ),
@@ -212,5 +208,4 @@ def cart_pole() -> CartPole:
         episode_steps=500,
         solved=Solved("return", 475.0),
         reference="gymnasium CartPole-v1, with friction and a continuous force",
-        outside_sign=(1, -1, 1),
     )

@@ -18,7 +18,7 @@ where it has none), a site where it is. Frames do not turn, the joints of the bo
 Everything moves linearly in the factors by which the links grow.
 
 Mass and inertia follow from the geoms at the density that they have in the model as compiled, with the compiler's own
-conventions: one geom gives the body its frame of inertia, several are added up and diagonalised by ``mju_eig3``.
+conventions: one geom gives the body its frame of inertia, several are added up and diagonalised by ``mju_eig3`` (of equal moments the axes are any two, here as there).
 MuJoCo's mj_setConst, which must follow, refreshes what else depends on them.
 """
 
@@ -42,9 +42,7 @@ _SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 _TARGET = re.compile(r"^link:(.+)\.(length|radius)$")
 _SAME = 1e-9  # relative, to the compiled model; a distance in m when comparing which is nearer
-_POWERS = np.array(
-    [[0], [1], [2], [3], [5]]
-)  # of a link's factor in its mass and moments of inertia, the last of a sphere's
+_POWERS = np.array([[0], [1], [2], [3], [5]])  # of a link's factor in its mass and moments; the last is a sphere's
 _UNIT = np.eye(3)
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 
