@@ -155,10 +155,13 @@ def test_a_diverging_lane_is_marked_and_disturbs_no_other(task: Task, simulator:
     before = case.rollout(simulator)
     wild = Case(task)
     first = 1 + simulator.model.nq
-    wild.start[2, first : first + simulator.model.nv] = 1e9  # enormous velocities
-    after = wild.rollout(simulator)
+    for speed in (1e9, 1e11):  # a pendulum bears the first; the second is more than MuJoCo takes for a number
+        wild.start[2, first : first + simulator.model.nv] = speed
+        after = wild.rollout(simulator)
+        assert after.valid[2, 0] == (speed < 1e10)
+        if not after.valid[2, -1]:
+            break
     assert not after.valid[2, -1]
-    assert after.valid[2, 0]
     others = np.array([0, 1, 3, 4])
     same(after[others], before[others])
     ends = np.flatnonzero(~after.valid[2])
