@@ -62,7 +62,7 @@ class Episodes:
         self.theta = np.full((self.count, len(simulator.space)), np.nan)
         self._models: list[Any] = [None] * self.count
         self.set_theta(np.arange(self.count), theta)
-        derived = simulator.derived_size if task.needs_derived else 0
+        derived = simulator.engine.derived_size if task.needs_derived else 0
         self._timesteps = np.full(self.count, self._timestep)
         self.states = np.zeros((self.count, simulator.state_size))
         self.goals = np.zeros((self.count, task.goal_size)) if task.goal_size else None
@@ -95,7 +95,7 @@ class Episodes:
         states, goals = self.states[chosen], None if self.goals is None else self.goals[chosen]
         derived = None
         if self._derived is not None:
-            derived = self.simulator.sensors([self._models[k] for k in chosen], states)
+            derived = self.simulator.engine.sensors([self._models[k] for k in chosen], states)
             self._derived[chosen] = derived
         self.observations[chosen] = self.task.observe(self.simulator.model, states, derived, goals)
         self.elapsed[chosen], self._over[chosen] = 0, False
@@ -133,7 +133,7 @@ class Episodes:
         models = self._models if isinstance(lanes, slice) else [self._models[k] for k in lanes]
         goals = None if self.goals is None else self.goals[lanes]
         old = None if self._derived is None else self._derived[lanes]
-        states, derived, sound = self.simulator.advance(
+        states, derived, sound = self.simulator.engine.advance(
             self._skip, models, self._timesteps[lanes], actions[:, None], before, first=False
         )
         after, new = states[:, 1], None if derived is None else derived[:, 1]

@@ -104,10 +104,14 @@ def _reader(data: Any, fields: Sequence[str]) -> Callable[[FloatArray], None]:
 
 
 def _share(datas: list[Any], count: int, work: Callable[[Any, Any], None]) -> None:
-    """Run ``work`` once for each MjData in a thread of its own; together they take the lanes 0 to ``count``."""
-    lanes = iter(range(count))  # threads take the next lane in turn, as Python's lock makes that one operation
-    if count == 1 or len(datas) == 1:
+    """Run ``work`` once for each MjData, in this thread and others; together they take the lanes 0 to ``count``."""
+    lanes = iter(range(count))  # each thread takes the next one, which Python's lock makes one operation
+    others = datas[1:count]
+    if not others:
         work(datas[0], lanes)
         return
-    with ThreadPoolExecutor(len(datas)) as threads:
-        list(threads.map(lambda data: work(data, lanes), datas))
+    with ThreadPoolExecutor(len(others)) as threads:
+        running = [threads.submit(work, data, lanes) for data in others]
+        work(datas[0], lanes)
+    for thread in running:
+        thread.result()

@@ -14,18 +14,15 @@ import copy
 import hashlib
 import math
 import os
-import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
-import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes import lanes as by_lane
+from sipe_bayes.engine import HUGE, Engine, quiet
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.episodes import Episodes, Step
 from sipe_bayes.parameters import ParameterSpace
@@ -36,36 +33,6 @@ BoolArray = NDArray[np.bool_]
 
 _CHUNK = 2**24  # numbers of state and sensor output held at once, 128 MiB
 _POOL = 2**29  # bytes of models held at once
-_TIME_TOLERANCE = 0.5  # of a physics step
-_FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-_HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
-
-
-class _Quiet:
-    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the
-    GIL."""
-
-    def __init__(self) -> None:
-        self._lock, self._inside, self._before = threading.Lock(), 0, mujoco.MjLogConfig.get()
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        with self._lock:
-            if not self._inside:
-                self._before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-                silent.logto_console = silent.logto_file = False
-                silent.set()
-            self._inside += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._inside -= 1
-                if not self._inside:
-                    self._before.set()
-
-
-_quiet = _Quiet()
 
 
 class Simulator:
@@ -83,14 +50,12 @@ class Simulator:
         self.model = environment.compile()
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show
-        self._physics_size = int(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        self.engine = Engine(environment, self.model, self.num_threads)
         self.diverged = 0
         self.control_steps = 0
         self._pool: list[Any] = []
         self._keys: list[bytes] = []
         self._scratch = mujoco.MjData(self.model)
-        self._threads = mujoco.rollout.Rollout(nthread=self.num_threads if self.num_threads > 1 else 0)
-        self._datas = [mujoco.MjData(self.model) for _ in range(self.num_threads)]
         self._physical: list[bool] = []
         self._biases: list[FloatArray] = []
         self.episodes: Episodes | None = None
@@ -105,13 +70,7 @@ class Simulator:
     @property
     def state_size(self) -> int:
         """S: the numbers of MuJoCo's full physics state, and of a stepwise environment's memory."""
-        return self._physics_size + self.environment.memory_size
-
-    @property
-    def derived_size(self) -> int:
-        """D: the numbers of ``derived``, sensordata or MjData's own."""
-        fields = self.environment.data_fields
-        return by_lane.fields_size(self._scratch, fields) if fields else int(self.model.nsensordata)
+        return self.engine.physics_size + self.environment.memory_size
 
     def checksum(self) -> str:
         """SHA-256 of the compiled default model, with whatever files its MJCF includes."""
@@ -121,11 +80,11 @@ class Simulator:
 
     def default_state(self) -> FloatArray:
         """State (S,) after a reset of the default model."""
-        data, state = mujoco.MjData(self.model), np.empty(self._physics_size)
+        data, state = mujoco.MjData(self.model), np.empty(self.engine.physics_size)
         mujoco.mj_getState(self.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if not self.environment.memory_size:
             return state
-        memory = self.environment.remember(self.sensors([self.model], state[None]))
+        memory = self.environment.remember(self.engine.sensors([self.model], state[None]))
         return np.concatenate([state, memory[0]])
 
     @property
@@ -169,7 +128,7 @@ class Simulator:
         steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(d) for d in dts.tolist()), strict=True))
         horizon = actions.shape[1]
         whole = _Motion.empty(batch, horizon, self)
-        with _quiet():
+        with quiet():
             for skip, chunk in self._chunks(steps, horizon):
                 lanes = self._models(theta[chunk], timesteps[chunk], [names[i] for i in chunk])
                 targets = None if goals is None else goals[chunk]
@@ -200,7 +159,7 @@ class Simulator:
             raise ValueError(f"actions: expected (B, T, {self.environment.num_actions}), got {actions.shape}")
         if not actions.shape[1]:
             raise ValueError("actions: expected at least one control step, got none")
-        if not (np.abs(actions) <= _HUGE).all():
+        if not (np.abs(actions) <= HUGE).all():
             raise ValueError(
                 "actions: expected finite numbers up to 1e10, got NaN, infinity or more; mask or hold them first"
             )
@@ -253,7 +212,7 @@ class Simulator:
         for skip in np.unique(steps).tolist():
             group = np.flatnonzero(steps == skip)
             rows = horizon * (1 if self.environment.data_fields else skip) + 1
-            width = rows * (self.state_size + self.derived_size + self.model.nu)
+            width = rows * (self.state_size + self.engine.derived_size + self.model.nu)
             most = max(self.num_threads, min(_CHUNK // width, _POOL // mujoco.mj_sizeModel(self.model)))
             for chunk in np.array_split(group, math.ceil(len(group) / most)):
                 yield skip, chunk
@@ -311,7 +270,7 @@ class Simulator:
         if not run.any():
             return motion
         models = [self._pool[k] for k in lanes[run]]
-        states, derived, sound = self.advance(skip, models, timesteps[run], actions[run], initial_state[run])
+        states, derived, sound = self.engine.advance(skip, models, timesteps[run], actions[run], initial_state[run])
         targets = None if goals is None else goals[run, None]
         observations = environment.observe(self.model, states, derived, targets)
         biases = np.stack([self._biases[k] for k in lanes[run]])[:, None]
@@ -319,23 +278,6 @@ class Simulator:
         if derived is not None and motion.derived is not None:
             motion.derived[run] = derived
         return motion
-
-    def advance(
-        self,
-        skip: int,
-        models: list[Any],
-        timesteps: FloatArray,
-        actions: FloatArray,
-        start: FloatArray,
-        first: bool = True,
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """States (B, T+1, S), sensordata aligned as the environment has it (B, T+1, D) or None, and which samples
-        (B, T+1) are sound, of lanes with ``models`` and ``skip`` physics steps a control step. Without ``first`` the
-        derived quantities of sample 0 may be missing."""
-        if self.environment.data_fields:
-            return self._by_lane(skip, models, timesteps, actions, start, first)
-        run = self._stepwise if self.environment.stepwise else self._open_loop
-        return run(skip, models, timesteps, actions, start)
 
     def written(self, theta: FloatArray) -> Any:
         """A mujoco.MjModel of one's own with theta (N,) written in; raises ValueError for an unphysical one."""
@@ -367,106 +309,7 @@ class Simulator:
         """One control step of all lanes with actions (B, A); see ``sipe_bayes.episodes``."""
         if self.episodes is None:
             raise ValueError("step: nothing has begun yet; call reset first")
-        with _quiet():
-            return self.episodes.step(actions)
-
-    def _open_loop(
-        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """States (B, T+1, S), sensordata aligned with them (B, T+1, D) and which samples are sound."""
-        environment, horizon = self.environment, actions.shape[1]
-        controls = np.repeat(environment.control(self.model, start, actions), skip, axis=1)
-        # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one
-        # shows it. Sensordata belongs to the state before the step, so the last sample's comes with the next
-        # step as well.
-        aligned = environment.needs_derived and not environment.derived_late
-        if aligned or (horizon * skip == 1 and not start[:, 0].all()):
-            controls = np.concatenate([controls, controls[:, -1:]], axis=1)
-        out, sensors = self._native(models, start, controls)
-        states = np.concatenate([start[:, None], out[:, skip - 1 : horizon * skip : skip]], axis=1)
-        derived = None
-        if aligned:
-            derived = sensors[:, ::skip][:, : horizon + 1]
-        elif environment.needs_derived:
-            derived = np.concatenate([sensors[:, :1], sensors[:, skip - 1 : horizon * skip : skip]], axis=1)
-        return states, derived, _sound(states, out, skip, timesteps[:, None], aligned)
-
-    def _stepwise(
-        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """The same for an environment whose control depends on the state."""
-        environment, horizon, own = self.environment, actions.shape[1], self._physics_size
-        states = np.empty((len(start), horizon + 1, start.shape[1]))
-        derived = np.empty((len(start), horizon + 1, self.model.nsensordata)) if environment.needs_derived else None
-        sound = np.ones((len(start), horizon + 1), bool)
-        states[:, 0] = start
-        if derived is not None:
-            derived[:, 0] = self.sensors(models, start)
-        sound[:, 0] = (np.abs(start) <= _HUGE).all(1)
-        for t in range(horizon):
-            begin = np.ascontiguousarray(states[:, t, :own])
-            control = environment.control(self.model, states[:, t], actions[:, t])
-            out, _ = self._native(models, begin, np.repeat(control[:, None], skip, axis=1))
-            ends = np.stack([begin, out[:, -1]], axis=1)
-            sound[:, t : t + 2] &= _sound(ends, out, skip, timesteps[:, None], False)
-            after = environment.settle(self.model, out[:, -1])
-            before = out[:, -2] if skip > 1 else begin
-            seen = self.sensors(models, environment.probe(self.model, before, after))
-            states[:, t + 1, :own], states[:, t + 1, own:] = after, environment.remember(seen)
-            if derived is not None:
-                derived[:, t + 1] = seen
-        return states, derived, sound
-
-    def _by_lane(
-        self,
-        skip: int,
-        models: list[Any],
-        timesteps: FloatArray,
-        actions: FloatArray,
-        start: FloatArray,
-        first: bool,
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """The same for an environment that reads MjData itself."""
-        environment = self.environment
-        controls = environment.control(self.model, start, actions)
-        states, derived, clean = by_lane.advance(
-            models, self._datas, environment.data_fields, skip, controls, start, first
-        )
-        return states, derived, clean & _sound(states, states[:, 1:], 1, skip * timesteps[:, None], False)
-
-    def sensors(self, models: list[Any], states: FloatArray) -> FloatArray:
-        """Sensordata (B, D) of states (B, S), without control."""
-        if self.environment.data_fields:
-            return by_lane.forward(models, self._datas, self.environment.data_fields, states)
-        width = mujoco.mj_stateSize(self.model, self.environment.control_spec)
-        own = np.ascontiguousarray(states[:, : self._physics_size])
-        flags = int(self.model.opt.disableflags)
-        try:
-            for model in models:
-                model.opt.disableflags = flags | _FORCES if self.environment.kinematic else flags
-            return np.asarray(self._native(models, own, np.zeros((len(states), 1, width)))[1][:, 0])
-        finally:
-            for model in models:
-                model.opt.disableflags = flags
-
-    def _native(self, models: list[Any], start: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (B, P, S) and sensordata (B, P, D) of physics steps with controls (B, P, U)."""
-        batch, steps = controls.shape[:2]
-        out = np.empty((batch, steps, self._physics_size))
-        read = self.environment.needs_derived or self.environment.stepwise
-        sensors = np.empty((batch, steps, self.model.nsensordata)) if read else None
-        self._threads.rollout(
-            models,
-            self._datas,
-            np.ascontiguousarray(start),
-            np.ascontiguousarray(controls),
-            control_spec=self.environment.control_spec,
-            skip_checks=True,
-            nstep=steps,
-            state=out,
-            sensordata=sensors,
-        )
-        return out, np.empty((batch, steps, 0)) if sensors is None else sensors
+        return self.episodes.step(actions)
 
 
 @dataclass(frozen=True)
@@ -483,34 +326,10 @@ class _Motion:
     def empty(cls, batch: int, horizon: int, simulator: Simulator) -> _Motion:
         environment = simulator.environment
         shape = (batch, horizon + 1)
-        derived = np.full((*shape, simulator.derived_size), np.nan) if environment.needs_derived else None
+        derived = np.full((*shape, simulator.engine.derived_size), np.nan) if environment.needs_derived else None
         return cls(
             np.full((*shape, simulator.state_size), np.nan),
             np.full((*shape, len(environment.channels)), np.nan),
             np.zeros(shape, bool),
             derived,
         )
-
-
-def _sound(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:
-    """Which samples ``kept`` (B, T+1, S) of the physics steps ``out`` (B, P, S) are neither reset, repeated
-    nor huge; with ``derived`` the step that filled their sensordata must have been as well."""
-    count = kept.shape[1]
-    expected = kept[:, :1, 0] + np.arange(count) * skip * timestep
-    sound = (np.abs(kept[..., 0] - expected) < _TIME_TOLERANCE * timestep) & (np.abs(kept) <= _HUGE).all(-1)
-    after = out[:, ::skip][:, :count]  # the physics step that follows sample 0, 1, ...
-    sound &= _not_repeated(kept, after)
-    if derived:
-        sound &= np.abs(after[..., 0] - expected - timestep) < _TIME_TOLERANCE * timestep
-        sound &= _not_repeated(after, out[:, 1::skip])
-    return sound
-
-
-def _not_repeated(states: FloatArray, following: FloatArray) -> BoolArray:
-    """Which ``states`` (B, T, S) differ from those ``following`` them, as far as there are any."""
-    different = np.ones(states.shape[:2], bool)
-    number = min(states.shape[1], following.shape[1])
-    different[:, :number] = following[:, :number, 0] != states[:, :number, 0]
-    if not different.all():
-        different[:, :number] |= (following[:, :number] != states[:, :number]).any(-1)
-    return different

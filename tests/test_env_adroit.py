@@ -77,7 +77,7 @@ def motion(simulator: Simulator, seed: int, theta: Any) -> tuple[Any, Transition
     commands, states = actions(task, seed), task.states(*(x[None] for x in start(task, seed)))
     run = simulator.rollout(theta, commands, states)
     timestep = np.array([simulator.model.opt.timestep])
-    x, d, _ = simulator.advance(task.frame_skip, [simulator.written(theta)], timestep, commands[None], states)
+    x, d, _ = simulator.engine.advance(task.frame_skip, [simulator.written(theta)], timestep, commands[None], states)
     assert d is not None
     return run, Transition(x[:, :-1], d[:, :-1], commands[None], x[:, 1:], d[:, 1:])
 

@@ -150,7 +150,10 @@ def test_writing_in_place_equals_compiling(simulator: Simulator, theta: tuple[fl
     start, _ = task.initial_states(np.random.default_rng(0), 1)
     velocity = 1 + written.nq + written.joint("object0:joint").dofadr[0]
     start[:, velocity : velocity + 2] = -0.6, -0.4
-    ends = [simulator.advance(20, [m], np.array([0.002]), np.zeros((1, 25, 4)), start)[0] for m in (written, compiled)]
+    ends = [
+        simulator.engine.advance(20, [m], np.array([0.002]), np.zeros((1, 25, 4)), start)[0]
+        for m in (written, compiled)
+    ]
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-9)
     assert np.ptp(task.achieved_goals(ends[0], None)[0], axis=0).max() > 0.01
 

@@ -119,7 +119,7 @@ def test_in_place_equals_compiled(simulator: Simulator, seed: int) -> None:
     rng = np.random.default_rng(seed)
     (start, _), actions = task.initial_states(rng, 1), rng.uniform(-0.4, 0.4, (1, 100, 17))
     states = [
-        simulator.advance(task.frame_skip, [model], np.array([model.opt.timestep]), actions, start)[0]
+        simulator.engine.advance(task.frame_skip, [model], np.array([model.opt.timestep]), actions, start)[0]
         for model in (written, compiled)
     ]
     np.testing.assert_allclose(states[0], states[1], rtol=0, atol=1e-9)

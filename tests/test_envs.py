@@ -24,6 +24,7 @@ from sipe_bayes.envs.task import VARIANTS, Task
 from sipe_bayes.simulator import Simulator
 from tests.test_env_fetch import steer
 
+gymnasium.register_envs(sipe.gym)  # another test may have imported sipe_bayes before gymnasium
 STEPS = 12
 PUBLISHED = {  # parameters, observation, action: Table 1 of the paper, Relocate's 30 actions as the model has them
     "FetchPush": (2, 31, 4),
@@ -131,7 +132,7 @@ def test_one_step_windows_and_stepping_give_the_bits_of_a_rollout(task: Task, si
     if episodes.goals is not None and case.goals is not None:
         episodes.goals[:] = case.goals
     if episodes._derived is not None:
-        episodes._derived[:] = simulator.sensors(episodes._models, case.start)
+        episodes._derived[:] = simulator.engine.sensors(episodes._models, case.start)
     for t in range(STEPS):
         lanes = len(case.theta)
         window = simulator.rollout(
@@ -195,7 +196,7 @@ def test_states_and_derived_are_those_of_plain_mujoco(task: Task, simulator: Sim
         pytest.skip("compared with the published class in its family's test")
     case = Case(task, lanes=1, steps=3)
     model, skip = simulator.written(case.theta[0]), task.frame_skip
-    _, derived, _ = simulator.advance(skip, [model], np.array([model.opt.timestep]), case.actions, case.start)
+    _, derived, _ = simulator.engine.advance(skip, [model], np.array([model.opt.timestep]), case.actions, case.start)
     whole = case.rollout(simulator)
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, case.start[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)

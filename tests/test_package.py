@@ -132,6 +132,16 @@ def test_version_is_the_project_s() -> None:
     assert project["version"] == sipe_bayes.__version__
 
 
+ORDERS = ("import gymnasium, sipe_bayes", "import sipe_bayes, gymnasium; gymnasium.register_envs(sipe_bayes.gym)")
+
+
+@pytest.mark.parametrize("imports", ORDERS)
+def test_gymnasium_knows_the_environments(imports: str) -> None:
+    check = "print('sipe/Pendulum-v0' in gymnasium.registry)"
+    done = subprocess.run([sys.executable, "-c", f"{imports}; {check}"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
+
+
 # The README
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sipe_bayes.engine import Engine
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment
 from sipe_bayes.parameters import Parameter
 from sipe_bayes.simulator import Simulator
@@ -302,13 +303,13 @@ def test_unphysical_parameters_are_never_simulated(
     parameter: Parameter, theta: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lanes = []
-    real: Callable[..., Any] = Simulator._native
+    real: Callable[..., Any] = Engine._native
 
-    def counted(simulator: Simulator, models: Any, *args: Any) -> Any:
+    def counted(engine: Engine, models: Any, *args: Any) -> Any:
         lanes.append(len(models))
-        return real(simulator, models, *args)
+        return real(engine, models, *args)
 
-    monkeypatch.setattr(Simulator, "_native", counted)
+    monkeypatch.setattr(Engine, "_native", counted)
     environment = MjcfEnvironment.build(PENDULUM, [parameter], ["motor"], HINGE)
     simulator, actions = Simulator(environment, 1), np.zeros((1, 3, 1))
     default = float(environment.space.default_theta[0])

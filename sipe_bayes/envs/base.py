@@ -32,7 +32,9 @@ class Environment(ABC):
     channels: tuple[str, ...]
     num_actions: int
     needs_derived: bool = False
-    data_fields: tuple[str, ...] = ()  # MjData arrays that are derived in place of sensordata, for what no sensor returns
+    data_fields: tuple[
+        str, ...
+    ] = ()  # MjData arrays that are derived in place of sensordata, for what no sensor returns
     derived_late: bool = False  # derived belongs to the state before the last physics step, as Gymnasium reads it
     frame_skip: int = 1  # physics steps of a control step where no dt is given
     stepwise: bool = False  # control needs the state: control steps are simulated one by one
