@@ -197,16 +197,9 @@ def _inertia_entries() -> list[str]:
 
 
 def _bind(model: Any, target: str) -> Target:
-    """A joint without a spring has 0.001 N m/rad stand for none, and the difference is written: theta = 0.5 is the
-    published model, and the motion follows the parameter without a jump."""
+    """A joint without a spring gets one of 0.001 N m/rad, which stands for none."""
     bound = bind(model, target)
-    if bound.value or not target.endswith(".stiffness"):
-        return bound
-
-    def write(other: Any, value: float) -> None:
-        bound.write(other, value - _NO_SPRING)
-
-    return replace(bound, value=_NO_SPRING, write=write)
+    return replace(bound, value=_NO_SPRING) if not bound.value and target.endswith(".stiffness") else bound
 
 
 def _parameter(model: Any, name: str, target: str, unit: str, description: str) -> Parameter:
@@ -220,8 +213,8 @@ def _joint_parameters(model: Any, joint: str) -> list[Parameter]:
     spring = (
         f"Pulls the joint that {moves} back to its rest angle. In slow motion it trades off against the gear."
         if model.joint(joint).stiffness[0]
-        else f"The published joint that {moves} has no spring: 0.001 stands for none and only the difference to it is "
-        "written, too little to be seen in a log. The posterior should stay the prior."
+        else f"The published joint that {moves} has no spring: 0.001 stands for none, too little to be seen in a log. "
+        "The posterior should stay the prior."
     )
     return [
         _parameter(
@@ -252,7 +245,7 @@ def _humanoid(
         summary=summary,
         episode_steps=1000,
         solved=Solved("return", _SOLVED),
-        reference="gymnasium Humanoid-v4 with terminate_when_unhealthy=False",
+        reference="gymnasium Humanoid-v4, never terminated",
         action_low=-0.4,
         action_high=0.4,
         outside_sign=outside_sign,
