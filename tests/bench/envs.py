@@ -11,6 +11,7 @@ import resource
 import sys
 import tempfile
 import time
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
+from sipe_bayes.engine import quiet
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulator import Simulator
@@ -54,6 +56,12 @@ def _found(file: str) -> str:
     return str(Path(spec.origin).parent / rest)
 
 
+def _load(file: str) -> Any:
+    with quiet(), warnings.catch_warnings():  # settotalmass is deprecated
+        warnings.simplefilter("ignore")
+        return mujoco.MjModel.from_xml_path(file)
+
+
 class Lanes:
     """One task's lanes, ours and bare."""
 
@@ -73,10 +81,10 @@ class Lanes:
         self.controls = self._controls()
 
     def _bare_models(self) -> tuple[list[Any], list[Any]]:
-        plain, models = mujoco.MjModel.from_xml_path(self.file), []
+        plain, models = _load(self.file), []
         scratch = mujoco.MjData(plain)
         for row in self.theta:
-            model = mujoco.MjModel.from_xml_path(self.file)
+            model = _load(self.file)
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
             self.task.write(model, self.task.space.values(row))
             mujoco.mj_setConst(model, scratch)
@@ -187,7 +195,9 @@ class Reparsed(gymnasium.Env[np.ndarray, np.ndarray]):
         with tempfile.NamedTemporaryFile("wb", suffix=".xml") as file:
             tree.write(file)
             file.flush()
-            self.env = gymnasium.make("HalfCheetah-v5", xml_file=file.name)
+            with quiet(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self.env = gymnasium.make("HalfCheetah-v5", xml_file=file.name)
         return self.env.reset(seed=seed)
 
     def step(self, action: np.ndarray) -> Any:
