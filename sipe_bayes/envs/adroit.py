@@ -261,7 +261,7 @@ def door(latch_damping: float = 1.5) -> Door:
         summary="A 24-joint hand on an arm turns a latch and pulls a door open",
         episode_steps=200,
         solved=Solved("success", 0.9),
-        reference="gymnasium-robotics AdroitHandDoor-v1",
+        reference=f"gymnasium-robotics AdroitHandDoor-v1, latch damping {latch_damping:g}",
         outside_sign=(1, -1, 1, -1, 1, 1, 1),  # of the latch's damping upwards: below theta = -1/6 it is negative
         latch_damping=latch_damping,
     )
