@@ -1,5 +1,6 @@
 """Do 90 % intervals hold the truth 90 % of the time? Simulated logs of the simple pendulum, truths from the prior.
 
+    python examples/studies/pendulum_coverage.py                              # both estimators and noises, two hours
     python examples/studies/pendulum_coverage.py --estimator laplace --rho 0.99 --truths 128
 
 Every log repeats the recorded torque of `ddp` (6 s, 500 Hz) in a pendulum whose five parameters come from the prior;
@@ -28,6 +29,7 @@ CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
 NOISE_SD = 0.01  # rad
 WINDOW = 0.5  # s
 BUDGET = {"laplace": 5000, "mcmc": 2000}  # rollouts; 2000 are 60 steps of 24 walkers or more after the first fit
+TRUTHS = {"laplace": 128, "mcmc": 100}
 
 
 def simulated_log(problem: Problem, theta: np.ndarray, rho: float, rng: np.random.Generator) -> sipe.Trajectory:
@@ -106,37 +108,41 @@ def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--estimator", default="laplace")
-    parser.add_argument("--rho", type=float, default=0.0)
-    parser.add_argument("--truths", type=int, default=128)
-    parser.add_argument("--threads", type=int, default=1)
-    arguments = parser.parse_args()
-    problem = sipe.prepare(CONFIG, num_threads=arguments.threads)
-    name = f"pendulum_coverage_{arguments.estimator}_rho{arguments.rho:g}"
+def study(problem: Problem, estimator: str, rho: float, truths: int) -> None:
+    """One cell: fit what is missing, write the summary."""
+    name = f"pendulum_coverage_{estimator}_rho{rho:g}"
     kept = Path("runs") / f"{name}.jsonl"
     kept.parent.mkdir(exist_ok=True)
-    setting = _setting(arguments.estimator)
+    setting = _setting(estimator)
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     if any(row["setting"] != setting for row in rows):
         raise SystemExit(f"{kept}: holds fits of other code or settings than {setting}; delete it to start again")
-    for seed in range(len(rows), arguments.truths):
-        rows.append({**one_fit(problem, arguments.estimator, arguments.rho, seed), "setting": setting})
+    for seed in range(len(rows), truths):
+        rows.append({**one_fit(problem, estimator, rho, seed), "setting": setting})
         with kept.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
         found = summary(rows, problem.environment.space.names)
         print(f"{len(rows)} fits: coverage {found['coverage_90']} ± {found['standard_error']}", flush=True)
-    found = {
-        "command": f"python examples/studies/pendulum_coverage.py --estimator {arguments.estimator} "
-        f"--rho {arguments.rho:g} --truths {arguments.truths}",
-        "noise_sd_rad": NOISE_SD,
-        **setting,
-        **summary(rows[: arguments.truths], problem.environment.space.names),
-    }
-    result = HERE / "results" / f"{name}.json"
-    write_text(result, json.dumps(found, indent=2) + "\n")
+    command = (
+        f"python {Path(__file__).relative_to(HERE.parents[1])} --estimator {estimator} --rho {rho:g} --truths {truths}"
+    )
+    head = {"command": command, "noise_sd_rad": NOISE_SD, **setting}
+    found = {**head, **summary(rows[:truths], problem.environment.space.names)}
+    write_text(HERE / "results" / f"{name}.json", json.dumps(found, indent=2) + "\n")
     print(json.dumps(found, indent=2))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--estimator", nargs="*", default=list(TRUTHS), help="default: both")
+    parser.add_argument("--rho", type=float, nargs="*", default=[0.0, 0.99], help="default: both")
+    parser.add_argument("--truths", type=int, help=f"default: {TRUTHS}")
+    parser.add_argument("--threads", type=int, default=1)
+    given = parser.parse_args()
+    problem = sipe.prepare(CONFIG, num_threads=given.threads)
+    for estimator in given.estimator:
+        for rho in given.rho:
+            study(problem, estimator, rho, given.truths or TRUTHS[estimator])
 
 
 if __name__ == "__main__":
