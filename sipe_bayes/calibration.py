@@ -203,6 +203,7 @@ def _method(
         likelihood=problem.likelihood,
         seed=config.seed if seed is None else seed,
         budget=config.budget if budget is None else budget,
+        **config.search.model_dump(),
         checkpoint=checkpoint,
         progress=progress,
     )

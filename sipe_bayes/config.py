@@ -338,6 +338,13 @@ class PriorSource(Table):
     source: Location = Field(alias="from")
 
 
+class Search(Table):
+    """How widely the optimum is looked for: starting points followed, and draws from the prior among which they are chosen."""
+
+    restarts: Annotated[int, Strict(), Field(gt=0)] = 2
+    candidates: Annotated[int, Strict(), Field(ge=0)] = 4
+
+
 class Config(Table):
     """A whole configuration; ``load_config`` reads one. ``window`` in seconds, or "log" for whole logs."""
 
@@ -346,6 +353,7 @@ class Config(Table):
     window: Annotated[float | Literal["log"], BeforeValidator(_window)]
     seed: Annotated[int, Strict(), Field(ge=0)] = 0
     budget: Annotated[int, Strict(), Field(gt=0)] | None = None
+    search: Search = Search()
     resample: Resample = Resample()
     columns: Columns = Columns()
     commands: tuple[Command, ...] = ()

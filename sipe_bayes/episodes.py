@@ -74,13 +74,13 @@ class Episodes:
 
     def set_theta(self, lanes: NDArray[np.int64], theta: FloatArray) -> None:
         """Give ``lanes`` (L,) the parameters theta (L, N) or (N,); they hold from the next physics step on."""
-        theta = np.broadcast_to(np.asarray(theta, float), (len(lanes), len(self.simulator.space)))
+        rows = self.simulator.check_theta(theta, self.allow_outside, len(lanes))
         models: dict[bytes, Any] = {}
-        for lane, row in zip(lanes.tolist(), self.simulator.check_theta(theta, self.allow_outside), strict=True):
-            key = row.tobytes()
-            if key not in models:
-                models[key] = self.simulator.written(row)
-            self._models[lane], self.theta[lane] = models[key], row
+        for row in rows:  # all of them before any lane is touched
+            if row.tobytes() not in models:
+                models[row.tobytes()] = self.simulator.written(row)
+        for lane, row in zip(lanes.tolist(), rows, strict=True):
+            self._models[lane], self.theta[lane] = models[row.tobytes()], row
 
     def begin(self, lanes: BoolArray) -> None:
         """Begin a new episode in the marked lanes (B,)."""
@@ -102,8 +102,9 @@ class Episodes:
 
     def first(self) -> Step:
         """The step that a reset stands for."""
-        no = np.zeros(self.count, bool)
-        return self._step(np.zeros(self.count), no, no, ~no, None if self._no_success() else no)
+        success = None if self._no_success() else np.zeros(self.count, bool)
+        ended = np.zeros((2, self.count), bool)
+        return self._step(np.zeros(self.count), ended[0], ended[1], np.ones(self.count, bool), success)
 
     def step(self, actions: FloatArray) -> Step:
         """One control step of all lanes with actions (B, A); raises ValueError for other shapes or NaN."""
@@ -122,6 +123,7 @@ class Episodes:
             if success is not None:
                 success[lanes] = result[3]
         self.elapsed[lanes] += 1
+        self.simulator.control_steps += int((~fresh).sum())
         truncated = (self.elapsed >= self.task.episode_steps) & ~terminated & ~fresh
         self.begin(fresh)
         self._over = terminated | truncated

@@ -78,11 +78,13 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     def set_parameters(self, theta: FloatArray, allow_outside: bool = False) -> None:
         """Give the simulator theta (N,); raises ValueError for other shapes, NaN, or values outside [0, 1]."""
-        theta = self.simulator.check_theta(np.asarray(theta, float), allow_outside)
-        if self._episodes is not None:
+        theta = self.simulator.check_theta(theta, allow_outside, 1)
+        if self._episodes is None:
+            self.simulator.written(theta[0])  # raises for unphysical values
+        else:
             self._episodes.allow_outside = True
             self._episodes.set_theta(np.zeros(1, int), theta)
-        self.theta = theta
+        self.theta = theta[0]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[FloatArray, Info]:
         super().reset(seed=seed)
@@ -138,37 +140,62 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     def set_parameters(
         self, theta: FloatArray, lanes: NDArray[np.int64] | None = None, allow_outside: bool = False
     ) -> None:
-        """Give the ``lanes`` (L,), default all, theta (L, N) or (N,); raises ValueError for what does not fit."""
-        chosen = np.arange(self.num_envs) if lanes is None else np.asarray(lanes)
-        theta = self.simulator.check_theta(np.asarray(theta, float), allow_outside)
+        """Give the ``lanes``, (L,) numbers or a mask (B,), default all, theta (L, N) or (N,); raises ValueError for what does
+        not fit, and then changes nothing."""
+        chosen = self._chosen("lanes", lanes)
+        theta = self.simulator.check_theta(theta, allow_outside, len(chosen))
         if self._episodes is not None:
             self._episodes.allow_outside = True
             self._episodes.set_theta(chosen, theta)
+        else:
+            for row in np.unique(theta, axis=0):
+                self.simulator.written(row)  # raises for unphysical values
         self.theta[chosen] = theta
+
+    def _chosen(self, name: str, lanes: Any) -> NDArray[np.int64]:
+        """Numbers of lanes given as numbers or as a mask; raises ValueError."""
+        given = np.arange(self.num_envs) if lanes is None else np.asarray(lanes)
+        if given.dtype == bool and given.shape == (self.num_envs,):
+            return np.flatnonzero(given)
+        whole = given.ndim == 1 and np.issubdtype(given.dtype, np.integer)
+        if not whole or (len(given) and not 0 <= given.min() <= given.max() < self.num_envs):
+            raise ValueError(
+                f"{name}: expected a mask ({self.num_envs},) or numbers of lanes below {self.num_envs}, got {given.tolist()}"
+            )
+        return given
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
     ) -> tuple[FloatArray, Info]:
-        """options: ``theta`` (B, N) or (N,), and ``reset_mask`` (B,) to begin anew in some lanes only."""
+        """options: ``reset_mask`` (B,) to begin anew in some lanes only, and for those ``theta`` (L, N) or (N,) with
+        ``allow_outside``."""
         options = options or {}
-        if seed is not None or not self._generators:
-            seeds = (
-                [None if seed is None else seed + i for i in range(self.num_envs)]
-                if not isinstance(seed, Sequence)
-                else seed
-            )
-            if len(seeds) != self.num_envs:
-                raise ValueError(f"seed: expected one number or {self.num_envs}, got {len(seeds)}")
-            self._generators = [np.random.default_rng(s) for s in seeds]
+        chosen = self._chosen("reset_mask", options.get("reset_mask"))
+        seeds = self._seeds(seed)
         if "theta" in options:
-            self.set_parameters(options["theta"], allow_outside=bool(options.get("allow_outside", False)))
+            self.set_parameters(options["theta"], chosen, bool(options.get("allow_outside", False)))
+        if not self._generators:
+            self._generators = [np.random.default_rng(s) for s in seeds]
+        elif seed is not None:
+            for lane in chosen:
+                self._generators[lane] = np.random.default_rng(seeds[lane])
         if self._episodes is None:
             self._episodes = Episodes(self.simulator, self.theta, self._generators, allow_outside=True)
         else:
             self._episodes.generators = self._generators
-            self._episodes.begin(np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)), bool))
+            self._episodes.begin(np.isin(np.arange(self.num_envs), chosen))
         step = self._episodes.first()
         return step.observations, self._marked(step)
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        """One seed for each lane: seed, seed + 1, ... of one number."""
+        if seed is None:
+            return [None] * self.num_envs
+        if np.ndim(seed) == 0:
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed: expected one number or {self.num_envs}, got {len(seed)}")
+        return [None if s is None else int(s) for s in seed]
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, Info]:
         if self._episodes is None:
@@ -182,5 +209,5 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
 
     def _marked(self, step: Step) -> Info:
         """Gymnasium's form: with every entry the lanes that it holds for."""
-        info, everywhere = _info(step), np.ones(self.num_envs, bool)
-        return {**info, **{f"_{key}": everywhere for key in info}}
+        info = _info(step)
+        return {**info, **{f"_{key}": np.ones(self.num_envs, bool) for key in info}}

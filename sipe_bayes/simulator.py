@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.engine import HUGE, Engine, quiet
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.envs.task import Task
 from sipe_bayes.episodes import Episodes, Step
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.trajectory import Trajectories
@@ -145,6 +146,7 @@ class Simulator:
         self.control_steps += batch * horizon
         length = np.full(batch, horizon)
         rewards = self.environment.rewards(whole.states, whole.derived, actions, goals)
+        rewards = None if rewards is None else np.where(valid[:, 1:], rewards, 0.0)
         channels = self.environment.channels
         return Trajectories(whole.observations, actions, dts, length, valid, whole.states, (), channels, rewards)
 
@@ -152,7 +154,7 @@ class Simulator:
         self, theta: FloatArray, actions: FloatArray, initial_state: FloatArray, allow_outside: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         theta = self.check_theta(np.atleast_2d(theta), allow_outside)
-        actions = np.asarray(actions, float)
+        actions = np.ascontiguousarray(actions, float)
         if actions.ndim == 2:
             actions = actions[None]
         if actions.ndim != 3 or actions.shape[-1] != self.environment.num_actions or not actions.shape[0]:
@@ -173,9 +175,17 @@ class Simulator:
             )
         return theta, actions, initial_state
 
-    def check_theta(self, theta: FloatArray, allow_outside: bool) -> FloatArray:
-        """theta (B, N); raises ValueError for another shape, NaN, or values outside [0, 1] that are not allowed."""
-        theta = self.space.check_shape(theta)
+    def check_theta(self, theta: FloatArray, allow_outside: bool, lanes: int | None = None) -> FloatArray:
+        """theta (B, N), a copy, or for a number of lanes (lanes, N) of theta (lanes, N) or (N,); raises ValueError for
+        another shape, NaN, or values outside [0, 1] that are not allowed."""
+        theta, n = np.array(theta, float), len(self.space)
+        if theta.shape not in ((n,), (lanes, n)) if lanes is not None else theta.shape[-1:] != (n,):
+            expected = f"({n},)" if lanes in (None, 1) else f"({lanes}, {n}) or ({n},)"
+            raise ValueError(
+                f"theta: expected {n} parameters, shape {expected}, got {theta.shape}; see the space's names"
+            )
+        if lanes is not None:
+            theta = np.tile(theta, (lanes, 1)) if theta.ndim == 1 else theta
         if not np.isfinite(theta).all():
             raise ValueError("theta: expected finite numbers, got NaN or infinity")
         if not allow_outside and not ((theta >= 0) & (theta <= 1)).all():
@@ -198,6 +208,10 @@ class Simulator:
         self, batch: int, dt: FloatArray | float | None, logs: Sequence[str | None] | None
     ) -> tuple[FloatArray, list[str | None]]:
         dts = np.asarray(self.dt if dt is None else dt, float)
+        if isinstance(self.environment, Task) and not np.allclose(dts, self.dt, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"dt: {self.environment.name} has control steps of {self.dt:g} s, got {dts.min():g}; leave it out"
+            )
         if dts.shape not in ((), (1,), (batch,)):
             raise ValueError(f"dt: expected one number or ({batch},), one for each lane, got shape {dts.shape}")
         if not (np.isfinite(dts) & (dts > 0)).all():

@@ -90,7 +90,7 @@ class Trajectory:
 @dataclass(frozen=True, eq=False)
 class Trajectories(Sequence[Trajectory]):
     """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,),
-    length (B,), rewards (B, T) or None, of simulated tasks.
+    length (B,), rewards (B, T) or None: of simulated tasks, zero where a step was not valid, going on after a task's end.
 
     Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first
     sample of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index

@@ -24,6 +24,7 @@ from sipe_bayes.config import (
     ParameterEntry,
     PriorSource,
     Resample,
+    Search,
     Table,
     TimeColumn,
 )
@@ -183,6 +184,7 @@ TABLES: dict[str, type[Table]] = {
     "": Config,
     "columns.": Columns,
     "columns.time.": TimeColumn,
+    "search.": Search,
     "resample.": Resample,
     "commands.": Command,
     "measurements.": Measurement,

@@ -49,7 +49,12 @@ def main() -> None:
     problem = sipe.prepare(CONFIG)
     began = time.monotonic()
     method = sipe.get_estimator(
-        problem.simulator, "laplace", prior=problem.prior, likelihood=problem.likelihood, seed=0
+        problem.simulator,
+        "laplace",
+        prior=problem.prior,
+        likelihood=problem.likelihood,
+        seed=0,
+        **problem.config.search.model_dump(),
     )
     posterior = method.fit(problem.train)
     seconds = time.monotonic() - began

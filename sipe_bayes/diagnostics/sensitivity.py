@@ -2,7 +2,8 @@
 
 From the same starts and under the same random actions, a parameter's value is changed by 10 % while the others stay at
 theta = 0.5; its sensitivity is the root-mean-square change of the observations, each in units of its own spread over the
-undisturbed episodes. Episodes are short, since a contact-rich simulation multiplies any change in the long run.
+undisturbed episodes (at least 0.001 of its unit) and at most 1, so that a channel that hardly varies does not drown the
+others. What random actions never touch, such as an object out of reach, counts as changing nothing. Episodes are short, since a contact-rich simulation multiplies any change in the long run.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta
 DEAD = 1e-4  # of the spread: below it a change moves nothing
 _CHANGE = 0.1  # of the value
 _EPISODES, _STEPS = 8, 25
+_LEAST_SPREAD = 1e-3  # m, rad, m/s, N, ...
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,7 @@ def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
         return motion.observations.reshape(*shape, -1)[:, :, 1:], motion.valid.reshape(shape)[:, :, 1:]
 
     middle, _ = observe(np.full((1, n), 0.5))
-    spread = middle[0].std(axis=(0, 1))
-    counted = spread > 1e-9
+    spread = np.maximum(middle[0].std(axis=(0, 1)), _LEAST_SPREAD)
     moved = np.empty((len(LEVELS), n))
     for row, level in enumerate(LEVELS):
         here, there = np.full((n, n), 0.5), np.full((n, n), 0.5)
@@ -79,7 +80,7 @@ def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
             sign = -1.0 if level == LEVELS[-1] else 1.0
             there[j, j] = parameter.normalise(float(parameter.value(level)) * (1 + sign * _CHANGE))
         (a, good_a), (b, good_b) = observe(here), observe(there)
-        change = (b - a)[..., counted] / spread[counted]
+        change = np.minimum(np.abs(b - a) / spread, 1.0)
         change = np.where((good_a & good_b)[..., None], change, np.nan)
         moved[row] = np.sqrt(np.nanmean(change**2, axis=(1, 2, 3)))
     return Sensitivity(moved, task.space.names)

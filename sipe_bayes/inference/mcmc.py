@@ -51,7 +51,8 @@ _CHECKED = 16  # draws on which the linearisation is checked
 class MCMC(Estimator):
     """Particles of an emcee ensemble; see the module's docstring.
 
-    walkers: default twice the dimensions plus two, at least 24. effective: effective draws at which it stops early,
+    restarts, candidates: of the ``laplace`` fit that comes first. walkers: default twice the dimensions plus two, at least
+    24. effective: effective draws at which it stops early,
     once R-hat is small too.
     """
 
@@ -59,7 +60,14 @@ class MCMC(Estimator):
     default_budget: ClassVar[int] = 50_000
 
     def __init__(
-        self, simulator: Any, *, walkers: int | None = None, effective: int = 400, **settings: Any
+        self,
+        simulator: Any,
+        *,
+        walkers: int | None = None,
+        effective: int = 400,
+        restarts: int = 2,
+        candidates: int = 4,
+        **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
         if self.likelihood.noise == "sandwich":
@@ -69,14 +77,22 @@ class MCMC(Estimator):
         if walkers is not None and walkers < 2 * len(self.space) + 2:
             raise ValueError(f"walkers: expected at least {2 * len(self.space) + 2}, got {walkers}")
         self.walkers, self.effective = walkers, effective
+        self.restarts, self.candidates = restarts, candidates
 
     def settings(self) -> dict[str, Any]:
-        return {**super().settings(), "walkers": self.walkers, "effective": self.effective}
+        own = ("walkers", "effective", "restarts", "candidates")
+        return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def start(self, trajectories: Trajectories) -> State:
         """Fit ``laplace``, which places the walkers and supplies the starts' Jacobian."""
         first = Laplace(
-            self.simulator, prior=self.prior, budget=self.budget, seed=self.seed, likelihood=self.likelihood
+            self.simulator,
+            prior=self.prior,
+            budget=self.budget,
+            seed=self.seed,
+            likelihood=self.likelihood,
+            restarts=self.restarts,
+            candidates=self.candidates,
         )
         windows = self.windows(trajectories)
         first._bound = (trajectories, windows)
