@@ -182,7 +182,9 @@ def print_task(found: dict[str, Any]) -> None:
     for p in found["parameters"]:
         console.print(Text(f"{p['name']} ({', '.join(p['writes'])}): {p['description']}"))
     for name in found["changes_nothing"]:
-        console.print(Text(f"{name} changes nothing under random actions: expect the prior back unless the actions do better"))
+        console.print(
+            Text(f"{name} changes nothing under random actions: expect the prior back unless the actions do better")
+        )
     for name, where in found["changes_nothing_at_theta"].items():
         console.print(Text(f"{name} changes nothing at theta = {', '.join(f'{w:g}' for w in where)}"))
 
