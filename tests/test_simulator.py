@@ -494,7 +494,7 @@ def call(**changes: Any) -> Any:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"theta": np.zeros((7, 2))}, r"expected 3 parameters on the last axis, got shape \(7, 2\)"),
+        ({"theta": np.zeros((7, 2))}, r"theta: expected 3 parameters, shape \(3,\), got \(7, 2\)"),
         ({"theta": 0.5}, "expected 3 parameters"),
         (
             {"theta": np.full((7, 3), 1.2)},

@@ -19,7 +19,7 @@ from sipe_bayes.simulator import Simulator
 FloatArray = NDArray[np.float64]
 
 LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta
-DEAD = 1e-4  # of the spread: below it a change moves nothing
+DEAD = 1e-3  # of the spread: below it a change moves nothing
 _CHANGE = 0.1  # of the value
 _EPISODES, _STEPS = 8, 25
 _LEAST_SPREAD = 1e-3  # m, rad, m/s, N, ...
