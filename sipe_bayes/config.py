@@ -342,7 +342,7 @@ class Search(Table):
     """How widely the optimum is looked for: starting points followed, and draws from the prior among which they are chosen."""
 
     restarts: Annotated[int, Strict(), Field(gt=0)] = 2
-    candidates: Annotated[int, Strict(), Field(ge=0)] = 4
+    candidates: Annotated[int, Strict(), Field(ge=0)] = 8
 
 
 class Config(Table):

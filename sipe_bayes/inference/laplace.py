@@ -83,7 +83,7 @@ class Laplace(Estimator):
         simulator: Any,
         *,
         restarts: int = 2,
-        candidates: int = 4,
+        candidates: int = 8,
         initial: FloatArray | None = None,
         **settings: Any,
     ) -> None:

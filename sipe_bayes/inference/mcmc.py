@@ -66,7 +66,7 @@ class MCMC(Estimator):
         walkers: int | None = None,
         effective: int = 400,
         restarts: int = 2,
-        candidates: int = 4,
+        candidates: int = 8,
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
