@@ -80,7 +80,7 @@ def envs(
 
     try:
         found: Any = tasks() if name is None else describe(name)
-    except ValueError as error:
+    except (ValueError, ImportError, OSError) as error:  # the two last: assets that are not installed
         print(f"sipe: {_one_line(error)}", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
     if as_json:

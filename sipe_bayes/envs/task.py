@@ -29,8 +29,7 @@ BoolArray = NDArray[np.bool_]
 Variant = Literal["default", "in_distribution", "out_of_distribution"]
 VARIANTS: tuple[Variant, ...] = ("default", "in_distribution", "out_of_distribution")
 
-_INSIDE = (0.1, 0.9)  # of an in-distribution theta
-_AWAY = 0.1  # its least distance from 0.5
+_INSIDE = (0.1, 0.4)  # how far from 0.5 an in-distribution theta lies
 _OUTSIDE = (0.05, 0.2)  # how far beyond the bounds an out-of-distribution theta lies
 
 
@@ -109,7 +108,7 @@ class Task(Environment):
 
     def goal_reward(self, achieved: FloatArray, goals: FloatArray) -> FloatArray:
         """(...,) of achieved and desired goals (..., G), for hindsight relabelling."""
-        raise NotImplementedError(f"{self.name} has no goals")
+        raise ValueError(f"goals: {self.name} has none; take the rewards of its steps")
 
     def control(self, model: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
         return actions
@@ -160,7 +159,7 @@ class Task(Environment):
         rng = np.random.default_rng(zlib.crc32(f"{self.name}/{variant}".encode()))
         sign = rng.choice((-1.0, 1.0), n)
         if variant == "in_distribution":
-            return 0.5 + sign * rng.uniform(_AWAY, _INSIDE[1] - 0.5, n)
+            return 0.5 + sign * rng.uniform(*_INSIDE, n)
         sign = sign if self.outside_sign is None else np.array(self.outside_sign, float)
         return 0.5 + sign * (0.5 + rng.uniform(*_OUTSIDE, n))
 
