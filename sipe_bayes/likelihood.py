@@ -22,6 +22,7 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
+from sipe_bayes.function_simulator import FunctionSimulator
 from sipe_bayes.noise import Moments, Noise, Sequence, sequences, whiten
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -93,13 +94,20 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
                 1 + model.nq + int(model.jnt_dofadr[joint]),
             )
             if position in measured and velocity not in measured:
-                states[:, velocity] = _smooth(measured[position], trajectory.dt, 1)
+                states[:, velocity] = smoothed(measured[position], trajectory.dt, 1)
     if measured:
-        states[:, list(measured)] = _smooth(np.stack(list(measured.values()), axis=1), trajectory.dt)
+        states[:, list(measured)] = smoothed(np.stack(list(measured.values()), axis=1), trajectory.dt)
     return states
 
 
-def _smooth(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
+def first_states(simulator: Simulator | FunctionSimulator, trajectories: Trajectories) -> FloatArray:
+    """Starting states (R, S) of R recorded trajectories: recorded, else estimated from the measurements."""
+    if isinstance(simulator, FunctionSimulator):
+        return simulator.first_states(trajectories)
+    return np.stack([estimate_states(simulator, t)[0] for t in trajectories])
+
+
+def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
     """Local quadratics over ``_SMOOTHING`` seconds, at least 5 samples, along the first axis."""
     span = min(max(5, 2 * round(_SMOOTHING / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
     if span < 3:

@@ -15,7 +15,7 @@ import hashlib
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -149,6 +149,34 @@ class Simulator:
         rewards = None if rewards is None else np.where(valid[:, 1:], rewards, 0.0)
         channels = self.environment.channels
         return Trajectories(whole.observations, actions, dts, length, valid, whole.states, (), channels, rewards)
+
+    def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:
+        """The recorded actions from the recorded starting states, for every theta (B, N): B * R trajectories, of theta 0 with
+        each of the R recorded ones, then of theta 1 ..., each as long as the recorded one.
+
+        starts (R, S): starting states to use instead. Raises ValueError where nothing tells the starting states."""
+        theta, count = np.atleast_2d(theta), len(trajectories)
+        if starts is None and trajectories.states is None:
+            raise ValueError("trajectories: they hold no states to start from; record them or pass starts (R, S)")
+        first = trajectories.states[:, 0] if starts is None else np.asarray(starts, float)  # type: ignore[index]
+        first = np.concatenate([np.zeros((count, 1)), first[:, 1:]], axis=1)
+        batch = len(theta)
+        result = self.rollout(
+            np.repeat(theta, count, axis=0),
+            np.tile(trajectories.actions, (batch, 1, 1)),
+            np.tile(first, (batch, 1)),
+            np.tile(trajectories.dt, batch),
+            list(trajectories.names or [None] * count) * batch,
+        )
+        length = np.tile(trajectories.length, batch)
+        inside = np.arange(result.valid.shape[1]) <= length[:, None]
+        return replace(
+            result,
+            observations=np.where(inside[..., None], result.observations, np.nan),
+            valid=result.valid & inside,
+            length=length,
+            names=tuple(trajectories.names) * batch,
+        )
 
     def _check(
         self, theta: FloatArray, actions: FloatArray, initial_state: FloatArray, allow_outside: bool

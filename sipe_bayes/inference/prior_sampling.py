@@ -1,0 +1,115 @@
+"""What the estimators that learn from simulations of the prior share: regression, MAML, BayesSim, NPE, ABC.
+
+Simulating goes block by block, kept in the cache; then the method trains once on what is valid. The trained state
+conditions on other trajectories, if their actions and starting states are those of the training's.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
+from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetExhausted, first_states
+from sipe_bayes.noise_level import noise_level
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+
+_FEWEST = 10  # valid simulations below which nothing is trained
+
+
+class PriorSampling(Estimator):
+    """Base of the estimators that simulate from the prior and then train.
+
+    cache: folder for simulations, shared between estimators of one seed; default beside the checkpoint, else in memory.
+    Simulated observations get the noise of the recorded ones: ``likelihood.noise_sd`` where stated, else none for
+    trajectories with recorded states, which come from a simulator, and for a measured log what smoothing it takes away.
+
+    A subclass writes ``train(simulations, trajectories) -> State``, of the valid simulations with noise added, and
+    ``infer(state, trajectories) -> Posterior``; both without simulating.
+    """
+
+    amortised: ClassVar[bool] = True
+
+    def __init__(self, simulator: Any, *, cache: str | Path | None = None, **settings: Any) -> None:
+        super().__init__(simulator, **settings)
+        beside = None if self.checkpoint is None else self.checkpoint.with_name("simulations")
+        self.cache = beside if cache is None else Path(cache)
+        self._cached: tuple[Trajectories, Cache] | None = None
+
+    @abstractmethod
+    def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
+        """Arrays, numbers and text that ``infer`` needs."""
+
+    @abstractmethod
+    def infer(self, state: State, trajectories: Trajectories) -> Posterior: ...
+
+    def start(self, trajectories: Trajectories) -> State:
+        self._check(trajectories)
+        return {"simulated": 0, "trained": False, "done": False}
+
+    def step(self, state: State, trajectories: Trajectories) -> State:
+        """A block of simulations, or the training once the budget is spent."""
+        most = self.budget // len(trajectories)
+        if not most:
+            raise BudgetExhausted(f"one simulation takes {len(trajectories)} rollouts, the budget is {self.budget}")
+        if state["simulated"] < most:
+            count = min(state["simulated"] + BLOCK, most)
+            self._simulations(trajectories).first(count)
+            self.rollouts = count * len(trajectories)
+            return {**state, "simulated": count}
+        return self._trained(state, trajectories)
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        self._check(trajectories)
+        return self.infer(state if state["trained"] else self._trained(state, trajectories), trajectories)
+
+    def describe(self, state: State) -> str:
+        return f"{self.name}: {'trained' if state['trained'] else 'simulating'}"
+
+    def simulations(self, state: State, trajectories: Trajectories) -> Simulations:
+        """The valid simulations so far, with noise."""
+        made = self._simulations(trajectories).first(state["simulated"])
+        said = describe_invalid(made, self.space)
+        if said is not None and said not in self.warnings:
+            self.warnings.append(said)
+        self.diagnostics["invalid_simulations"] = int((~made.valid).sum())
+        if made.valid.sum() < _FEWEST:
+            raise ValueError(
+                f"budget: {int(made.valid.sum())} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}; "
+                "raise the budget, or narrow the bounds"
+            )
+        observations = made.observations[made.valid]
+        sd = noise_level(trajectories, self.likelihood)
+        if sd.any():
+            rng = np.random.default_rng([self.seed, 1])
+            observations = observations + (sd * rng.standard_normal(observations.shape)).astype(np.float32)
+        return Simulations(made.theta[made.valid], observations, made.valid[made.valid])
+
+    def _trained(self, state: State, trajectories: Trajectories) -> State:
+        trained = self.train(self.simulations(state, trajectories), trajectories)
+        return {**state, **trained, "trained": True, "done": True}
+
+    def _simulations(self, trajectories: Trajectories) -> Cache:
+        if self._cached is None or self._cached[0] is not trajectories:
+            starts = first_states(self.simulator, trajectories)
+            made = Cache(self.simulator, self.prior, trajectories, starts, self.seed, self.cache)
+            self._cached = (trajectories, made)
+        return self._cached[1]
+
+    def _check(self, trajectories: Trajectories) -> None:
+        environment = self.simulator.environment
+        for name, array, count in (
+            ("observations of the channels", trajectories.observations, len(environment.channels)),
+            ("actions", trajectories.actions, environment.num_actions),
+        ):
+            if array.shape[2] != count:
+                raise ValueError(f"trajectories: expected {count} {name}, got {array.shape[2]}")
