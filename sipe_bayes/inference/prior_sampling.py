@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, first_states
+from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.trajectory import Trajectories
@@ -58,9 +60,11 @@ class PriorSampling(Estimator):
 
     def step(self, state: State, trajectories: Trajectories) -> State:
         """A block of simulations, or the training once the budget is spent."""
-        most = self.budget // len(trajectories)
-        if not most:
-            raise BudgetExhausted(f"one simulation takes {len(trajectories)} rollouts, the budget is {self.budget}")
+        most = self.budget // len(trajectories) - self.reserved
+        if most < 1:
+            raise BudgetExhausted(
+                f"{1 + self.reserved} simulations of {len(trajectories)} rollouts are the least, the budget is {self.budget}"
+            )
         if state["simulated"] < most:
             count = min(state["simulated"] + BLOCK, most)
             self._simulations(trajectories).first(count)
@@ -71,6 +75,15 @@ class PriorSampling(Estimator):
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
         self._check(trajectories)
         return self.infer(state if state["trained"] else self._trained(state, trajectories), trajectories)
+
+    @property
+    def reserved(self) -> int:
+        """Simulations kept for after the training."""
+        return 0
+
+    def simulate(self, theta: FloatArray, trajectories: Trajectories, rng: np.random.Generator) -> Simulations:
+        """Simulations of theta (n, N), which need not come from the prior, with noise; the caller counts them."""
+        return self._noisy(self._simulations(trajectories).simulate(theta), trajectories, rng)
 
     def describe(self, state: State) -> str:
         return f"{self.name}: {'trained' if state['trained'] else 'simulating'}"
@@ -87,12 +100,15 @@ class PriorSampling(Estimator):
                 f"budget: {int(made.valid.sum())} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}; "
                 "raise the budget, or narrow the bounds"
             )
-        observations = made.observations[made.valid]
+        valid = Simulations(made.theta[made.valid], made.observations[made.valid], made.valid[made.valid])
+        return self._noisy(valid, trajectories, np.random.default_rng([self.seed, 1]))
+
+    def _noisy(self, made: Simulations, trajectories: Trajectories, rng: np.random.Generator) -> Simulations:
         sd = noise_level(trajectories, self.likelihood)
-        if sd.any():
-            rng = np.random.default_rng([self.seed, 1])
-            observations = observations + (sd * rng.standard_normal(observations.shape)).astype(np.float32)
-        return Simulations(made.theta[made.valid], observations, made.valid[made.valid])
+        if not sd.any():
+            return made
+        noise = (sd * rng.standard_normal(made.observations.shape)).astype(np.float32)
+        return Simulations(made.theta, made.observations + noise, made.valid)
 
     def _trained(self, state: State, trajectories: Trajectories) -> State:
         trained = self.train(self.simulations(state, trajectories), trajectories)
@@ -113,3 +129,15 @@ class PriorSampling(Estimator):
         ):
             if array.shape[2] != count:
                 raise ValueError(f"trajectories: expected {count} {name}, got {array.shape[2]}")
+
+
+def recorded_steps(trajectories: Trajectories) -> torch.Tensor:
+    """The recorded control steps (M, 2 O + A) without missing samples; raises ValueError when there are none."""
+    steps = control_steps(trajectories.observations[None], trajectories.actions, trajectories.length)[0]
+    steps = steps[np.isfinite(steps).all(-1)]
+    if not len(steps):
+        raise ValueError(
+            "trajectories: expected control steps with all channels measured at both ends, got none; "
+            "resample the log, or leave out a channel that is rarely measured"
+        )
+    return torch.from_numpy(steps)

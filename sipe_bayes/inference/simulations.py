@@ -95,18 +95,21 @@ class Cache:
         old = self._blocks[block]
         generator = torch.Generator().manual_seed(int(np.random.SeedSequence([self.seed, block]).generate_state(1)[0]))
         theta = self.prior.sample((BLOCK,), generator=generator).numpy()[len(old) : rows]
-        motion = self.simulator.replay(theta, self.trajectories, self.starts)
-        count = len(self.trajectories)
-        inside = np.arange(motion.valid.shape[1]) <= motion.length[:, None]
-        valid = (motion.valid | ~inside).reshape(len(theta), -1).all(1)
-        seen = np.where(motion.valid[..., None], motion.observations, np.nan).astype(np.float32)
-        new = Simulations(theta, seen.reshape(len(theta), count, *seen.shape[1:]), valid)
-        parts = (old, new)
+        parts = (old, self.simulate(theta))
         both = Simulations(
             *(np.concatenate([getattr(p, name) for p in parts]) for name in ("theta", "observations", "valid"))
         )
         self._write(block, both)
         return both
+
+    def simulate(self, theta: FloatArray) -> Simulations:
+        """Simulations of any theta (n, N), which are not kept."""
+        motion = self.simulator.replay(theta, self.trajectories, self.starts)
+        count = len(self.trajectories)
+        inside = np.arange(motion.valid.shape[1]) <= motion.length[:, None]
+        valid = (motion.valid | ~inside).reshape(len(theta), -1).all(1)
+        seen = np.where(motion.valid[..., None], motion.observations, np.nan).astype(np.float32)
+        return Simulations(theta, seen.reshape(len(theta), count, *seen.shape[1:]), valid)
 
     def _write(self, block: int, simulations: Simulations) -> None:
         if self.folder is None:

@@ -66,9 +66,7 @@ class StepEmbedding(nn.Module):
     def __init__(self, step_features: int, features: int, hidden: int = 64) -> None:
         super().__init__()
         self.standardise = Standardise(step_features)
-        self.each = nn.Sequential(
-            nn.Linear(step_features, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
-        )
+        self.each = nn.Sequential(nn.Linear(step_features, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
         self.all = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, features))
 
     def forward(self, steps: Tensor) -> Tensor:

@@ -1,0 +1,108 @@
+"""Linear regression of theta on single control steps, by stochastic gradient: the SiPE paper's baseline.
+
+B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", section 2.3 and appendix: a single
+layer maps each concatenated (s, a, s') to theta; mean squared error, plain stochastic gradient, learning rate 0.001, batch 320.
+The estimate is the average over the recorded control steps: a Dirac.
+
+Deviations: inputs are standardised, and s' enters as s' - s (the same linear maps, better conditioned); at most 200 control
+steps of each simulation are used, spread evenly; training stops when held-out simulations no longer improve; the
+average is clipped to the cube.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import nn
+
+from sipe_bayes.inference.prior_sampling import PriorSampling, recorded_steps
+from sipe_bayes.inference.simulations import Simulations
+from sipe_bayes.inference.state import State
+from sipe_bayes.models.training import restore, split, weights
+from sipe_bayes.models.transitions import Standardise, control_steps
+from sipe_bayes.posterior import Dirac
+from sipe_bayes.trajectory import Trajectories
+
+_HELD_OUT = 0.1
+_PATIENCE = 5
+
+
+class Regression(PriorSampling):
+    """A Dirac; see the module's docstring.
+
+    learning_rate, batch: of the stochastic gradient, in control steps. epochs: passes at most.
+    """
+
+    name: ClassVar[str] = "regression"
+
+    def __init__(
+        self, simulator: Any, *, learning_rate: float = 1e-3, batch: int = 320, epochs: int = 100, **settings: Any
+    ) -> None:
+        super().__init__(simulator, **settings)
+        if not learning_rate > 0 or batch < 1 or epochs < 1:
+            raise ValueError(
+                f"learning_rate, batch, epochs: expected numbers above zero, got {learning_rate}, {batch}, {epochs}"
+            )
+        self.learning_rate, self.batch, self.epochs = learning_rate, batch, epochs
+
+    def settings(self) -> dict[str, Any]:
+        own = {"learning_rate": self.learning_rate, "batch": self.batch, "epochs": self.epochs}
+        return {**super().settings(), **own}
+
+    def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
+        generator = torch.Generator().manual_seed(self.seed)
+        steps = torch.from_numpy(control_steps(simulations.observations, trajectories.actions, trajectories.length))
+        theta = torch.tensor(simulations.theta, dtype=torch.float32)
+        network = _Linear(steps.shape[-1], len(self.space))
+        network.standardise.fit(steps)
+        network.bias.data.copy_(theta.mean(0))
+        inside, outside = split(len(theta), _HELD_OUT, generator)
+        inputs, targets = _rows(network, steps[inside], theta[inside])
+        held_inputs, held_targets = _rows(network, steps[outside], theta[outside])
+        optimiser = torch.optim.SGD(network.parameters(), self.learning_rate)
+        best, best_weights, waited = np.inf, weights(network), 0
+        for _ in range(self.epochs):
+            order = torch.randperm(len(inputs), generator=generator)
+            for chosen in order.split(self.batch):
+                optimiser.zero_grad(set_to_none=True)
+                (network.map(inputs[chosen]) - targets[chosen]).square().mean().backward()
+                optimiser.step()
+            with torch.no_grad():
+                loss = float((network.map(held_inputs) - held_targets).square().mean())
+            if loss < best * (1 - 1e-4):
+                best, best_weights, waited = loss, weights(network), 0
+            else:
+                waited += 1
+            if waited == _PATIENCE:
+                break
+        return {**best_weights, "held_out_loss": float(best)}
+
+    def infer(self, state: State, trajectories: Trajectories) -> Dirac:
+        steps = recorded_steps(trajectories)
+        network = _Linear(steps.shape[-1], len(self.space))
+        restore(network, state)
+        with torch.no_grad():
+            estimate = network.map(network.standardise(steps)).double().mean(0)
+        self.diagnostics["held_out_loss"] = state["held_out_loss"]
+        return Dirac(estimate.clamp(0, 1), self.space)
+
+
+class _Linear(nn.Module):
+    """Control steps (..., F) to theta (..., N)."""
+
+    def __init__(self, features: int, n: int) -> None:
+        super().__init__()
+        self.standardise = Standardise(features)
+        self.slope = nn.Parameter(torch.zeros(features, n))
+        self.bias = nn.Parameter(torch.zeros(n))
+
+    def map(self, standardised: torch.Tensor) -> torch.Tensor:
+        return standardised @ self.slope + self.bias
+
+
+def _rows(network: _Linear, steps: torch.Tensor, theta: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Finite control steps (m, F), standardised, and the theta (m, N) that each was simulated with."""
+    good = steps.isfinite().all(-1)
+    return network.standardise(steps[good]), theta[:, None].expand(-1, steps.shape[1], -1)[good]

@@ -1,0 +1,89 @@
+"""Training small networks: seeded, early stopping on held-out rows, weights as flat arrays for an estimator's state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+Loss = Callable[[Tensor], Tensor]
+"""Losses (b,) of the rows (b,) whose indices are given."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """batch rows a step, at most ``epochs`` passes; stops ``patience`` passes after the held-out loss was last better;
+    ``held_out`` share of the rows; learning rate of Adam, with weight decay."""
+
+    batch: int = 100
+    epochs: int = 500
+    patience: int = 20
+    held_out: float = 0.1
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Mean loss of the held-out rows, passes made, optimiser's steps, and whether it stopped by itself."""
+
+    held_out_loss: float
+    epochs: int
+    steps: int
+    converged: bool
+
+
+def split(rows: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Indices of training and held-out rows; at least one of each."""
+    order = torch.randperm(rows, generator=generator)
+    held = min(max(1, round(share * rows)), rows - 1)
+    return order[held:], order[:held]
+
+
+def train(network: nn.Module, loss: Loss, rows: int, settings: Training, generator: torch.Generator) -> Trained:
+    """Minimise the mean ``loss`` with Adam and leave the weights of the best held-out pass in ``network``."""
+    parameters = [p for p in network.parameters() if p.requires_grad]
+    optimiser = torch.optim.Adam(parameters, settings.learning_rate, weight_decay=settings.weight_decay, foreach=True)
+    inside, outside = split(rows, settings.held_out, generator)
+    best, best_weights, waited, steps = np.inf, _copy(network), 0, 0
+    for epoch in range(1, settings.epochs + 1):
+        shuffled = inside[torch.randperm(len(inside), generator=generator)]
+        for chosen in shuffled.split(settings.batch):
+            optimiser.zero_grad(set_to_none=True)
+            loss(chosen).mean().backward()
+            torch.nn.utils.clip_grad_norm_(parameters, 5.0)
+            optimiser.step()
+            steps += 1
+        with torch.no_grad():
+            now = float(torch.cat([loss(part) for part in outside.split(2000)]).mean())
+        if now < best - 1e-4:
+            best, best_weights, waited = now, _copy(network), 0
+        else:
+            waited += 1
+        if waited >= settings.patience:
+            break
+    network.load_state_dict(best_weights)
+    return Trained(best, epoch, steps, waited >= settings.patience)
+
+
+def _copy(network: nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
+
+
+def weights(network: nn.Module) -> dict[str, NDArray[np.generic]]:
+    """The network's weights and buffers as arrays, names prefixed ``weight.``."""
+    return {f"weight.{name}": tensor.detach().cpu().numpy().copy() for name, tensor in network.state_dict().items()}
+
+
+def restore(network: nn.Module, state: dict[str, object]) -> None:
+    """Put ``weights`` back."""
+    found = {
+        k.removeprefix("weight."): torch.from_numpy(v)
+        for k, v in state.items()
+        if isinstance(v, np.ndarray) and k.startswith("weight.")
+    }
+    network.load_state_dict(found)
