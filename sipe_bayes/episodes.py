@@ -75,12 +75,19 @@ class Episodes:
     def set_theta(self, lanes: NDArray[np.int64], theta: FloatArray) -> None:
         """Give ``lanes`` (L,) the parameters theta (L, N) or (N,); they hold from the next physics step on."""
         rows = self.simulator.check_theta(theta, self.allow_outside, len(lanes))
-        models: dict[bytes, Any] = {}
-        for row in rows:  # all of them before any lane is touched
-            if row.tobytes() not in models:
-                models[row.tobytes()] = self.simulator.written(row)
-        for lane, row in zip(lanes.tolist(), rows, strict=True):
-            self._models[lane], self.theta[lane] = models[row.tobytes()], row
+        groups: dict[bytes, list[int]] = {}
+        for index, row in enumerate(rows):
+            groups.setdefault(row.tobytes(), []).append(index)
+        for group in groups.values():  # all of them before any lane is touched
+            self.simulator.check_physical(rows[group[0]])
+        chosen = lanes.tolist()
+        kept = {id(m) for lane, m in enumerate(self._models) if lane not in set(chosen)}
+        free = {id(m): m for lane in chosen if (m := self._models[lane]) is not None and id(m) not in kept}
+        spare = list(free.values())
+        for group in groups.values():
+            model = self.simulator.written(rows[group[0]], spare.pop() if spare else None)
+            for index in group:
+                self._models[chosen[index]], self.theta[chosen[index]] = model, rows[index]
 
     def begin(self, lanes: BoolArray) -> None:
         """Begin a new episode in the marked lanes (B,)."""

@@ -16,6 +16,7 @@ import copy
 import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -32,6 +33,7 @@ FloatArray = NDArray[np.float64]
 _THETA_STEP = 1e-5  # finite differences, of the unit cube
 _START_STEP = 1e-5  # rad or m, rad/s or m/s
 _START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
+_ROUNDING = 1e-9  # of a channel's size
 _SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
 
 
@@ -45,7 +47,9 @@ class Segments:
 
     window: seconds, or None for each log as one window; ``windows`` overrides it for logs by name. noise: "ar1", "white", or "sandwich"
     (the optimum of white noise with the width of "ar1"; ``laplace`` only). fit: names of the channels whose
-    residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated.
+    residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated. starts: "estimated" with
+    theta, or "recorded": the trajectories' states are exact (they come from a simulator) and each window predicts the
+    samples after its start; ``window`` = dt then compares single control steps.
     """
 
     window: float | None = 0.5
@@ -53,8 +57,11 @@ class Segments:
     fit: tuple[str, ...] | None = None
     noise_sd: tuple[float | None, ...] | None = None
     windows: tuple[tuple[str, float | None], ...] = ()
+    starts: str = "estimated"
 
     def __post_init__(self) -> None:
+        if self.starts not in ("estimated", "recorded"):
+            raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
         if self.noise not in ("ar1", "white", "sandwich"):
             raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
@@ -141,6 +148,8 @@ class Windows:
             raise ValueError(
                 f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
             )
+        if settings.starts == "recorded" and trajectories.states is None:
+            raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
         self.channels = self._fitted(environment.channels)
         self._cut(trajectories)
         self._read_samples(trajectories)
@@ -178,7 +187,11 @@ class Windows:
         longest = int(self.steps.max())
         sample = self.start[:, None] + np.arange(longest + 1)
         last = self.start + self.steps == trajectories.length[self.log]
-        self.owned = np.arange(longest + 1) < (self.steps + last)[:, None]
+        place = np.arange(longest + 1)
+        if self.settings.starts == "recorded":
+            self.owned = (place >= 1) & (place <= self.steps[:, None])
+        else:
+            self.owned = place < (self.steps + last)[:, None]
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
         self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
@@ -189,10 +202,12 @@ class Windows:
         guesses = [estimate_states(simulator, t) for t in trajectories]
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
         reference[:, 0] = 0.0
+        self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         self.reference = environment.history(simulator.model, reference, self._past(trajectories), self._timestep())
         model = simulator.model
-        self.num_start = 2 * model.nv + model.na
-        sd = np.repeat(_START_SD, [model.nv, model.nv, model.na])
+        free = np.array([model.nv, model.nv, model.na]) * (self.settings.starts == "estimated")
+        self.num_start = int(free.sum())
+        sd = np.repeat(_START_SD, free)
         self.start_precision = sd**-2.0
 
     def _timestep(self) -> FloatArray:
@@ -222,10 +237,18 @@ class Windows:
         view, keep = copy.copy(self), np.flatnonzero(within % 2 == 0)
         for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):
             setattr(view, name, getattr(self, name)[keep])
+        view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]
         sample = view.start[:, None] + np.arange(view.observed.shape[1])
         view.sequences = sequences(view.observed, sample, view.log, view.dt)
         return view
+
+    @cached_property
+    def rounding(self) -> FloatArray:
+        """Noise sd (C,) below which finite differences are mostly rounding: what was simulated cannot be fitted closer."""
+        size = np.sqrt(np.nanmean(np.where(self.observed, self.measured, np.nan) ** 2, axis=(0, 1)))
+        moving = size[size > 0]
+        return _ROUNDING * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
 
     @property
     def num_windows(self) -> int:
@@ -243,6 +266,8 @@ class Windows:
         """Starting states (..., W, S) of starts (..., W, D)."""
         model = self.simulator.model
         out = np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
+        if not self.num_start:
+            return out
         nq, nv = model.nq, model.nv
         if nq == nv:
             out[..., 1 : 1 + nq] += starts[..., :nv]
@@ -268,7 +293,9 @@ class Windows:
         lanes = np.repeat(theta, self.num_windows, axis=0)
         states = self.states(starts).reshape(batch * self.num_windows, -1)
         actions = np.tile(self.actions, (batch, 1, 1))
-        result = self.simulator.rollout(lanes, actions, states, np.tile(self.dt, batch), self.names * batch)
+        goals = None if self.goals is None else np.tile(self.goals, (batch, 1))
+        dt, names = np.tile(self.dt, batch), self.names * batch
+        result = self.simulator.rollout(lanes, actions, states, dt, names, goals=goals)
         shape = (batch, self.num_windows)
         good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]

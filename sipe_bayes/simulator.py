@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -160,13 +161,14 @@ class Simulator:
             raise ValueError("trajectories: they hold no states to start from; record them or pass starts (R, S)")
         first = trajectories.states[:, 0] if starts is None else np.asarray(starts, float)  # type: ignore[index]
         first = np.concatenate([np.zeros((count, 1)), first[:, 1:]], axis=1)
-        batch = len(theta)
+        batch, goals = len(theta), self.environment.recorded_goals(trajectories.observations[:, 0])
         result = self.rollout(
             np.repeat(theta, count, axis=0),
             np.tile(trajectories.actions, (batch, 1, 1)),
             np.tile(first, (batch, 1)),
             np.tile(trajectories.dt, batch),
             list(trajectories.names or [None] * count) * batch,
+            goals=None if goals is None else np.tile(goals, (batch, 1)),
         )
         length = np.tile(trajectories.length, batch)
         inside = np.arange(result.valid.shape[1]) <= length[:, None]
@@ -321,13 +323,24 @@ class Simulator:
             motion.derived[run] = derived
         return motion
 
-    def written(self, theta: FloatArray) -> Any:
-        """A mujoco.MjModel of one's own with theta (N,) written in; raises ValueError for an unphysical one."""
-        model = copy.copy(self.model)
-        if not self._write_into(model, theta, float(model.opt.timestep), None):
+    def check_physical(self, theta: FloatArray) -> None:
+        """Raises ValueError for theta (N,) that no model can have."""
+        if not self.environment.write(self._trial, self._values(theta), None):
             named = ", ".join(f"{p.name} = {p.value(t):.4g} {p.unit}" for p, t in zip(self.space, theta, strict=True))
             raise ValueError(f"theta: unphysical parameters ({named}); choose values within the bounds")
+
+    def written(self, theta: FloatArray, model: Any = None) -> Any:
+        """A mujoco.MjModel of one's own with theta (N,) written in, or ``model``, an earlier one, written anew; raises
+        ValueError for an unphysical theta, and leaves ``model`` as it was."""
+        self.check_physical(theta)
+        model = copy.copy(self.model) if model is None else model
+        self._write_into(model, theta, float(self.model.opt.timestep), None)
         return model
+
+    @cached_property
+    def _trial(self) -> Any:
+        """A model that is only written to, to see whether a theta is physical."""
+        return copy.copy(self.model)
 
     def reset(
         self,

@@ -1,6 +1,6 @@
 """Recorded or simulated motion: one ``Trajectory``, or a padded batch ``Trajectories``.
 
-Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state); dt in seconds.
+Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state), rewards (T,); dt in seconds.
 Action t is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``:
 masked, never invented.
 """
@@ -26,8 +26,8 @@ BoolArray = NDArray[np.bool_]
 class Trajectory:
     """One trajectory of T control steps, ``dt`` seconds apart.
 
-    observations (T+1, O), NaN where there is no measurement; actions (T, A), finite; states (T+1, S) or None.
-    ``name`` is the log's name; ``channels`` names the O observed quantities.
+    observations (T+1, O), NaN where there is no measurement; actions (T, A), finite; states (T+1, S) or None;
+    rewards (T,) or None. ``name`` is the log's name; ``channels`` names the O observed quantities.
     """
 
     observations: FloatArray
@@ -36,6 +36,7 @@ class Trajectory:
     states: FloatArray | None = None
     name: str = ""
     channels: tuple[str, ...] = ()
+    rewards: FloatArray | None = None
 
     def __post_init__(self) -> None:
         label = f"trajectory {self.name!r}"
@@ -55,11 +56,15 @@ class Trajectory:
         states = None if self.states is None else np.asarray(self.states, dtype=np.float64)
         if states is not None and (states.ndim != 2 or len(states) != len(observations)):
             raise ValueError(f"{label}: expected states ({len(observations)}, S), got {states.shape}")
+        rewards = None if self.rewards is None else np.asarray(self.rewards, dtype=np.float64)
+        if rewards is not None and rewards.shape != (len(actions),):
+            raise ValueError(f"{label}: expected rewards ({len(actions)},), one for each step, got {rewards.shape}")
         if self.channels and len(self.channels) != observations.shape[1]:
             raise ValueError(f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels")
         object.__setattr__(self, "observations", observations)
         object.__setattr__(self, "actions", actions)
         object.__setattr__(self, "states", states)
+        object.__setattr__(self, "rewards", rewards)
 
     def __len__(self) -> int:
         """Control steps T."""
@@ -84,6 +89,7 @@ class Trajectory:
             states,
             self.name,
             self.channels,
+            None if self.rewards is None else self.rewards[start:stop],
         )
 
 
@@ -109,7 +115,8 @@ class Trajectories(Sequence[Trajectory]):
 
     @classmethod
     def stack(cls, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Trajectories:
-        """A batch of one or several trajectories, which may differ in length and dt."""
+        """A batch of one or several trajectories, which may differ in length and dt. States and rewards are kept where all
+        of them have them."""
         if isinstance(trajectories, Trajectories):
             return trajectories
         items = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
@@ -131,16 +138,19 @@ class Trajectories(Sequence[Trajectory]):
         states = None
         if with_states:
             states = np.full((batch, steps + 1, items[0].states.shape[1]), np.nan)  # type: ignore[union-attr]
+        rewards = np.zeros((batch, steps)) if all(t.rewards is not None for t in items) else None
         for i, t in enumerate(items):
             observations[i, : len(t) + 1], actions[i, : len(t)] = t.observations, t.actions
             if states is not None and t.states is not None:
                 states[i, : len(t) + 1] = t.states
+            if rewards is not None and t.rewards is not None:
+                rewards[i, : len(t)] = t.rewards
         length = np.array([len(t) for t in items])
         valid = np.arange(steps + 1)[None] <= length[:, None]
         names = tuple(t.name or str(i) for i, t in enumerate(items))
         dt = np.array([t.dt for t in items])
         names_of_channels = channels.pop() if channels else ()
-        return cls(observations, actions, dt, length, valid, states, names, names_of_channels)
+        return cls(observations, actions, dt, length, valid, states, names, names_of_channels, rewards)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -152,7 +162,9 @@ class Trajectories(Sequence[Trajectory]):
         states = None if self.states is None else self.states[key, : n + 1]
         name = self.names[key] if self.names else ""
         dt = float(self.dt[key])
-        return Trajectory(self.observations[key, : n + 1], self.actions[key, :n], dt, states, name, self.channels)
+        observations, actions = self.observations[key, : n + 1], self.actions[key, :n]
+        rewards = None if self.rewards is None else self.rewards[key, :n]
+        return Trajectory(observations, actions, dt, states, name, self.channels, rewards)
 
     def _subset(self, chosen: NDArray[np.int64]) -> Trajectories:
         if not len(chosen):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sipe_bayes.envs.fetch import Fetch, _euler
+from sipe_bayes.envs.fetch import _euler
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.simulator import Simulator
 
@@ -29,21 +29,6 @@ class _Integers:
         if name in ("mjtEq", "mjtJoint"):
             return types.SimpleNamespace(**{key: int(member) for key, member in value.__members__.items()})
         return value
-
-
-def steer(task: Fetch, observation: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Noisy actions (..., 4) that move the object: knock it sideways, or grasp it and bring it to the goal."""
-    grip, offset, goal = observation[..., :3], observation[..., 6:9], observation[..., 28:31]
-    action = rng.uniform(-0.2, 0.2, (*observation.shape[:-1], 4))
-    if task.scene.blocked:
-        action[..., :3] += 10 * offset
-        return action
-    above = np.linalg.norm(offset[..., :2], axis=-1, keepdims=True) > 0.02
-    there = np.linalg.norm(offset, axis=-1, keepdims=True) < 0.02
-    held = there & (observation[..., 9:10] < 0.0255)
-    action[..., :3] += 10 * np.where(held, goal - grip, offset + np.where(above, (0, 0, 0.08), 0.0))
-    action[..., 3:] += np.where(there, -1, 1)
-    return action
 
 
 def published(name: str) -> Any:
@@ -80,7 +65,7 @@ def drive(simulator: Simulator, steps: int, lanes: int = 3) -> tuple[FloatArray,
     step, rng, actions = simulator.reset(seed=5, count=lanes), np.random.default_rng(0), []
     start, goals = simulator.episodes.states.copy(), simulator.episodes.goals.copy()
     for _ in range(steps):
-        actions.append(steer(simulator.environment, step.observations, rng))
+        actions.append(simulator.environment.excitation(step.observations, rng))
         step = simulator.step(actions[-1])
     return start, goals, np.stack(actions, axis=1)
 
@@ -97,7 +82,7 @@ def test_it_starts_and_moves_as_published(simulator: Simulator, reference: Any) 
             observation["desired_goal"] = reference.goal
         observations.append(flat(observation))
         for _ in range(HORIZON):
-            actions.append(steer(task, observations[-1], rng))
+            actions.append(task.excitation(observations[-1], rng))
             observation, reward, _, _, info = reference.step(actions[-1])
             observations.append(flat(observation))
             rewards.append(reward)

@@ -22,7 +22,6 @@ from sipe_bayes.envs.fetch import Fetch
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Task
 from sipe_bayes.simulator import Simulator
-from tests.test_env_fetch import steer
 
 gymnasium.register_envs(sipe.gym)  # another test may have imported sipe_bayes before gymnasium
 STEPS = 12
@@ -245,7 +244,7 @@ def touching(simulator: Simulator, case: Case) -> Any:
     observation = task.observe(simulator.model, case.start, None, case.goals)
     actions = np.empty_like(case.actions)
     for t in range(actions.shape[1]):
-        actions[:, t] = steer(task, observation, rng)
+        actions[:, t] = task.excitation(observation, rng)
         observation = simulator.step(actions[:, t]).observations
     return actions
 

@@ -75,6 +75,10 @@ class Environment(ABC):
     ) -> FloatArray:
         """Observations (..., O) of states (..., S), sensordata (..., D) and goals (..., G), without sensor bias."""
 
+    def recorded_goals(self, observations: FloatArray) -> FloatArray | None:
+        """Goals (..., G) that observations (..., O) were made with; None of an environment without goals."""
+        return None
+
     def rewards(
         self, states: FloatArray, derived: FloatArray | None, actions: FloatArray, goals: FloatArray | None
     ) -> FloatArray | None:

@@ -219,6 +219,23 @@ class Fetch(Task):
         desired = np.broadcast_to(np.asarray(goals), place.shape)
         return np.concatenate([grip, place, place - grip, fingers, rotation, *moving, place, desired], axis=-1)
 
+    def excitation(self, observations: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Noisy actions (B, 4) that move the object: knock it sideways, or grasp it and bring it to the goal."""
+        grip, offset, goal = observations[..., :3], observations[..., 6:9], observations[..., 28:31]
+        action = rng.uniform(-0.2, 0.2, (*observations.shape[:-1], 4))
+        if self.scene.blocked:
+            action[..., :3] += 10 * offset
+            return np.clip(action, -1, 1)
+        above = np.linalg.norm(offset[..., :2], axis=-1, keepdims=True) > 0.02
+        there = np.linalg.norm(offset, axis=-1, keepdims=True) < 0.02
+        held = there & (observations[..., 9:10] < 0.0255)
+        action[..., :3] += 10 * np.where(held, goal - grip, offset + np.where(above, (0, 0, 0.08), 0.0))
+        action[..., 3:] += np.where(there, -1, 1)
+        return np.clip(action, -1, 1)
+
+    def recorded_goals(self, observations: FloatArray) -> FloatArray:
+        return observations[..., -self.goal_size :]
+
     def achieved_goals(self, states: FloatArray, derived: FloatArray | None) -> FloatArray:
         """Where the object was seen."""
         return states[..., self._sights["object"]].copy()

@@ -102,6 +102,10 @@ class Task(Environment):
         """(...,): whether the task is done at the end of the step; None where only the return counts."""
         return None
 
+    def excitation(self, observations: FloatArray, rng: np.random.Generator) -> FloatArray | None:
+        """Actions (B, A) that show the task's parameters from observations (B, O), where smooth random ones would not."""
+        return None
+
     def achieved_goals(self, states: FloatArray, derived: FloatArray | None) -> FloatArray | None:
         """(..., G): where a goal would have been reached; None without goals."""
         return None

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sipe_bayes.demonstration import Given
 from sipe_bayes.inference.state import State, load_state, save_state
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
 from sipe_bayes.posterior import Posterior
@@ -24,6 +25,8 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
+Recorded = Trajectory | Iterable[Trajectory] | Trajectories | Any
+"""One or several trajectories, or an environment: a task's name, a Task, a Simulator of one, ``sipe.make(...)``."""
 
 
 class Estimator(ABC):
@@ -86,6 +89,7 @@ class Estimator(ABC):
         self.diagnostics: dict[str, Any] = {}
         self._state: State | None = None
         self._bound: tuple[Trajectories, Windows] | None = None
+        self._given = Given()
 
     @abstractmethod
     def start(self, trajectories: Trajectories) -> State: ...
@@ -96,15 +100,16 @@ class Estimator(ABC):
     @abstractmethod
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior: ...
 
-    def fit(self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Posterior:
-        """The posterior given one or several trajectories; raises ValueError for ones that do not fit the simulator."""
-        batch = Trajectories.stack(trajectories)
+    def fit(self, trajectories: Recorded) -> Posterior:
+        """The posterior given one or several trajectories, or an environment, which stands for its reference demonstrations;
+        raises ValueError for ones that do not fit the simulator."""
+        batch = self._given.stack(trajectories, anew=True)
         fingerprint = self._fingerprint(batch)
         self.warnings, self.rollouts = [], 0
         state = None
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)
-            self.rollouts = self.windows(batch).rollouts = int(state["rollouts"])
+            self.rollouts, self._bound = int(state["rollouts"]), None  # windows, once bound, count from here
             self.warnings = list(state["warnings"])
         saved = time.monotonic()
         try:
@@ -128,26 +133,23 @@ class Estimator(ABC):
         self._state = state
         return self.posterior(state, batch)
 
-    def update_parameter_estimate(
-        self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories
-    ) -> None:
-        """One step of the method, as the paper's interface names it; trajectories may differ from step to step."""
-        batch = Trajectories.stack(trajectories)
+    def update_parameter_estimate(self, trajectories: Recorded) -> None:
+        """One step of the method, as the paper's interface names it; trajectories may differ from step to step. An
+        environment stands for its reference demonstrations."""
+        batch = self._given.stack(trajectories)
         if self._state is None:
             self._state = self._counted(self.start(batch), batch)
         if not self._state["done"]:
             self._state = self._counted(self.step(self._state, batch), batch)
 
-    def get_parameter_estimate(
-        self, trajectories: Trajectory | Iterable[Trajectory] | Trajectories
-    ) -> Posterior:
+    def get_parameter_estimate(self, trajectories: Recorded) -> Posterior:
         """The posterior of the present state."""
         if self._state is None:
             raise ValueError(
                 "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
             )
         self.warnings = list(self._state["warnings"])
-        return self.posterior(self._state, Trajectories.stack(trajectories))
+        return self.posterior(self._state, self._given.stack(trajectories))
 
     def describe(self, state: State) -> str:
         """What is being done, in a few words, for the progress bar."""

@@ -439,7 +439,7 @@ def _present_noise(windows: Windows, residual: FloatArray) -> Noise:
     """White noise with the root-mean-square of a residual (W, L, C), or the given sds."""
     fixed, counts = fixed_sd(windows), windows.observed.sum(axis=(0, 1))
     size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1))
-    return Noise(np.where(np.isnan(fixed), np.maximum(size, 1e-12), fixed), np.zeros(len(size)))
+    return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
 
 
 def _noise(
@@ -455,7 +455,9 @@ def _noise(
     arrow = eliminate(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
     context = pulls(windows, prior, theta, starts, arrow.gradient)
     shortest, longest = float(windows.dt.min()), longest_tau(windows)
-    return estimate_noise(moments, before, context, fixed_sd(windows), coloured, shortest, longest)
+    found = estimate_noise(moments, before, context, fixed_sd(windows), coloured, shortest, longest)
+    sd = np.where(np.isnan(fixed_sd(windows)), np.maximum(found.sd, windows.rounding), found.sd)
+    return Noise(sd, found.tau)
 
 
 def free_noise(windows: Windows) -> NDArray[np.int64]:

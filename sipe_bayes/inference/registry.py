@@ -10,8 +10,17 @@ if TYPE_CHECKING:
     from sipe_bayes.inference.base import Estimator
 
 ESTIMATORS = {
+    "regression": ("sipe_bayes.inference.regression", "Regression"),
+    "maml": ("sipe_bayes.inference.maml", "MAML"),
+    "bayessim": ("sipe_bayes.inference.bayessim", "BayesSim"),
     "laplace": ("sipe_bayes.inference.laplace", "Laplace"),
     "mcmc": ("sipe_bayes.inference.mcmc", "MCMC"),
+    "bayesopt": ("sipe_bayes.inference.bayesopt", "BayesOpt"),
+    "npe": ("sipe_bayes.inference.npe", "NPE"),
+    "abc": ("sipe_bayes.inference.abc", "ABC"),
+    "simopt": ("sipe_bayes.inference.simopt", "SimOpt"),
+    "adr": ("sipe_bayes.inference.adr", "ADR"),
+    "cem": ("sipe_bayes.inference.cem", "CEM"),
 }
 
 
@@ -27,11 +36,9 @@ def estimator_class(name: str) -> type[Estimator]:
 
 
 def get_estimator(simulator: Any, name: str, **settings: Any) -> Estimator:
-    """The estimator called ``name`` on ``simulator``, or on the benchmark's task of that name; settings as the class's own
-    (budget, seed, prior, ...)."""
-    if isinstance(simulator, str):
-        from sipe_bayes.envs.registry import make_task
-        from sipe_bayes.simulator import Simulator
+    """The estimator called ``name`` on ``simulator``, or on the simulator of a benchmark's task: its name, the Task, or the
+    Gymnasium environment of ``sipe.make``; settings as the class's own (budget, seed, prior, ...)."""
+    from sipe_bayes.demonstration import is_environment, simulator_of
 
-        simulator = Simulator(make_task(simulator))
-    return estimator_class(name)(simulator, **settings)
+    engine = simulator_of(simulator)[0] if is_environment(simulator) else simulator
+    return estimator_class(name)(engine, **settings)

@@ -2,19 +2,23 @@
 
 from sipe_bayes.posterior.base import NoDensityError, Posterior
 from sipe_bayes.posterior.dirac import Dirac
+from sipe_bayes.posterior.flow import Flow
 from sipe_bayes.posterior.independent import IndependentPrior, prior, uniform
 from sipe_bayes.posterior.mixture import GaussianMixture
 from sipe_bayes.posterior.particles import Particles
 from sipe_bayes.posterior.registry import FAMILIES, load_posterior
+from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
 __all__ = [
     "FAMILIES",
     "Dirac",
+    "Flow",
     "GaussianMixture",
     "IndependentPrior",
     "NoDensityError",
     "Particles",
     "Posterior",
+    "SurrogatePosterior",
     "load_posterior",
     "prior",
     "uniform",

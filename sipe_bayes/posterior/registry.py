@@ -18,6 +18,8 @@ FAMILIES: dict[str, str] = {
     "Particles": "sipe_bayes.posterior.particles",
     "GaussianMixture": "sipe_bayes.posterior.mixture",
     "IndependentPrior": "sipe_bayes.posterior.independent",
+    "SurrogatePosterior": "sipe_bayes.posterior.surrogate",
+    "Flow": "sipe_bayes.posterior.flow",
 }
 
 

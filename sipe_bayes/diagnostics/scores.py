@@ -1,0 +1,215 @@
+"""Scores of a posterior against a known truth, on one scale for points and distributions.
+
+The SiPE paper (Mehta, Handa, Fox, Ramos 2020, https://arxiv.org/abs/2011.08985) scores accuracy_j = 1 - |E theta_j - theta*_j|,
+which sees the mean alone. Beside it stand strictly proper scores (T. Gneiting, A. Raftery 2007, "Strictly Proper Scoring
+Rules, Prediction, and Estimation", JASA 102, https://doi.org/10.1198/016214506000001437), smallest in expectation for the
+true posterior, and for a point its plain error, so that points and distributions share an axis:
+
+    CRPS_j = E|theta_j - theta*_j| - 1/2 E|theta_j - theta_j'|,      energy = E|theta - theta*| - 1/2 E|theta - theta'|,
+
+theta, theta' independent draws, | | Euclidean. Dirac: absolute and Euclidean error. Particles are the discrete distribution
+that they are, weights included. Otherwise CRPS_j = 2 int (1[theta*_j < q_a] - a) (q_a - theta*_j) da with the quantiles q_a by
+the midpoint rule, and the energy score from draws, without bias (C. Ferro 2014, "Fair scores for ensemble forecasts").
+
+Mind: the prior's mean is a perfect guess of a truth at the centre of the range, and out of distribution, where the truth lies
+outside the support, only CRPS, energy score, ``distance`` and ``noticed`` mean anything.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from sipe_bayes.models.sbi_tools import import_sbi
+from sipe_bayes.posterior import Dirac, Particles, Posterior
+from sipe_bayes.posterior import prior as default_prior
+
+FloatArray = NDArray[np.float64]
+
+LEVELS = (0.5, 0.9, 0.95)  # of the central intervals
+AT_BOUND = 0.02  # of the range: a posterior whose median is nearer to a bound than that sits on it
+_QUANTILES = 400
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores in theta units, N parameters; smaller CRPS and energy, larger everything else, is better.
+
+    accuracy, crps and contraction (1 - sd / prior sd): one number for each parameter. energy: the energy score. nats: log
+    p(truth) - log prior(truth); None without a density, minus infinity outside the support. covered: level -> whether each
+    parameter's central interval holds the truth. skill_over_prior_mean and skill_over_prior: 1 - CRPS / CRPS of those, means
+    over parameters; None where they are exact. distance: of a truth outside [0, 1] to the nearest bound, else 0. noticed: of
+    a truth outside, whether the posterior's median sits on that bound; None inside.
+    """
+
+    names: tuple[str, ...]
+    accuracy: tuple[float, ...]
+    crps: tuple[float, ...]
+    energy: float
+    nats: float | None
+    covered: dict[str, tuple[bool, ...]]
+    contraction: tuple[float, ...]
+    skill_over_prior_mean: float | None
+    skill_over_prior: float | None
+    distance: tuple[float, ...]
+    noticed: tuple[bool | None, ...]
+
+    @property
+    def mean_accuracy(self) -> float:
+        return float(np.mean(self.accuracy))
+
+    @property
+    def min_accuracy(self) -> float:
+        return min(self.accuracy)
+
+    @property
+    def max_accuracy(self) -> float:
+        return max(self.accuracy)
+
+    @property
+    def mean_crps(self) -> float:
+        return float(np.mean(self.crps))
+
+    @property
+    def mean_contraction(self) -> float:
+        return float(np.mean(self.contraction))
+
+    def coverage(self, level: float) -> float:
+        """The share of parameters whose interval of ``level`` holds the truth; raises ValueError for another level."""
+        if str(level) not in self.covered:
+            raise ValueError(f"level: expected one of {', '.join(self.covered)}, got {level}")
+        return float(np.mean(self.covered[str(level)]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, for JSON, with the summaries over parameters."""
+        summaries = ("mean_accuracy", "min_accuracy", "max_accuracy", "mean_crps", "mean_contraction")
+        coverage = {level: self.coverage(float(level)) for level in self.covered}
+        return {**asdict(self), **{name: getattr(self, name) for name in summaries}, "coverage": coverage}
+
+
+def score(posterior: Posterior, truth: Any, prior: Posterior | None = None) -> Scores:
+    """Scores of a posterior against the truth (N,) in theta, which may lie outside [0, 1]. prior: what was believed before,
+    default what the parameters say. The same posterior has the same scores. Raises ValueError for another truth."""
+    theta = _checked(posterior, truth)
+    before = default_prior(posterior.space) if prior is None else prior
+    if before.space.names != posterior.space.names:
+        raise ValueError(f"prior: expected parameters {list(posterior.space.names)}, got {list(before.space.names)}")
+    error = crps(posterior, theta)
+    distance = np.maximum(np.maximum(-theta, theta - 1), 0.0)
+    return Scores(
+        names=posterior.space.names,
+        accuracy=_floats(1 - np.abs(posterior.mean.numpy() - theta)),
+        crps=_floats(error),
+        energy=energy_score(posterior, theta),
+        nats=nats(posterior, theta, before),
+        covered={str(level): _covered(posterior, theta, level) for level in LEVELS},
+        contraction=_floats(1 - posterior.stddev.numpy() / before.stddev.numpy()),
+        skill_over_prior_mean=_skill(error, crps(Dirac(before.mean, posterior.space), theta)),
+        skill_over_prior=_skill(error, crps(before, theta)),
+        distance=_floats(distance),
+        noticed=_noticed(posterior, theta),
+    )
+
+
+def crps(posterior: Posterior, truth: Any) -> FloatArray:
+    """Continuous ranked probability score (N,) against the truth (N,), each parameter by itself."""
+    theta = _checked(posterior, truth)
+    if isinstance(posterior, Dirac):
+        return np.abs(posterior.theta.numpy() - theta)
+    if isinstance(posterior, Particles):
+        points, weights = posterior.theta.numpy(), posterior.weights.numpy()
+        return weights @ np.abs(points - theta) - 0.5 * _spread(points, weights)
+    level = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    quantile = posterior.quantile(level).numpy()
+    return np.asarray(2 * np.mean(((theta < quantile) - level[:, None]) * (quantile - theta), axis=0))
+
+
+def _spread(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """E|x - x'| (N,) of weighted points (M, N): 2 sum_i w_i x_i (2 W_i - w_i - 1) with W the cumulative weight in order."""
+    order = np.argsort(points, axis=0)
+    sorted_points, sorted_weights = np.take_along_axis(points, order, 0), weights[order]
+    middle = np.cumsum(sorted_weights, axis=0) - sorted_weights / 2
+    return np.asarray(2 * (sorted_weights * sorted_points * (2 * middle - 1)).sum(0))
+
+
+def energy_score(posterior: Posterior, truth: Any, draws: int = _DRAWS, seed: int = 0) -> float:
+    """Energy score against the truth (N,); of more than ``draws`` particles, of as many picked evenly."""
+    theta = _checked(posterior, truth)
+    points, weights = _points(posterior, draws, seed)
+    error = float(weights @ np.linalg.norm(points - theta, axis=1))
+    if len(points) == 1:
+        return error
+    spread = float(weights @ cdist(points, points) @ weights)
+    if not isinstance(posterior, Particles):
+        spread *= len(points) / (len(points) - 1)  # a draw is not its own partner
+    return error - 0.5 * spread
+
+
+def _points(posterior: Posterior, draws: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Points (M, N) and weights (M,) that stand for a posterior."""
+    if isinstance(posterior, Dirac):
+        return posterior.theta.numpy()[None], np.ones(1)
+    if isinstance(posterior, Particles) and len(posterior.theta) <= draws:
+        return posterior.theta.numpy(), posterior.weights.numpy()
+    if isinstance(posterior, Particles):
+        cumulative = posterior.weights.numpy().cumsum()
+        rows = np.searchsorted(cumulative, (np.arange(draws) + 0.5) / draws * cumulative[-1])
+        return posterior.theta.numpy()[rows], np.full(draws, 1 / draws)
+    theta = posterior.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
+    return theta, np.full(draws, 1 / draws)
+
+
+def nats(posterior: Posterior, truth: Any, prior: Posterior) -> float | None:
+    """What was learnt about the truth (N,): log p(truth) - log prior(truth); None where either has no density, minus infinity
+    where the posterior excludes the truth."""
+    theta = torch.from_numpy(_checked(posterior, truth))
+    if not (posterior.has_density and prior.has_density):
+        return None
+    after = float(posterior.log_prob(theta).detach())
+    return after if math.isinf(after) else after - float(prior.log_prob(theta).detach())
+
+
+def c2st(posterior: Posterior, reference: Any, seed: int = 0) -> float:
+    """Accuracy of a classifier that tells draws of the posterior from ``reference`` draws (M, N): 0.5 when it cannot, 1 when it
+    always can. D. Lopez-Paz, M. Oquab 2017, "Revisiting Classifier Two-Sample Tests" (https://arxiv.org/abs/1610.06545), by
+    ``sbi.utils.metrics.c2st`` with its random forest. Raises ValueError for fewer than 20 reference draws."""
+    given = posterior.space.check_shape(reference)
+    if given.ndim != 2 or len(given) < 20:
+        raise ValueError(f"reference: expected at least 20 draws (M, {len(posterior.space)}), got {given.shape}")
+    own = posterior.sample((len(given),), generator=torch.Generator().manual_seed(seed)).float()
+    return float(import_sbi("utils.metrics").c2st(torch.from_numpy(given).float(), own, seed=seed + 1))
+
+
+def _checked(posterior: Posterior, truth: Any) -> FloatArray:
+    theta = posterior.space.check_shape(truth.numpy() if isinstance(truth, torch.Tensor) else truth)
+    if theta.ndim != 1 or not np.isfinite(theta).all():
+        raise ValueError(f"truth: expected {len(posterior.space)} finite numbers in theta, got {theta.tolist()}")
+    return theta
+
+
+def _covered(posterior: Posterior, theta: FloatArray, level: float) -> tuple[bool, ...]:
+    low, high = posterior.quantile([(1 - level) / 2, (1 + level) / 2]).numpy()
+    return tuple(bool(x) for x in (low <= theta) & (theta <= high))
+
+
+def _skill(error: FloatArray, reference: FloatArray) -> float | None:
+    worst = float(reference.mean())
+    return None if worst < 1e-12 else 1 - float(error.mean()) / worst
+
+
+def _noticed(posterior: Posterior, theta: FloatArray) -> tuple[bool | None, ...]:
+    median = posterior.quantile(0.5).numpy()
+    to_bound = np.where(theta < 0, median, 1 - median)
+    outside = (theta < 0) | (theta > 1)
+    return tuple(bool(d < AT_BOUND) if out else None for d, out in zip(to_bound, outside, strict=True))
+
+
+def _floats(array: FloatArray) -> tuple[float, ...]:
+    return tuple(float(x) for x in array)

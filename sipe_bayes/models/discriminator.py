@@ -1,0 +1,99 @@
+"""A network that tells recorded control steps from simulated ones, with its training state as flat arrays.
+
+I. Goodfellow et al. 2014, "Generative Adversarial Networks", https://arxiv.org/abs/1406.2661: with D the probability that
+x is recorded, binary cross-entropy
+
+    -E_recorded log D(x) - E_simulated log(1 - D(x))
+
+is least at D = p_recorded / (p_recorded + p_simulated), which is 1/2 where the two cannot be told apart.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import logsigmoid
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from sipe_bayes.models.transitions import Standardise
+
+FloatArray = NDArray[np.float64]
+
+HIDDEN = 128
+
+
+class Discriminator(nn.Module):
+    """Logit of "recorded" for features (..., F): two hidden layers of 128 tanh units, features standardised."""
+
+    def __init__(self, features: int, seed: int = 0, hidden: int = HIDDEN) -> None:
+        super().__init__()
+        self.standardise = Standardise(features)
+        self.layers = nn.Sequential(
+            nn.Linear(features, hidden), nn.Tanh(), nn.Linear(hidden, hidden), nn.Tanh(), nn.Linear(hidden, 1)
+        )
+        generator = torch.Generator().manual_seed(seed)
+        for layer in self.layers:
+            if isinstance(layer, nn.Linear):
+                nn.init.xavier_uniform_(layer.weight, generator=generator)
+                nn.init.zeros_(layer.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.layers(self.standardise(x))[..., 0]
+        return out
+
+
+class Training:
+    """A discriminator with Adam, saved to and read from flat numpy arrays so that training goes on exactly."""
+
+    def __init__(self, network: Discriminator, learning_rate: float) -> None:
+        self.network = network
+        self.optimiser = torch.optim.Adam(network.layers.parameters(), lr=learning_rate)
+        self.steps = 0
+
+    def step(self, recorded: Tensor, simulated: Tensor) -> float:
+        """One step on a batch of each (n, F); the loss before it."""
+        loss = -logsigmoid(self.network(recorded)).mean() / 2 - logsigmoid(-self.network(simulated)).mean() / 2
+        self.optimiser.zero_grad()
+        loss.backward()
+        self.optimiser.step()
+        self.steps += 1
+        return float(loss.detach())
+
+    def state(self) -> dict[str, Any]:
+        """Weights and Adam's moments (P,) each, number of steps, mean and sd (F,) of the standardisation."""
+        parameters = list(self.network.layers.parameters())
+        moments = [self.optimiser.state.get(p, {}) for p in parameters]
+        flat = {
+            name: torch.cat(
+                [m.get(name, torch.zeros_like(p)).flatten() for m, p in zip(moments, parameters, strict=True)]
+            )
+            for name in ("exp_avg", "exp_avg_sq")
+        }
+        return {
+            "weights": parameters_to_vector(parameters).detach().numpy().copy(),
+            "first_moment": flat["exp_avg"].numpy().copy(),
+            "second_moment": flat["exp_avg_sq"].numpy().copy(),
+            "steps": self.steps,
+            "mean": self.network.standardise.mean.numpy().copy(),
+            "sd": self.network.standardise.sd.numpy().copy(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` returned."""
+        parameters = list(self.network.layers.parameters())
+        vector_to_parameters(torch.tensor(state["weights"]), parameters)
+        sizes = [p.numel() for p in parameters]
+        first, second = (torch.tensor(state[name]).split(sizes) for name in ("first_moment", "second_moment"))
+        self.steps = int(state["steps"])
+        for p, a, b in zip(parameters, first, second, strict=True):
+            self.optimiser.state[p] = {
+                "step": torch.tensor(float(self.steps)),
+                "exp_avg": a.view_as(p).clone(),
+                "exp_avg_sq": b.view_as(p).clone(),
+            }
+        self.network.standardise.mean.copy_(torch.tensor(state["mean"]))
+        self.network.standardise.sd.copy_(torch.tensor(state["sd"]))

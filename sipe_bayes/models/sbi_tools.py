@@ -1,0 +1,54 @@
+"""sbi without its side effects, for ``npe`` and ``abc``: `import sbi` switches off torch.distributions' argument validation
+for the whole process, and some of its functions seed every global random generator."""
+
+from __future__ import annotations
+
+import importlib
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch.distributions import Distribution
+
+
+def import_sbi(module: str) -> Any:
+    """The module ``sbi.<module>``; argument validation stays as it was before."""
+    before = Distribution._validate_args
+    try:
+        return importlib.import_module(f"sbi.{module}")
+    finally:
+        Distribution.set_default_validate_args(before)
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """torch's, numpy's and Python's global generators seeded within, and as they were afterwards."""
+    legacy, plain = np.random.get_state(), random.getstate()  # noqa: NPY002
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        np.random.seed(seed % 2**32)  # noqa: NPY002
+        random.seed(seed)
+        try:
+            yield
+        finally:
+            np.random.set_state(legacy)  # noqa: NPY002
+            random.setstate(plain)
+
+
+class NoTracker:
+    """Keeps sbi from writing TensorBoard logs into the working directory."""
+
+    log_dir = None
+
+    def log_metric(self, name: str, value: float, step: int | None = None) -> None: ...
+
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None: ...
+
+    def log_params(self, params: dict[str, Any]) -> None: ...
+
+    def add_figure(self, name: str, figure: Any, step: int | None = None) -> None: ...
+
+    def flush(self) -> None: ...
