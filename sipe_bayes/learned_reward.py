@@ -90,7 +90,7 @@ class LearnedReward:
     def __call__(self, state: State, features: Features) -> FloatArray:
         """Reward (B,) of features (B, M, F): the mean of log D, -inf where the simulation diverged."""
         network = self._training(state).network
-        good = np.isfinite(features).all(-1)
+        good = np.asarray(np.isfinite(features).all(-1))
         x = torch.from_numpy(np.where(good[..., None], features, 0.0).astype(np.float32))
         x = self._noisy(x, np.random.default_rng([self.seed, 2]))
         with torch.no_grad():

@@ -69,7 +69,7 @@ def test_ranks() -> None:
 
 
 def test_recovery() -> None:
-    check_recovery("adr", 300, 3.0)
+    check_recovery("adr", 300, 2.5)
 
 
 def test_recovery_with_a_learned_reward() -> None:

@@ -50,12 +50,12 @@ def test_moments_of_many_elites_are_theirs_and_of_few_nearly_diagonal() -> None:
     np.testing.assert_allclose(mean, [0.4, 0.6], atol=0.01)
     np.testing.assert_allclose(found, covariance, rtol=0.05)
     few = elite_moments(many[:2])[1]
-    assert abs(few[0, 1]) < 0.51 * np.sqrt(few[0, 0] * few[1, 1])
+    assert abs(few[0, 1]) < 0.67 * np.sqrt(few[0, 0] * few[1, 1])
     assert np.linalg.eigvalsh(elite_moments(np.ones((2, 2)))[1]).min() > 0
 
 
 def test_recovery() -> None:
-    check_recovery("cem", 120, 5.0)
+    check_recovery("cem", 120, 4.0)
 
 
 def test_contract() -> None:

@@ -1,6 +1,6 @@
 """Is `npe` as good as the sbi it is built on? Two moons, against exact posterior draws and sbi called directly.
 
-    python examples/studies/npe_two_moons.py                                    # all cells: see below
+    python examples/studies/npe_two_moons.py                                    # all cells: about three hours
     python examples/studies/npe_two_moons.py --observations 2 --seeds 1 --budget 1000 --draws 500 --rounds 1
 
 Two moons (J.-M. Lueckmann et al. 2021, "Benchmarking Simulation-Based Inference", https://arxiv.org/abs/2101.04653, task T.8):
@@ -14,9 +14,9 @@ either sign of u, and theta thrown away outside the prior's square.
 
 Accuracy of a classifier that tells draws from exact ones (C2ST, sbi.utils.metrics.c2st), mean over the observations:
 0.5 is perfect. Each cell (method, seed) trains on its own simulations; ours and sbi's of one seed are the same ones. The
-"npe" and "sbi" cells condition one training on all observations; "npe rounds" trains for each. Cells are kept one by one
-in runs/, so an interrupted study goes on; the summary goes to results/. Times are of the training alone, in processor
-seconds.
+"npe" and "sbi" cells condition one training on all observations; several rounds are a cell for each observation, whose
+standard error is over observations. Cells are kept one by one in runs/, so an interrupted study goes on; the summary goes
+to results/. Times are processor seconds of the training alone, of several rounds with their simulations.
 """
 
 from __future__ import annotations
@@ -155,9 +155,10 @@ def direct(seed: int, budget: int, seen: np.ndarray, density: str) -> tuple[list
     return [sample(row) for row in seen], spent
 
 
-def cell(method: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
-    """One training (or one for each observation) and its C2ST on every observation."""
-    seen = observations(given.observations)
+def cell(method: str, seed: int, only: int | None, given: argparse.Namespace) -> dict[str, Any]:
+    """One training and its C2ST on every observation, or on the one that it is for."""
+    chosen = list(range(given.observations)) if only is None else [only]
+    seen = observations(given.observations)[chosen]
     if method == "npe":
         samplers, spent = ours(seed, given.budget, seen)
     elif method == "sbi":
@@ -166,10 +167,10 @@ def cell(method: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
         samplers, spent = sequential(seed, given.budget, given.rounds, seen)
     c2st = import_sbi("utils.metrics").c2st
     scores = []
-    for k, (x, sample) in enumerate(zip(seen, samplers, strict=True)):
+    for k, x, sample in zip(chosen, seen, samplers, strict=True):
         exact = exact_posterior(x, given.draws, np.random.default_rng([SEED, k, 1]))
         scores.append(float(c2st(torch.from_numpy(exact), torch.from_numpy(sample(given.draws)), seed=1)))
-    return {"method": method, "seed": seed, "c2st": scores, "train_seconds": spent}
+    return {"method": method, "seed": seed, "observation": only, "c2st": scores, "train_seconds": spent}
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -195,6 +196,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def _key(row: dict[str, Any]) -> tuple[str, int, int | None]:
+    return row["method"], row["seed"], row["observation"]
+
+
 def _error(values: np.ndarray) -> float | None:
     return round(float(values.std(ddof=1) / np.sqrt(len(values))), 4) if len(values) > 1 else None
 
@@ -214,30 +219,29 @@ def main() -> None:
         k: v for k, v in estimator(0, given.budget).settings().items() if k not in ("space", "seed")
     }
     settings["versions"] = {name: version(name) for name in ("sbi", "zuko", "torch", "numpy")}
-    cells = [(m, s) for s in range(given.seeds) for m in ("npe", "sbi")]
+    cells: list[tuple[str, int, int | None]] = [(m, s, None) for s in range(given.seeds) for m in ("npe", "sbi")]
     if given.rounds > 1:
-        cells.append((f"npe, {given.rounds} rounds", 0))
+        cells += [(f"npe, {given.rounds} rounds", 0, k) for k in range(given.observations)]
     kept = Path("runs") / f"{given.out.stem}.jsonl"
     kept.parent.mkdir(exist_ok=True)
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     plain = json.loads(json.dumps(settings))
     if any(row["setting"] != plain for row in rows):
         raise SystemExit(f"{kept}: holds cells of other settings; delete it to start again")
-    for method, seed in cells:
-        if any((row["method"], row["seed"]) == (method, seed) for row in rows):
+    for key in cells:
+        if any(_key(row) == key for row in rows):
             continue
-        rows.append({**cell(method, seed, given), "setting": plain})
+        rows.append({**cell(*key, given), "setting": plain})
         with kept.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
-        print(
-            method, seed, round(float(np.mean(rows[-1]["c2st"])), 4), f"{rows[-1]['train_seconds']:.1f} s", flush=True
-        )
-    used = [row for row in rows if (row["method"], row["seed"]) in cells]
+        print(*key, round(float(np.mean(rows[-1]["c2st"])), 4), f"{rows[-1]['train_seconds']:.1f} s", flush=True)
+    used = [row for row in rows if _key(row) in cells]
     options = " ".join(
         f"--{k} {getattr(given, k)}" for k in ("observations", "seeds", "budget", "draws", "rounds", "density")
     )
     command = f"python {Path(__file__).relative_to(HERE.parents[1])} {options}"
     found = {"command": command, **settings, **summary(used)}
+    given.out.parent.mkdir(parents=True, exist_ok=True)
     write_text(given.out, json.dumps(found, indent=2) + "\n")
     print(json.dumps(summary(used), indent=2))
 

@@ -26,6 +26,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from sipe_bayes.inference.base import AT_BOUND
 from sipe_bayes.models.sbi_tools import import_sbi
 from sipe_bayes.posterior import Dirac, Particles, Posterior
 from sipe_bayes.posterior import prior as default_prior
@@ -33,7 +34,6 @@ from sipe_bayes.posterior import prior as default_prior
 FloatArray = NDArray[np.float64]
 
 LEVELS = (0.5, 0.9, 0.95)  # of the central intervals
-AT_BOUND = 0.02  # of the range: a posterior whose median is nearer to a bound than that sits on it
 _QUANTILES = 400
 _DRAWS = 2000
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 
 from sipe_bayes.demonstration import Given
 from sipe_bayes.inference.state import State, load_state, save_state
@@ -22,6 +23,9 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
+
+AT_BOUND = 0.02  # of the range: a posterior whose median is nearer to a bound than that sits on it
+_NARROW = 0.5  # of the prior's sd: a posterior that is wider claims nothing
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
@@ -60,6 +64,7 @@ class Estimator(ABC):
 
     name: ClassVar[str]
     amortised: ClassVar[bool] = False
+    uses_prior: ClassVar[bool] = True
     default_budget: ClassVar[int] = 1000
     checkpoint_seconds: float = 1.0
 
@@ -127,11 +132,9 @@ class Estimator(ABC):
         except BudgetExhausted as error:
             if state is None:
                 raise ValueError(f"budget: {error}; raise it") from None
-            self.warnings.append(
-                f"the budget of {self.budget} rollouts ran out before the method had converged"
-            )
+            self.warnings.append(self._spent())
         self._state = state
-        return self.posterior(state, batch)
+        return self._finished(state, batch)
 
     def update_parameter_estimate(self, trajectories: Recorded) -> None:
         """One step of the method, as the paper's interface names it; trajectories may differ from step to step. An
@@ -140,7 +143,14 @@ class Estimator(ABC):
         if self._state is None:
             self._state = self._counted(self.start(batch), batch)
         if not self._state["done"]:
-            self._state = self._counted(self.step(self._state, batch), batch)
+            try:
+                self._state = self._counted(self.step(self._state, batch), batch)
+            except BudgetExhausted:
+                self.warnings.append(self._spent())
+                self._state = self._counted({**self._state, "done": True}, batch)
+
+    def _spent(self) -> str:
+        return f"the budget of {self.budget} rollouts ran out before the method had converged"
 
     def get_parameter_estimate(self, trajectories: Recorded) -> Posterior:
         """The posterior of the present state."""
@@ -149,7 +159,23 @@ class Estimator(ABC):
                 "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
             )
         self.warnings = list(self._state["warnings"])
-        return self.posterior(self._state, self._given.stack(trajectories))
+        return self._finished(self._state, self._given.stack(trajectories))
+
+    def _finished(self, state: State, trajectories: Trajectories) -> Posterior:
+        """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
+        posterior = self.posterior(state, trajectories)
+        middle = posterior.quantile(torch.tensor([0.5], dtype=torch.float64))[0].numpy()
+        narrow = posterior.stddev.numpy() <= _NARROW * self.prior.stddev.numpy()
+        at = [
+            n
+            for n, m, sharp in zip(self.space.names, middle, narrow, strict=True)
+            if sharp and min(m, 1 - m) < AT_BOUND
+        ]
+        if at:
+            self.warnings.append(
+                f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
+            )
+        return posterior
 
     def describe(self, state: State) -> str:
         """What is being done, in a few words, for the progress bar."""

@@ -62,6 +62,7 @@ _PARENTS, _CHANGED = 5, 10  # best points that are changed, coordinates that cha
 _CLIMBS, _CLIMB_STEPS = 3, 20  # candidates that climb together, iterations of L-BFGS
 _CHECKED = 2000  # draws of the prior from which one of the posterior is picked
 _TAIL = 1e-4  # of the prior on each side is not searched
+_CLEAR_ACCEPTANCE = 0.01  # probability of epsilon at the median draw below which the posterior is said to be room alone
 _CLEAR_ERROR = 0.2  # nats, standard error of log Z above which the density is said to be rough
 _MIXED_RHAT, _MIXED_ESS = 1.05, 400
 
@@ -286,8 +287,11 @@ class BayesOpt(Estimator):
     def _report(self, state: State, process: GaussianProcess, found: SurrogatePosterior, starts_known: bool) -> None:
         diverged, count = int((~np.isfinite(state["cost"])).sum()), len(state["cost"])
         mixing = found.mixing
+        with torch.no_grad():
+            likely = float(log_acceptance(process, found.epsilon, found.draws[::10]).median().exp())
         self.diagnostics = {
             "mixing": mixing,
+            "median_acceptance": likely,
             "evaluations": count,
             "diverged": diverged,
             "lowest_cost": float(state["cost"].min()),
@@ -313,6 +317,11 @@ class BayesOpt(Estimator):
             doubts.append(
                 f"the draws have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective): evaluate more "
                 "before you trust the intervals"
+            )
+        if likely < _CLEAR_ACCEPTANCE:
+            doubts.append(
+                f"most of the posterior lies where a cost as low as epsilon is improbable ({likely:.1g}), because there is "
+                "so much room there: the intervals are about the prior's; take the mode, evaluate more, or free fewer parameters"
             )
         if found.normaliser_error > _CLEAR_ERROR:
             doubts.append(

@@ -125,12 +125,15 @@ class CEM(Search):
             raise ValueError(f"budget: {self.budget} rollouts were not enough for one simulation; raise it")
         self.report(state)
         good = np.isfinite(state["pool_reward"])
+        if not good.any():
+            return Particles(np.clip(state["mean"], 0, 1)[None], self.space)
         theta, reward = state["pool_theta"][good], state["pool_reward"][good]
         self.diagnostics["search"] = {
             "generations": state["generations"],
             "largest_sd": float(np.sqrt(np.diag(state["covariance"]).max())),
             "best_cost": float(-reward.max()),
         }
+        self.warn_if_wide(self.diagnostics["search"]["largest_sd"])
         return Particles(theta, self.space, best=theta[reward.argmax()])
 
 

@@ -24,6 +24,7 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
+_WIDE_SD = 0.15
 _SWEEPS = 10  # of Gibbs sampling for draws that fell outside the cube
 REWARDS = ("state_difference", "learned")
 
@@ -32,19 +33,23 @@ class Search(Estimator):
     """Base of the methods that simulate where they expect good rewards.
 
     reward: "state_difference", minus the cost of ``discrepancy.StateDifference``, or "learned", a discriminator's (see
-    ``learned_reward``). The State holds pool_theta (P, N), pool_reward (P,), -inf where the simulation diverged,
+    ``learned_reward``) whose Adam has ``learning_rate``. The State holds pool_theta (P, N), pool_reward (P,), -inf where the simulation diverged,
     pool_draw (P,), the number of the draw that each came from, and, with learned rewards, pool_features (P, M, F) and the
     discriminator.
     """
 
+    uses_prior: ClassVar[bool] = False
     rewards: ClassVar[tuple[str, ...]] = REWARDS
-    learning_rate: float = 0.001
 
-    def __init__(self, simulator: Any, *, reward: str = "state_difference", **settings: Any) -> None:
+    def __init__(
+        self, simulator: Any, *, reward: str = "state_difference", learning_rate: float = 0.001, **settings: Any
+    ) -> None:
         super().__init__(simulator, **settings)
         if reward not in self.rewards:
             raise ValueError(f"reward: expected one of {', '.join(self.rewards)}, got {reward!r}")
-        self.reward = reward
+        if not learning_rate > 0:
+            raise ValueError(f"learning_rate: expected a positive number, got {learning_rate}")
+        self.reward, self.learning_rate = reward, learning_rate
         self._learned: tuple[Trajectories, LearnedReward] | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -127,6 +132,13 @@ class Search(Estimator):
             self.warn(
                 f"{state['diverged']} of {state['simulated']} simulations diverged and counted as worst; "
                 "narrow the bounds if they are many"
+            )
+
+    def warn_if_wide(self, sd: float) -> None:
+        """A warning where the search distribution's largest sd says that the search was cut short."""
+        if sd > _WIDE_SD:
+            self.warn(
+                f"the search is still wide (sd {sd:.2f} of the bounds' range): raise the budget, or expect nothing of it"
             )
 
     def warn(self, sentence: str) -> None:

@@ -123,12 +123,15 @@ class PriorSampling(Estimator):
 
     def _check(self, trajectories: Trajectories) -> None:
         environment = self.simulator.environment
-        for name, array, count in (
-            ("observations of the channels", trajectories.observations, len(environment.channels)),
-            ("actions", trajectories.actions, environment.num_actions),
-        ):
-            if array.shape[2] != count:
-                raise ValueError(f"trajectories: expected {count} {name}, got {array.shape[2]}")
+        channels, found = list(environment.channels), trajectories.observations.shape[2]
+        if found != len(channels):
+            raise ValueError(
+                f"trajectories: expected observations of the {len(channels)} channels {channels}, got {found}"
+            )
+        if trajectories.actions.shape[2] != environment.num_actions:
+            raise ValueError(
+                f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
+            )
 
 
 def recorded_steps(trajectories: Trajectories) -> torch.Tensor:

@@ -152,6 +152,7 @@ class SimOpt(Search):
             "effective_particles": result.effective_size,
             "best_reward": float(reward.max()),
         }
+        self.warn_if_wide(self.diagnostics["search"]["largest_sd"])
         return result
 
 

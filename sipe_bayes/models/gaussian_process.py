@@ -126,18 +126,15 @@ def _subset(y: Tensor, seed: int) -> Tensor:
 def _hyper_parameters(
     x: Tensor, z: Tensor, previous: GaussianProcess | None, iterations: int
 ) -> tuple[Tensor, float, float]:
+    import gpytorch  # type: ignore[import-untyped]
     from botorch.models import SingleTaskGP
     from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
     from botorch.optim.fit import fit_gpytorch_mll_scipy
-    from gpytorch.constraints import GreaterThan
-    from gpytorch.likelihoods import GaussianLikelihood
-    from gpytorch.mlls import ExactMarginalLogLikelihood
-    from gpytorch.priors import LogNormalPrior
 
     kernel = get_covar_module_with_dim_scaled_prior(ard_num_dims=x.shape[1], use_rbf_kernel=False)
-    likelihood = GaussianLikelihood(
-        noise_prior=LogNormalPrior(-7.0, 2.0),
-        noise_constraint=GreaterThan(_LEAST_NOISE, transform=None, initial_value=1e-3),
+    likelihood = gpytorch.likelihoods.GaussianLikelihood(
+        noise_prior=gpytorch.priors.LogNormalPrior(-7.0, 2.0),
+        noise_constraint=gpytorch.constraints.GreaterThan(_LEAST_NOISE, transform=None, initial_value=1e-3),
     )
     with warnings.catch_warnings():
         warnings.simplefilter(
@@ -147,7 +144,7 @@ def _hyper_parameters(
         if previous is not None:
             kernel.lengthscale, likelihood.noise = previous.lengthscale, max(previous.noise, 2 * _LEAST_NOISE)
             model.mean_module.constant = previous.level
-        mll = ExactMarginalLogLikelihood(likelihood, model).double()
+        mll = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model).double()
         fit_gpytorch_mll_scipy(mll, options={"maxiter": iterations})
     with torch.no_grad():
         lengthscale = kernel.lengthscale.reshape(-1).clone()

@@ -57,7 +57,7 @@ class SurrogatePosterior(Posterior):
     """p(theta) proportional to prior(theta) Phi((epsilon - mu) / sqrt(s^2 + sigma^2)); see the module's docstring.
 
     process: the Gaussian process over the transformed discrepancy. epsilon: the threshold on it. prior: a posterior with a
-    density over the same space. draws (M, N): ``chains`` equal consecutive Markov chains. log_normaliser: log Z, and
+    density over the same space. draws (M, N): ``chains`` equal consecutive Markov chains, or 1: independent draws. log_normaliser: log Z, and
     normaliser_error its standard error. ``SurrogatePosterior.sampled`` makes draws and normaliser. Works inside
     ``pyro.sample``.
     """
@@ -162,6 +162,8 @@ class SurrogatePosterior(Posterior):
         return climbed if float(self._log_prob(climbed[None])) > float(density.max()) else start
 
     def _chains(self, num_draws: int, generator: Generator | None) -> Tensor:
+        if self.chains == 1:
+            return super()._chains(num_draws, generator)
         return self.draws.reshape(self.chains, -1, len(self.space))
 
     def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -250,34 +252,36 @@ class _Mixture:
 
     def __init__(self, warm: FloatArray, prior: Posterior, random: np.random.RandomState) -> None:
         self.prior, n = prior, warm.shape[1]
-        covariance = np.atleast_2d(np.cov(warm.T)) + 1e-10 * np.eye(n)
-        self.factor = np.linalg.cholesky(covariance)
-        self.mean = warm.mean(0)
-        self.width = max(len(warm) ** (-1 / (n + 4)), 0.1)
+        self.mean, self.factor = warm.mean(0), _factor(warm)
         self.centres = warm[random.randint(len(warm), size=_KERNELS)]
+        self.kernel = max(len(warm) ** (-1 / (n + 4)), 0.1) * _factor(_core(warm))
+
+    def _normal(self, count: int, factor: FloatArray, random: np.random.RandomState) -> FloatArray:
+        return random.standard_normal((count, len(self.mean))) @ factor.T
 
     def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
         """z (count, N)."""
         kind = random.choice(3, size=count, p=_SHARES)
-        normal = random.standard_normal((count, len(self.mean))) @ self.factor.T
-        kernels = self.centres[random.randint(len(self.centres), size=count)] + self.width * normal
+        normal = self.mean + self._normal(count, self.factor, random)
+        kernels = self.centres[random.randint(len(self.centres), size=count)] + self._normal(count, self.kernel, random)
         return np.where(
             (kind == 0)[:, None],
             _prior_draws(self.prior, count, random),
-            np.where((kind == 1)[:, None], self.mean + normal, kernels),
+            np.where((kind == 1)[:, None], normal, kernels),
         )
 
     def log_density(self, z: FloatArray) -> FloatArray:
         """(n,) of z (n, N)."""
-        n = z.shape[1]
-        constant = -np.log(np.diag(self.factor)).sum() - n / 2 * _LOG_2PI
-        white, centres = (np.linalg.solve(self.factor, a.T).T for a in (z - self.mean, self.centres - self.mean))
-        square = (white**2).sum(1)
-        far = square[:, None] + (centres**2).sum(1) - 2 * white @ centres.T
-        kernels = np.logaddexp.reduce(-0.5 * np.maximum(far, 0) / self.width**2, axis=1) - np.log(len(centres))
+        half = z.shape[1] / 2 * _LOG_2PI
+        white = np.linalg.solve(self.factor, (z - self.mean).T)
+        normal = -0.5 * (white**2).sum(0) - np.log(np.diag(self.factor)).sum() - half
+        points, centres = (np.linalg.solve(self.kernel, (a - self.mean).T).T for a in (z, self.centres))
+        far = (points**2).sum(1)[:, None] + (centres**2).sum(1) - 2 * points @ centres.T
+        kernels = np.logaddexp.reduce(-0.5 * np.maximum(far, 0), axis=1) - math.log(len(centres))
+        kernels -= np.log(np.diag(self.kernel)).sum() + half
         with torch.no_grad():
             prior = self.prior._log_prob(_theta(z)).numpy() + _log_jacobian(z)
-        parts = [prior, constant - square / 2, constant - n * np.log(self.width) + kernels]
+        parts = [prior, normal, kernels]
         return np.asarray(
             np.logaddexp.reduce([p + np.log(share) for p, share in zip(parts, _SHARES, strict=True)], axis=0)
         )
@@ -285,6 +289,23 @@ class _Mixture:
     def __call__(self, walkers: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
         proposed = self.draw(len(walkers), random)
         return proposed, self.log_density(walkers) - self.log_density(proposed)
+
+
+def _factor(z: FloatArray) -> FloatArray:
+    covariance = np.atleast_2d(np.cov(z.T))
+    return np.linalg.cholesky(
+        covariance + (1e-12 + 1e-9 * np.trace(covariance) / len(covariance)) * np.eye(len(covariance))
+    )
+
+
+def _core(z: FloatArray) -> FloatArray:
+    """The half of z (n, N) that lies closest together: kernels as wide as far tails would miss a narrow peak."""
+    kept = z
+    for _ in range(3):
+        white = np.linalg.solve(_factor(kept), (z - np.median(kept, axis=0)).T)
+        square = (white**2).sum(0)
+        kept = z[square <= np.median(square)]
+    return kept
 
 
 def _importance(

@@ -1,0 +1,174 @@
+"""The Estimator contract, for every method of the registry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sipe_bayes.inference import ESTIMATORS, get_estimator
+from sipe_bayes.inference.registry import estimator_class
+from sipe_bayes.inference.state import CheckpointError
+from sipe_bayes.posterior import IndependentPrior, Posterior, load_posterior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+from tests.pendulums import log, pendulum
+
+NAMES = list(ESTIMATORS)
+BUDGET = 400
+TRUTH = [0.6, 0.05]
+
+
+def draws(posterior: Posterior, count: int = 200) -> torch.Tensor:
+    return posterior.sample((count,), generator=torch.Generator().manual_seed(0))
+
+
+class Fragile(Simulator):
+    """A pendulum that diverges half-way wherever its rod is among the heaviest tenth."""
+
+    def __init__(self) -> None:
+        super().__init__(pendulum().environment, num_threads=1)
+
+    def rollout(self, theta: Any, *args: Any, **settings: Any) -> Trajectories:
+        made = super().rollout(theta, *args, **settings)
+        half = made.observations.shape[1] // 2
+        bad = np.broadcast_to(np.atleast_2d(theta)[:, 0] > 0.9, (len(made),))
+        late = bad[:, None] & (np.arange(made.observations.shape[1]) >= half)
+        return replace(
+            made, observations=np.where(late[..., None], np.nan, made.observations), valid=made.valid & ~late
+        )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_support_seeds_budget_and_files(name: str, tmp_path: Path) -> None:
+    """Two logs of different lengths with missing samples; the same seed gives the same bits; a saved posterior is the same."""
+    simulator = pendulum()
+    logs = [log(simulator, TRUTH, 1, "a", steps=120), log(simulator, TRUTH, 2, "b", steps=90)]
+    logs[0].observations[20:40] = np.nan
+    fits = [get_estimator(simulator, name, seed=3, budget=BUDGET) for _ in range(2)]
+    one, other = (f.fit(logs) for f in fits)
+    assert draws(one).dtype == torch.float64
+    assert draws(one).shape == (200, 2)
+    assert ((draws(one) >= 0) & (draws(one) <= 1)).all()
+    assert one.mean.shape == one.stddev.shape == one.mode.shape == (2,)
+    assert 0 < fits[0].rollouts <= BUDGET
+    assert torch.equal(draws(one), draws(other))
+    one.save(tmp_path / "posterior")
+    again = load_posterior(tmp_path / "posterior")
+    assert torch.equal(draws(one), draws(again))
+    assert torch.equal(one.mean, again.mean)
+    if one.has_density:
+        theta = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        assert torch.equal(one.log_prob(theta), again.log_prob(theta))
+
+
+class Interrupted(Exception):
+    """Stands for a killed process."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: Path) -> None:
+    simulator = pendulum()
+    trajectory = log(simulator, TRUTH, 1, steps=100)
+    undisturbed = get_estimator(simulator, name, seed=5, budget=BUDGET).fit(trajectory)
+    steps = 0
+
+    def interrupt(*_: Any) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 3:
+            raise Interrupted
+
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    settings = {"seed": 5, "budget": BUDGET, "checkpoint": checkpoint}
+    first = get_estimator(simulator, name, progress=interrupt, **settings)
+    first.checkpoint_seconds = 0.0
+    with pytest.raises(Interrupted):
+        first.fit(trajectory)
+    assert checkpoint.exists()
+    resumed = get_estimator(pendulum(), name, **settings).fit(trajectory)
+    assert torch.equal(draws(undisturbed), draws(resumed))
+    with pytest.raises(CheckpointError, match="belongs to another run"):
+        get_estimator(simulator, name, **{**settings, "seed": 6}).fit(trajectory)
+    checkpoint.write_bytes(b"nonsense")
+    with pytest.raises(CheckpointError, match="delete it"):
+        get_estimator(simulator, name, **settings).fit(trajectory)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_trajectories_of_another_environment_are_refused(name: str) -> None:
+    other = Trajectory(np.zeros((101, 3)), np.zeros((100, 1)), 0.01)
+    with pytest.raises(ValueError, match="expected observations of the 1 channels"):
+        get_estimator(pendulum(), name, budget=BUDGET).fit(other)
+    other = Trajectory(np.zeros((101, 1)), np.zeros((100, 2)), 0.01)
+    with pytest.raises(ValueError, match="expected 1 actions"):
+        get_estimator(pendulum(), name, budget=BUDGET).fit(other)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_diverging_simulations_are_survived(name: str) -> None:
+    """A tenth of the prior diverges: the fit goes on, and gives as good a mean as without, to a tenth of the range."""
+    trajectory = log(pendulum(), [0.5, 0.12], 1, steps=120)
+    fragile = get_estimator(Fragile(), name, seed=1, budget=BUDGET)
+    sound = get_estimator(pendulum(), name, seed=1, budget=BUDGET).fit(trajectory)
+    posterior = fragile.fit(trajectory)
+    print(name, posterior.mean, sound.mean, fragile.warnings)
+    assert torch.isfinite(draws(posterior)).all()
+    assert (posterior.mean - sound.mean).abs().max() < 0.15
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_truth_outside_the_prior_raises_suspicion(name: str) -> None:
+    """The rod is three times as heavy as the bounds allow. A truth well inside raises none."""
+    suspicious = ("at a bound", "unlike")
+    heavy = light()
+    outside = get_estimator(heavy, name, seed=2, budget=BUDGET)
+    outside.fit(log(pendulum(), [0.99, 0.01], 1, steps=200))
+    assert any(word in w for w in outside.warnings for word in suspicious), outside.warnings
+    inside = get_estimator(heavy, name, seed=2, budget=BUDGET)
+    inside.fit(log(heavy, [0.2, 0.1], 1, steps=200))
+    assert not any(word in w for w in inside.warnings for word in suspicious), inside.warnings
+
+
+def light() -> Simulator:
+    """A pendulum whose rod is believed to be between 0.1 and 0.3 kg."""
+    from sipe_bayes.envs.mjcf import MjcfEnvironment
+    from sipe_bayes.parameters import Parameter
+    from tests.pendulums import XML
+
+    parameters = [
+        Parameter("rod_mass", 0.1, 0.33, targets=("body:rod.mass",)),
+        Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",)),
+    ]
+    return Simulator(
+        MjcfEnvironment.build(XML.replace('mass="0.6"', 'mass="0.2"'), parameters, ["motor"], ["joint:hinge.position"]),
+        num_threads=1,
+    )
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if estimator_class(n).uses_prior])
+def test_a_prior_counts(name: str) -> None:
+    """A narrow prior far from the data's answer pulls the posterior to it."""
+    simulator = pendulum()
+    trajectory = log(simulator, TRUTH, 1, steps=100)
+    prior = IndependentPrior([0.9, 0.5], [1e-3, float("inf")], simulator.space)
+    posterior = get_estimator(simulator, name, prior=prior, budget=BUDGET).fit(trajectory)
+    assert abs(float(posterior.mean[0]) - 0.9) < 2e-2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_papers_loop(name: str) -> None:
+    """update_parameter_estimate as often as one likes, get_parameter_estimate in between; no budget is overdrawn."""
+    simulator = pendulum()
+    trajectory = log(simulator, TRUTH, 1, steps=100)
+    estimator = get_estimator(simulator, name, budget=BUDGET)
+    with pytest.raises(ValueError, match="nothing has been fitted"):
+        estimator.get_parameter_estimate(trajectory)
+    for _ in range(40):
+        estimator.update_parameter_estimate(trajectory)
+    assert estimator.rollouts <= BUDGET
+    assert torch.isfinite(estimator.get_parameter_estimate(trajectory).mean).all()
