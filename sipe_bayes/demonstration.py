@@ -193,7 +193,9 @@ def _exciting_actions(
         if chosen is None:
             return actions
         actions[t] = chosen[0]
-        state = simulator.rollout(theta, actions[None, t : t + 1], state, allow_outside=True, goals=goal).states[:, 1]
+        moved = simulator.rollout(theta, actions[None, t : t + 1], state, allow_outside=True, goals=goal).states
+        assert moved is not None
+        state = moved[:, 1]
     return actions
 
 

@@ -300,7 +300,7 @@ class Windows:
         good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
         predicted = np.where(good[..., None], predicted, np.nan)
-        return predicted, (good | ~self.owned).all(axis=(1, 2))
+        return predicted, np.asarray((good | ~self.owned).all(axis=(1, 2)))
 
     def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Measured minus predicted (B, W, L, C), zero where nothing was measured, and which of the B are valid."""

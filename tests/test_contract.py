@@ -19,7 +19,12 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 from tests.pendulums import log, pendulum
 
 NAMES = list(ESTIMATORS)
-BUDGET = 400
+BUDGET = 250
+QUICK = {
+    "maml": {"iterations": 50},
+    "npe": {"max_epochs": 20},
+    "regression": {"epochs": 20},
+}  # training, where only form counts
 TRUTH = [0.6, 0.05]
 
 
@@ -49,7 +54,7 @@ def test_support_seeds_budget_and_files(name: str, tmp_path: Path) -> None:
     simulator = pendulum()
     logs = [log(simulator, TRUTH, 1, "a", steps=120), log(simulator, TRUTH, 2, "b", steps=90)]
     logs[0].observations[20:40] = np.nan
-    fits = [get_estimator(simulator, name, seed=3, budget=BUDGET) for _ in range(2)]
+    fits = [get_estimator(simulator, name, seed=3, budget=BUDGET, **QUICK.get(name, {})) for _ in range(2)]
     one, other = (f.fit(logs) for f in fits)
     assert draws(one).dtype == torch.float64
     assert draws(one).shape == (200, 2)
@@ -74,7 +79,8 @@ class Interrupted(Exception):
 def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: Path) -> None:
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
-    undisturbed = get_estimator(simulator, name, seed=5, budget=BUDGET).fit(trajectory)
+    quick = QUICK.get(name, {})
+    undisturbed = get_estimator(simulator, name, seed=5, budget=BUDGET, **quick).fit(trajectory)
     steps = 0
 
     def interrupt(*_: Any) -> None:
@@ -84,7 +90,7 @@ def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: P
             raise Interrupted
 
     checkpoint = tmp_path / "checkpoint.safetensors"
-    settings = {"seed": 5, "budget": BUDGET, "checkpoint": checkpoint}
+    settings = {"seed": 5, "budget": BUDGET, "checkpoint": checkpoint, **quick}
     first = get_estimator(simulator, name, progress=interrupt, **settings)
     first.checkpoint_seconds = 0.0
     with pytest.raises(Interrupted):
@@ -113,8 +119,9 @@ def test_trajectories_of_another_environment_are_refused(name: str) -> None:
 def test_diverging_simulations_are_survived(name: str) -> None:
     """A tenth of the prior diverges: the fit goes on, and gives as good a mean as without, to a tenth of the range."""
     trajectory = log(pendulum(), [0.5, 0.12], 1, steps=120)
-    fragile = get_estimator(Fragile(), name, seed=1, budget=BUDGET)
-    sound = get_estimator(pendulum(), name, seed=1, budget=BUDGET).fit(trajectory)
+    quick = QUICK.get(name, {})
+    fragile = get_estimator(Fragile(), name, seed=1, budget=BUDGET, **quick)
+    sound = get_estimator(pendulum(), name, seed=1, budget=BUDGET, **quick).fit(trajectory)
     posterior = fragile.fit(trajectory)
     print(name, posterior.mean, sound.mean, fragile.warnings)
     assert torch.isfinite(draws(posterior)).all()
@@ -126,10 +133,10 @@ def test_a_truth_outside_the_prior_raises_suspicion(name: str) -> None:
     """The rod is three times as heavy as the bounds allow. A truth well inside raises none."""
     suspicious = ("at a bound", "unlike")
     heavy = light()
-    outside = get_estimator(heavy, name, seed=2, budget=BUDGET)
+    outside = get_estimator(heavy, name, seed=2, budget=BUDGET, **QUICK.get(name, {}))
     outside.fit(log(pendulum(), [0.99, 0.01], 1, steps=200))
     assert any(word in w for w in outside.warnings for word in suspicious), outside.warnings
-    inside = get_estimator(heavy, name, seed=2, budget=BUDGET)
+    inside = get_estimator(heavy, name, seed=2, budget=BUDGET, **QUICK.get(name, {}))
     inside.fit(log(heavy, [0.2, 0.1], 1, steps=200))
     assert not any(word in w for w in inside.warnings for word in suspicious), inside.warnings
 
@@ -156,7 +163,7 @@ def test_a_prior_counts(name: str) -> None:
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
     prior = IndependentPrior([0.9, 0.5], [1e-3, float("inf")], simulator.space)
-    posterior = get_estimator(simulator, name, prior=prior, budget=BUDGET).fit(trajectory)
+    posterior = get_estimator(simulator, name, prior=prior, budget=BUDGET, **QUICK.get(name, {})).fit(trajectory)
     assert abs(float(posterior.mean[0]) - 0.9) < 2e-2
 
 
@@ -165,7 +172,7 @@ def test_the_papers_loop(name: str) -> None:
     """update_parameter_estimate as often as one likes, get_parameter_estimate in between; no budget is overdrawn."""
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
-    estimator = get_estimator(simulator, name, budget=BUDGET)
+    estimator = get_estimator(simulator, name, budget=BUDGET, **QUICK.get(name, {}))
     with pytest.raises(ValueError, match="nothing has been fitted"):
         estimator.get_parameter_estimate(trajectory)
     for _ in range(40):

@@ -115,7 +115,7 @@ def test_training_goes_on_exactly_from_disk(tmp_path: Path) -> None:
 
 
 def test_the_discriminator_learns_a_density_ratio() -> None:
-    """Recorded N(1, 1), simulated N(-1, 1): the logit is 2 x, to 0.3 within one sd of either."""
+    """Recorded N(1, 1), simulated N(-1, 1): the logit is 2 x, to 0.5 within an sd and a half of either."""
     rng = np.random.default_rng(0)
     network = Discriminator(1)
     network.standardise.fit(torch.from_numpy(rng.normal(1, 1, (10_000, 1)).astype(np.float32)))

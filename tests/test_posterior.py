@@ -30,12 +30,14 @@ from sipe_bayes.posterior import (
     prior,
     uniform,
 )
+from sipe_bayes.posterior.flow import Flow, spline_flow
 from sipe_bayes.posterior.truncated_normal import (
     TruncatedNormal,
     interval_moments,
     interval_quantile,
     log_interval,
 )
+from tests.surrogates import example_surrogate
 
 SIGMAS = 5.0
 
@@ -70,6 +72,15 @@ def example_particles(n: int) -> Particles:
     return Particles(rng.beta(2, 3, (400, n)), space_of(n), rng.exponential(size=400), best=rng.random(n))
 
 
+def example_flow(n: int) -> Flow:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        net = spline_flow(n, 4, 2, 8, 4)
+    architecture = {"transforms": 2, "hidden": 8, "bins": 4}
+    mild = {name: 0.5 * tensor for name, tensor in net.state_dict().items()}
+    return Flow(mild, torch.ones(4), torch.zeros(n), torch.ones(n), space_of(n), **architecture)
+
+
 EXAMPLES: dict[str, Callable[[int], Posterior]] = {
     "Dirac": lambda n: Dirac(np.linspace(0.2, 0.9, n), space_of(n)),
     "Particles": example_particles,
@@ -77,6 +88,8 @@ EXAMPLES: dict[str, Callable[[int], Posterior]] = {
     "IndependentPrior": lambda n: IndependentPrior(
         np.linspace(-0.2, 0.7, n), [math.inf if j % 2 else 0.3 for j in range(n)], space_of(n)
     ),
+    "SurrogatePosterior": lambda n: example_surrogate(space_of(n)),
+    "Flow": example_flow,
 }
 
 
@@ -106,10 +119,10 @@ def test_samples_agree_with_moments(posterior: Posterior) -> None:
     theta = posterior.sample((n,), generator=seeded(2))
     assert theta.dtype == torch.float64
     assert bool(((theta >= 0) & (theta <= 1)).all())
-    error = posterior.stddev / math.sqrt(n)
+    error = posterior.stddev * math.sqrt(2 / n)  # a family may take its moments from as many draws
     assert bool(((theta.mean(0) - posterior.mean).abs() <= SIGMAS * error + 1e-12).all())
     products = (theta - posterior.mean)[:, :, None] * (theta - posterior.mean)[:, None, :]
-    error = products.std(0) / math.sqrt(n)
+    error = products.std(0) * math.sqrt(2 / n)
     # 1e-3: the covariance of a correlated truncated mixture is itself from quasi-random points
     slack = 1e-3 * float(posterior.variance.max()) + 1e-12
     assert bool(((products.mean(0) - posterior.covariance).abs() <= SIGMAS * error + slack).all())

@@ -25,8 +25,6 @@ from sipe_bayes.inference.prior_sampling import PriorSampling
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
 from sipe_bayes.models.sbi_tools import import_sbi, seeded
-from sipe_bayes.models.statistics import step_statistics
-from sipe_bayes.models.transitions import MOST_STEPS, control_steps
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.flow import to_cube, to_line
 from sipe_bayes.trajectory import Trajectories
@@ -34,7 +32,6 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 _FEW = 30  # accepted draws below which their spread says little
-_ROWS = 256  # simulations whose control steps are held at once
 _SPARE = 2  # accepted simulations for each coefficient of the regression
 
 
@@ -58,18 +55,14 @@ class ABC(PriorSampling):
 
     def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
         """Nothing but the scale of the statistics is learned."""
-        parts = [
-            self._statistics(simulations.observations[i : i + _ROWS], trajectories)
-            for i in range(0, len(simulations), _ROWS)
-        ]
-        statistics = np.concatenate(parts)
+        statistics = self.statistics(simulations.observations, trajectories)
         sd = statistics.std(0)
         varies = sd > 1e-7 * (np.abs(statistics).max(0) + 1e-30)
         scale = np.where(varies, sd, np.inf)
         return {"theta": simulations.theta, "statistics": statistics, "scale": scale}
 
     def infer(self, state: State, trajectories: Trajectories) -> Posterior:
-        observed = self._statistics(trajectories.observations[None], trajectories)
+        observed = self.statistics(trajectories.observations[None], trajectories)
         if not np.isfinite(observed).all():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
         varies = np.isfinite(state["scale"])
@@ -105,27 +98,11 @@ class ABC(PriorSampling):
             )
         return accepted.double(), summary["distances"].numpy()
 
-    def _statistics(self, observations: NDArray[np.floating], trajectories: Trajectories) -> FloatArray:
-        """(n, F) of observations (n, R, T+1, O), without the samples that the log lacks."""
-        actions = trajectories.actions
-        seen = np.where(np.isfinite(trajectories.observations), observations, np.nan)
-        most = max(MOST_STEPS, int(trajectories.length.sum()))
-        steps = control_steps(seen, actions, trajectories.length, most)
-        return step_statistics(steps, seen.shape[-1], actions.shape[-1])
-
     def _report(self, distances: FloatArray, simulated: FloatArray, target: FloatArray) -> None:
         spread = float(np.sqrt(2 * simulated.shape[1]))  # distance of two independent simulations, root mean square
         self.diagnostics.update(accepted=len(distances), epsilon=float(distances.max()), nearest=float(distances.min()))
         self.diagnostics["epsilon_relative"] = float(distances.max()) / spread
-        low, high = simulated.min(0), simulated.max(0)
-        outside = int(((target < low) | (target > high)).sum())
-        self.diagnostics["statistics_outside"] = outside
         sentences = []
-        if outside:
-            sentences.append(
-                f"{outside} of the log's {len(target)} statistics lie outside of all simulations'; "
-                "widen the bounds or correct the model"
-            )
         if len(distances) < _FEW:
             sentences.append(
                 f"only {len(distances)} simulations were accepted; raise the budget or the accepted fraction"

@@ -64,6 +64,7 @@ _CHECKED = 2000  # draws of the prior from which one of the posterior is picked
 _TAIL = 1e-4  # of the prior on each side is not searched
 _CLEAR_ACCEPTANCE = 0.01  # probability of epsilon at the median draw below which the posterior is said to be room alone
 _CLEAR_ERROR = 0.2  # nats, standard error of log Z above which the density is said to be rough
+_AT_BOUND = 2e-3  # of the range
 _MIXED_RHAT, _MIXED_ESS = 1.05, 400
 
 
@@ -309,6 +310,9 @@ class BayesOpt(Estimator):
                 "the trajectories have no recorded states: errors of the windows' estimated starts are not in the posterior; "
                 "compare it with laplace or mcmc"
             )
+        at = [n for n, x in zip(self.space.names, found.best.tolist(), strict=True) if min(x, 1 - x) < _AT_BOUND]
+        if at:
+            doubts.append(f"the best point has {', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds")
         if diverged:
             doubts.append(
                 f"{diverged} of {count} simulations diverged and count as the worst finite cost: narrow the bounds"

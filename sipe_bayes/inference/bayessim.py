@@ -7,9 +7,8 @@ p~ instead of the prior p, the answer is q p / p~.
 
 - ``features``: "mlp" (two layers of 24 tanh units) or "random_fourier" (quasi-Monte Carlo, Matern-5/2), then a linear layer.
 - ``summary``: "statistics", or "learned": a network on each control step, averaged, trained with the mixture.
-- ``rounds`` > 1 draws later rounds from the answer so far. The correction p / p~ weighs the loss (J.-M. Lueckmann et al. 2017,
-  "Flexible statistical inference for mechanistic models of neural dynamics") instead of dividing mixtures, which need not
-  leave a density; one draw in five still comes from the prior, so no weight is above 5.
+- ``rounds`` > 1 draws later rounds where the answer so far has its mass: truncated proposals, for which the correction
+  p / p~ is one (``inference.rounds``), instead of dividing mixtures, which need not leave a density.
 
 Deviations: the mixture is restricted to the cube, with its true normaliser; statistics are averages over control steps, so that
 length does not matter; early stopping on held-out simulations; standardised inputs.
@@ -24,11 +23,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from sipe_bayes.inference.prior_sampling import PriorSampling
+from sipe_bayes.inference.rounds import Rounds
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
 from sipe_bayes.models.mixture_density import Features, MixtureDensity
-from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.training import Training, restore, train, weights
 from sipe_bayes.models.transitions import StepEmbedding, control_steps
 from sipe_bayes.posterior import GaussianMixture
@@ -36,10 +34,9 @@ from sipe_bayes.trajectory import Trajectories
 
 _WIDTH = {"mlp": 24, "random_fourier": 500}
 _LEARNED = 32  # summaries
-_EVERY_STEP = 10_000  # control steps that the statistics look at
 
 
-class BayesSim(PriorSampling):
+class BayesSim(Rounds):
     """A GaussianMixture; see the module's docstring.
 
     components: of the mixture. training: of the network, ``models.training.Training``. device: where it is trained.
@@ -103,22 +100,15 @@ class BayesSim(PriorSampling):
         if not inputs.isfinite().any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
         self.diagnostics.update({name: state[name] for name in ("held_out_loss", "epochs", "converged")})
-        return GaussianMixture(*network.mixture(inputs), self.space)
+        log_weights, means, covariances = network.mixture(inputs)
+        return GaussianMixture(log_weights, means, covariances, self.space)
 
     def _inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> NDArray[np.float32]:
         """What the network reads of n simulations: statistics (n, I) or control steps (n, M, F)."""
-        environment = self.simulator.environment
         if self.summary == "learned":
-            return control_steps(observations, trajectories.actions, trajectories.length)
-        parts = [
-            step_statistics(
-                control_steps(rows, trajectories.actions, trajectories.length, _EVERY_STEP),
-                len(environment.channels),
-                environment.num_actions,
-            )
-            for rows in np.split(observations, range(100, len(observations), 100))
-        ]
-        return np.concatenate(parts).astype(np.float32)
+            seen = np.where(np.isfinite(trajectories.observations), observations, np.nan)
+            return control_steps(seen, trajectories.actions, trajectories.length)
+        return self.statistics(observations, trajectories).astype(np.float32)
 
     def _network(self, trajectories: Trajectories) -> _Summarised:
         environment = self.simulator.environment

@@ -61,7 +61,7 @@ class MAML(PriorSampling):
         hidden: int = 60,
         learning_rate: float = 0.005,
         tasks: int = 10,
-        iterations: int = 2000,
+        iterations: int = 1000,
         patience: int = 8,
         device: str = "cpu",
         **settings: Any,
@@ -214,8 +214,8 @@ class _Regressor(nn.Module):
         """Answer with about theta (N,) at first."""
         last = self.layers[-1]
         with torch.no_grad():
-            last.weight.mul_(0.1)  # type: ignore[operator, union-attr]
-            last.bias.copy_(theta)  # type: ignore[operator, union-attr]
+            last.weight.mul_(0.1)  # type: ignore[operator]
+            last.bias.copy_(theta)  # type: ignore[operator]
 
     def forward(self, steps: Tensor) -> Tensor:
         out: Tensor = self.layers(steps)

@@ -9,19 +9,14 @@ trainer is used. With theta_i from the prior and x_i simulated, the flow q and a
 whose maximum over all q is the posterior p(theta | x), of whatever prior theta came from: one round needs no correction,
 and the trained flow conditions on other logs without training again.
 
-``rounds`` > 1: M. Deistler, P. Goncalves, J. Macke 2022, "Truncated proposals for scalable and hassle-free simulation-based
-inference" (https://arxiv.org/abs/2210.04815). Later rounds simulate the prior restricted to where the last flow has all but
-1e-4 of its mass. On that region every round's theta has the prior's density up to a constant, so the loss stays what it
-is; the flow is then right there only, for the log in hand.
+``rounds`` > 1: truncated proposals, see ``inference.rounds``.
 
 Trajectories enter as sets of control steps (s, a, s' - s) through ``models.transitions.StepEmbedding``, or as they are
 (``embedding="none"``).
 
 Deviations. theta goes through Phi^-1 before the flow (see ``posterior.flow``): support is the cube, so that there is no
-leakage to correct and no rejection. From the second round on the flow is trained from the beginning on all rounds, as
-its standardisation changes. When fewer than one draw of the prior in a thousand falls into the truncated region, proposals
-are resampled from the flow's own draws with weights prior / flow (their section 4.3). Simulations lose the samples that
-the log lacks.
+leakage to correct and no rejection. Simulations lose the samples that the log
+lacks.
 """
 
 from __future__ import annotations
@@ -37,10 +32,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sipe_bayes.inference.prior_sampling import PriorSampling
-from sipe_bayes.inference.simulations import BLOCK, Simulations
+from sipe_bayes.inference.rounds import Rounds
+from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
-from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
 from sipe_bayes.models.transitions import MOST_STEPS, Standardise, StepEmbedding, control_steps
 from sipe_bayes.posterior import Posterior
@@ -57,7 +51,7 @@ _PROPOSALS = 2**17  # draws of the prior tried before resampling the flow's
 _FAR = 0.999  # quantile of the simulations' distances beyond which a log is unlike them
 
 
-class NPE(PriorSampling):
+class NPE(Rounds):
     """A Flow; see the module's docstring.
 
     embedding: "transitions", for trajectories of any length, or "none", every finite sample as it is, for functions with few
@@ -76,7 +70,6 @@ class NPE(PriorSampling):
         *,
         embedding: str = "transitions",
         embedding_features: int = 32,
-        rounds: int = 1,
         transforms: int = 3,
         hidden: int = 64,
         bins: int = 8,
@@ -94,7 +87,6 @@ class NPE(PriorSampling):
             raise ValueError(f"learning_rate: expected a number between 0 and 1, got {learning_rate}; try 1e-3")
         counts = {
             "embedding_features": embedding_features,
-            "rounds": rounds,
             "transforms": transforms,
             "hidden": hidden,
             "bins": bins,
@@ -107,20 +99,17 @@ class NPE(PriorSampling):
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
         if device.startswith("cuda") and not torch.cuda.is_available():
             raise ValueError(f"device: {device!r} is not available here; use 'cpu'")
-        self.embedding, self.rounds = embedding, int(rounds)
+        self.embedding = embedding
         self.embedding_features = int(embedding_features)
         self.architecture = {"transforms": int(transforms), "hidden": int(hidden), "bins": int(bins)}
         self.batch_size, self.learning_rate = int(batch_size), float(learning_rate)
         self.patience, self.max_epochs, self.device = int(patience), int(max_epochs), device
-        if self.rounds > 1:
-            self.amortised = False  # type: ignore[misc]  # this instance conditions on one log
 
     def settings(self) -> dict[str, Any]:
         return {
             **super().settings(),
             "embedding": self.embedding,
             "embedding_features": self.embedding_features,
-            "rounds": self.rounds,
             **self.architecture,
             "batch_size": self.batch_size,
             "learning_rate": self.learning_rate,
@@ -132,61 +121,7 @@ class NPE(PriorSampling):
     def start(self, trajectories: Trajectories) -> State:
         if self.embedding == "none" and not np.isfinite(trajectories.observations[_inside(trajectories)]).all():
             raise ValueError("trajectories: samples are missing, which embedding='none' cannot take; use 'transitions'")
-        return {**super().start(trajectories), "round": 1}
-
-    def step(self, state: State, trajectories: Trajectories) -> State:
-        """A block of simulations, or a training at the end of a round."""
-        most = self.budget // len(trajectories)
-        if self.rounds == 1:
-            return super().step(state, trajectories)
-        if most < self.rounds:
-            raise BudgetExhausted(f"{self.rounds} rounds take {self.rounds * len(trajectories)} rollouts or more")
-        until = most * state["round"] // self.rounds
-        if state["simulated"] == until:
-            state = self._trained(state, trajectories)
-            if state["round"] == self.rounds:
-                return state
-            wanted = most * (state["round"] + 1) // self.rounds - until
-            proposed = self._propose(state, wanted, trajectories)
-            return {**state, "round": state["round"] + 1, "done": False, "proposed": proposed}
-        count = min(BLOCK, until - state["simulated"])
-        if state["round"] > 1:
-            rng = np.random.default_rng([self.seed, 2, state["simulated"]])
-            state = _joined(state, self.simulate(state["proposed"][:count], trajectories, rng))
-        else:
-            self._simulations(trajectories).first(state["simulated"] + count)
-        count += state["simulated"]
-        self.rollouts = count * len(trajectories)
-        return {**state, "simulated": count}
-
-    def simulations(self, state: State, trajectories: Trajectories) -> Simulations:
-        """Valid simulations of all rounds, with noise."""
-        if "round_theta" not in state:
-            return super().simulations(state, trajectories)
-        later = Simulations(*(state[f"round_{key}"] for key in ("theta", "observations", "valid")))
-        made = super().simulations({**state, "simulated": state["simulated"] - len(later)}, trajectories)
-        self.diagnostics["invalid_simulations"] += int((~later.valid).sum())
-        pairs = (
-            (getattr(made, name), getattr(later, name)[later.valid]) for name in ("theta", "observations", "valid")
-        )
-        return Simulations(*(np.concatenate(pair) for pair in pairs))
-
-    def _propose(self, state: State, count: int, trajectories: Trajectories) -> FloatArray:
-        """``count`` theta of the prior where the flow, given the log, has all but 1e-4 of its mass."""
-        flow = self.infer(state, trajectories)
-        generator = torch.Generator().manual_seed(_number(self.seed, 3, state["round"]))
-        own = flow.sample((_DENSITY_DRAWS,), generator=generator)
-        threshold = flow.log_prob(own).quantile(_TRUNCATED)
-        tried = self.prior.sample((_PROPOSALS,), generator=generator)
-        inside = tried[flow.log_prob(tried) >= threshold]
-        self.diagnostics[f"truncated_prior_{state['round'] + 1}"] = len(inside) / _PROPOSALS
-        if len(inside) >= count and len(inside) > 1e-3 * _PROPOSALS:
-            return inside[:count].numpy()
-        own = flow.sample((max(_PROPOSALS // 4, 10 * count),), generator=generator)
-        density = flow.log_prob(own)
-        weight = torch.where(density >= threshold, self.prior.log_prob(own) - density, -torch.inf)
-        chosen = torch.multinomial((weight - weight.max()).exp(), count, replacement=False, generator=generator)
-        return own[chosen].numpy()
+        return super().start(trajectories)
 
     def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
         line = to_line(torch.from_numpy(simulations.theta))
@@ -200,16 +135,9 @@ class NPE(PriorSampling):
         self._report(summary, len(x))
         weights = {f"weights.{key}": value.numpy() for key, value in net.state_dict().items()}
         shape: State = {"features": x.shape[-1], "context_features": context.shape[1]}
-        if self.rounds > 1:
-            shape["trained_on"] = _digest(trajectories)
-        centre, whitening = _whitening(context)
-        distance = ((context - centre) @ whitening).norm(dim=1).quantile(_FAR)
-        unlike = {"centre": centre.numpy(), "whitening": whitening.numpy(), "far": float(distance)}
-        return {**weights, **shape, **unlike, "line_mean": mean.numpy(), "line_sd": sd.numpy()}
+        return {**weights, **shape, "line_mean": mean.numpy(), "line_sd": sd.numpy()}
 
     def infer(self, state: State, trajectories: Trajectories) -> Posterior:
-        if self.rounds > 1 and state["trained_on"] != _digest(trajectories):
-            raise ValueError("trajectories: several rounds were trained for other ones; use rounds=1, or fit again")
         x = torch.from_numpy(self._features(trajectories.observations[None].astype(np.float32), trajectories))
         if x.shape[-1] != state["features"]:
             raise ValueError(
@@ -225,13 +153,6 @@ class NPE(PriorSampling):
         embedding.load_state_dict(_part(weights, "_embedding_net."))
         with torch.no_grad():
             context = embedding(x)[0].double()
-        distance = float(((context - torch.from_numpy(state["centre"])) @ torch.from_numpy(state["whitening"])).norm())
-        self.diagnostics["distance"] = distance / state["far"]
-        if distance > 2 * state["far"]:
-            self._warn(
-                f"the log is {distance / state['far']:.1f} times as far from the simulations' middle as nearly all of them: "
-                "the posterior cannot be trusted; widen the bounds or correct the model"
-            )
         flow_weights = _part(weights, "net.")
         return Flow(flow_weights, context, state["line_mean"], state["line_sd"], self.space, **self.architecture)
 
@@ -295,31 +216,9 @@ def _inside(trajectories: Trajectories) -> NDArray[np.bool_]:
     return inside
 
 
-def _joined(state: State, new: Simulations) -> State:
-    """``state`` with simulations of the later rounds appended and their theta taken off what is proposed."""
-    made = {"round_theta": new.theta, "round_observations": new.observations, "round_valid": new.valid}
-    kept = {k: np.concatenate([state[k], v]) if k in state else v for k, v in made.items()}
-    return {**state, **kept, "proposed": state["proposed"][len(new) :]}
-
-
 def _part(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
 
 
 def _number(*seed: int) -> int:
     return int(np.random.SeedSequence(seed).generate_state(1)[0])
-
-
-def _digest(trajectories: Trajectories) -> str:
-    digest = hashlib.sha256()
-    for array in (trajectories.observations, trajectories.actions):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def _whitening(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (D,) of x (n, D) and W (D, D) such that (x - mean) W has unit covariance along the directions that vary."""
-    centre = x.mean(0)
-    values, vectors = torch.linalg.eigh(torch.atleast_2d(torch.cov(x.T)))
-    scale = torch.where(values > 1e-8 * values.max(), values.clamp_min(1e-300).rsqrt(), 0.0)
-    return centre, vectors * scale

@@ -18,6 +18,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, first_states
+from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.posterior import Posterior
@@ -25,6 +26,10 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
+_ROWS = 100  # simulations whose control steps are held at once
+_SEEN = 500  # simulations that a log is compared with
+_NEIGHBOURS = 20
+_SAMPLES = 50
 _FEWEST = 10  # valid simulations below which nothing is trained
 
 
@@ -74,7 +79,24 @@ class PriorSampling(Estimator):
 
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
         self._check(trajectories)
-        return self.infer(state if state["trained"] else self._trained(state, trajectories), trajectories)
+        state = state if state["trained"] else self._trained(state, trajectories)
+        log = self._looks(trajectories.observations[None], trajectories)
+        same = [name for name in log if log[name].shape[1] == state[name].shape[1]]  # a log may be shorter
+        how_far = max(unlikeness(state[name], log[name][0]) for name in same)
+        self.diagnostics["unlikeness"] = how_far
+        if how_far > 1:
+            said = "the log is unlike every simulation: widen the bounds, or correct the model, before you trust the result"
+            self.warnings += [said] * (said not in self.warnings)
+        return self.infer(state, trajectories)
+
+    def statistics(self, observations: NDArray[np.floating], trajectories: Trajectories) -> FloatArray:
+        """BayesSim's statistics (n, F) of observations (n, R, T+1, O), without the samples that the log lacks."""
+        o, a = trajectories.observations.shape[-1], trajectories.actions.shape[-1]
+        found = []
+        for rows in np.split(observations, range(_ROWS, len(observations), _ROWS)):
+            seen = np.where(np.isfinite(trajectories.observations), rows, np.nan)
+            found.append(step_statistics(control_steps(seen, trajectories.actions, trajectories.length, None), o, a))
+        return np.concatenate(found)
 
     @property
     def reserved(self) -> int:
@@ -110,9 +132,18 @@ class PriorSampling(Estimator):
         noise = (sd * rng.standard_normal(made.observations.shape)).astype(np.float32)
         return Simulations(made.theta, made.observations + noise, made.valid)
 
+    def _looks(self, observations: NDArray[np.floating], trajectories: Trajectories) -> dict[str, FloatArray]:
+        """What tells a log from simulations: statistics, and up to 50 samples as they are (of what the log has)."""
+        there = np.isfinite(trajectories.observations).all(-1).nonzero()
+        kept = np.linspace(0, len(there[0]) - 1, min(_SAMPLES, len(there[0]))).round().astype(int)
+        samples = observations[:, there[0][kept], there[1][kept]].reshape(len(observations), -1)
+        return {"seen_statistics": self.statistics(observations, trajectories), "seen_samples": samples.astype(float)}
+
     def _trained(self, state: State, trajectories: Trajectories) -> State:
-        trained = self.train(self.simulations(state, trajectories), trajectories)
-        return {**state, **trained, "trained": True, "done": True}
+        simulations = self.simulations(state, trajectories)
+        seen = self._looks(simulations.observations[-_SEEN:], trajectories)
+        trained = self.train(simulations, trajectories)
+        return {**state, **trained, **seen, "trained": True, "done": True}
 
     def _simulations(self, trajectories: Trajectories) -> Cache:
         if self._cached is None or self._cached[0] is not trajectories:
@@ -132,6 +163,20 @@ class PriorSampling(Estimator):
             raise ValueError(
                 f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
             )
+
+
+def unlikeness(seen: FloatArray, log: FloatArray) -> float:
+    """Local outlier factor of a log's statistics (F,) among simulated ones (n, F), over the largest of the simulations' own
+    (M. Breunig et al. 2000, https://doi.org/10.1145/342009.335388): above 1 happens by chance once in n + 1 logs."""
+    from sklearn.neighbors import LocalOutlierFactor
+
+    sd = seen.std(0)
+    varies = sd > 1e-9 * (np.abs(seen).max(0) + 1e-30)
+    if not varies.any() or not np.isfinite(log).all():
+        return 0.0
+    scaled, point = seen[:, varies] / sd[varies], log[varies] / sd[varies]
+    factor = LocalOutlierFactor(min(_NEIGHBOURS, len(scaled) - 1), novelty=True).fit(scaled)
+    return float(-factor.score_samples(point[None])[0] / np.max(-factor.negative_outlier_factor_))
 
 
 def recorded_steps(trajectories: Trajectories) -> torch.Tensor:

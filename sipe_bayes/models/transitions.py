@@ -19,12 +19,12 @@ def control_steps(
     observations: NDArray[np.floating],
     actions: FloatArray,
     length: NDArray[np.int64],
-    most: int = MOST_STEPS,
+    most: int | None = MOST_STEPS,
 ) -> NDArray[np.float32]:
     """(n, M, 2 O + A) of observations (n, R, T+1, O) under actions (R, T, A) with lengths (R,): at most ``most`` steps of all
-    R trajectories together, evenly spread; a step with a missing sample is NaN throughout."""
+    R trajectories together, evenly spread, or all; a step with a missing sample is NaN throughout."""
     trajectory, step = np.nonzero(np.arange(actions.shape[1]) < length[:, None])
-    if len(step) > most:
+    if most is not None and len(step) > most:
         kept = np.linspace(0, len(step) - 1, most).round().astype(int)
         trajectory, step = trajectory[kept], step[kept]
     here = np.asarray(observations[:, trajectory, step], np.float32)

@@ -35,7 +35,7 @@ _MODE_STARTS = 4
 
 def spline_flow(features: int, context: int, transforms: int, hidden: int, bins: int) -> Any:
     """zuko's neural spline flow over u (..., ``features``) given a context (..., ``context``); float32, random weights."""
-    from zuko.flows import NSF  # type: ignore[import-untyped]
+    from zuko.flows import NSF
 
     settings: dict[str, Any] = {"transforms": transforms, "hidden_features": (hidden, hidden)}
     if features > 1:  # zuko takes neither for one parameter

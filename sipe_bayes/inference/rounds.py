@@ -1,0 +1,124 @@
+"""Sequential rounds of simulation for the estimators whose trained network has a density: NPE and BayesSim.
+
+M. Deistler, P. Goncalves, J. Macke 2022, "Truncated proposals for scalable and hassle-free simulation-based inference"
+(https://arxiv.org/abs/2210.04815). Later rounds simulate the prior restricted to where the posterior so far has all but 1e-4 of
+its mass. On that region the theta of every round have the prior's density up to a constant, so the proposal correction
+p(theta) / p~(theta) is one and the loss stays what it is; the network is then right there only, for the log in hand.
+
+Deviations. From the second round on the network is trained from the beginning on all rounds, as its standardisation changes.
+When fewer than one draw of the prior in a thousand falls into the truncated region, proposals are resampled from the
+posterior's own draws with weights prior / posterior (their section 4.3).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.prior_sampling import PriorSampling
+from sipe_bayes.inference.simulations import BLOCK, Simulations
+from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetExhausted
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+
+_TRUNCATED = 1e-4  # of the posterior's mass lies outside the truncated prior
+_DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from
+_PROPOSALS = 2**17  # draws of the prior tried before resampling the posterior's
+_FIELDS = ("theta", "observations", "valid")
+
+
+class Rounds(PriorSampling):
+    """Base of NPE and BayesSim. rounds: more than one conditions on the log in hand and is not amortised."""
+
+    def __init__(self, simulator: Any, *, rounds: int = 1, **settings: Any) -> None:
+        super().__init__(simulator, **settings)
+        if rounds < 1:
+            raise ValueError(f"rounds: expected at least 1, got {rounds}")
+        self.rounds = int(rounds)
+        if self.rounds > 1:
+            self.amortised = False  # type: ignore[misc]  # this instance conditions on one log
+
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings(), "rounds": self.rounds}
+
+    def start(self, trajectories: Trajectories) -> State:
+        return {**super().start(trajectories), "round": 1}
+
+    def step(self, state: State, trajectories: Trajectories) -> State:
+        """A block of simulations, or a training at the end of a round."""
+        most = self.budget // len(trajectories)
+        if self.rounds == 1:
+            return super().step(state, trajectories)
+        if most < self.rounds:
+            raise BudgetExhausted(f"{self.rounds} rounds take {self.rounds * len(trajectories)} rollouts or more")
+        until = most * state["round"] // self.rounds
+        if state["simulated"] == until:
+            state = {**self._trained(state, trajectories), "trained_on": _digest(trajectories)}
+            if state["round"] == self.rounds:
+                return state
+            wanted = most * (state["round"] + 1) // self.rounds - until
+            proposed = self._propose(state, wanted, trajectories)
+            return {**state, "round": state["round"] + 1, "done": False, "proposed": proposed}
+        count = min(BLOCK, until - state["simulated"])
+        if state["round"] > 1:
+            rng = np.random.default_rng([self.seed, 2, state["simulated"]])
+            state = _joined(state, self.simulate(state["proposed"][:count], trajectories, rng))
+        else:
+            self._simulations(trajectories).first(state["simulated"] + count)
+        count += state["simulated"]
+        self.rollouts = count * len(trajectories)
+        return {**state, "simulated": count}
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        if state.get("trained_on", _digest(trajectories)) != _digest(trajectories):
+            raise ValueError("trajectories: several rounds were trained for other ones; use rounds=1, or fit again")
+        return super().posterior(state, trajectories)
+
+    def simulations(self, state: State, trajectories: Trajectories) -> Simulations:
+        """Valid simulations of all rounds, with noise."""
+        if "round_theta" not in state:
+            return super().simulations(state, trajectories)
+        later = Simulations(*(state[f"round_{key}"] for key in _FIELDS))
+        made = super().simulations({**state, "simulated": state["simulated"] - len(later)}, trajectories)
+        self.diagnostics["invalid_simulations"] += int((~later.valid).sum())
+        pairs = ((getattr(made, name), getattr(later, name)[later.valid]) for name in _FIELDS)
+        return Simulations(*(np.concatenate(pair) for pair in pairs))
+
+    def _propose(self, state: State, count: int, trajectories: Trajectories) -> FloatArray:
+        """``count`` theta of the prior where the posterior has all but 1e-4 of its mass."""
+        found = self.infer(state, trajectories)
+        seed = np.random.SeedSequence([self.seed, 3, state["round"]]).generate_state(1)[0]
+        generator = torch.Generator().manual_seed(int(seed))
+        own = found.sample((_DENSITY_DRAWS,), generator=generator)
+        threshold = found.log_prob(own).quantile(_TRUNCATED)
+        tried = self.prior.sample((_PROPOSALS,), generator=generator)
+        inside = tried[found.log_prob(tried) >= threshold]
+        self.diagnostics[f"truncated_prior_{state['round'] + 1}"] = len(inside) / _PROPOSALS
+        if len(inside) >= count and len(inside) > 1e-3 * _PROPOSALS:
+            return inside[:count].numpy()
+        own = found.sample((max(_PROPOSALS // 4, 10 * count),), generator=generator)
+        density = found.log_prob(own)
+        weight = torch.where(density >= threshold, self.prior.log_prob(own) - density, -torch.inf)
+        chosen = torch.multinomial((weight - weight.max()).exp(), count, replacement=False, generator=generator)
+        return own[chosen].numpy()
+
+
+def _joined(state: State, new: Simulations) -> State:
+    """``state`` with simulations of the later rounds appended and their theta taken off what is proposed."""
+    made = {f"round_{name}": getattr(new, name) for name in _FIELDS}
+    kept = {k: np.concatenate([state[k], v]) if k in state else v for k, v in made.items()}
+    return {**state, **kept, "proposed": state["proposed"][len(new) :]}
+
+
+def _digest(trajectories: Trajectories) -> str:
+    digest = hashlib.sha256()
+    for array in (trajectories.observations, trajectories.actions):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
