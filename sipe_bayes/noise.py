@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_RIDGE = 1e-12  # of a parameter's own precision
 _LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
 _GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-3, 100, 2.0  # of the search for the noise: nats, steps, of a logarithm
 _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
@@ -338,7 +339,9 @@ def _restricted(moments: Moments, noise: Noise, pulls: Pulls, arrow: Arrow) -> t
     move, covariance = np.zeros(n), np.zeros((n, n))
     if pulls.free.any():
         free = np.ix_(pulls.free, pulls.free)
-        factor = np.linalg.cholesky(arrow.precision[free] + pulls.prior[free])
+        precision = arrow.precision[free] + pulls.prior[free]
+        # what rounding leaves of two parameters that do the same may be negative
+        factor = np.linalg.cholesky(precision + _RIDGE * np.diag(np.diag(precision)))
         inverse = np.linalg.inv(factor)
         half = inverse @ (arrow.gradient + pulls.prior_pull)[pulls.free]
         value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)

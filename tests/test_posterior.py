@@ -77,7 +77,8 @@ def example_flow(n: int) -> Flow:
         torch.manual_seed(0)
         net = spline_flow(n, 4, 2, 8, 4)
     architecture = {"transforms": 2, "hidden": 8, "bins": 4}
-    mild = {name: 0.5 * tensor for name, tensor in net.state_dict().items()}
+    learned = dict(net.named_parameters())
+    mild = {name: 0.5 * tensor if name in learned else tensor for name, tensor in net.state_dict().items()}
     return Flow(mild, torch.ones(4), torch.zeros(n), torch.ones(n), space_of(n), **architecture)
 
 
