@@ -549,7 +549,7 @@ class Marginal:
         self.windows, self.length, _, self.num_start = jacobian.shape
         empty = np.zeros(jacobian.shape[:3])
         self.moments = Moments(empty, jacobian, 0, all_sequences)
-        flat = jacobian.reshape(self.windows * self.length, -1, self.num_start)
+        flat = jacobian.reshape(self.windows * self.length, jacobian.shape[2], self.num_start)
         self.rows = [flat[s.index, c] for c, s in enumerate(all_sequences)]
         self.before = [
             np.where((s.previous >= 0)[:, None], flat[s.previous, c], 0.0) for c, s in enumerate(all_sequences)
@@ -573,10 +573,12 @@ class Marginal:
 
     def _eliminate(self, residual: FloatArray, starts: FloatArray, noise: Noise) -> tuple[Arrow, float]:
         d, flat = self.num_start, residual.reshape(self.windows * self.length, -1)
-        normal, square = self.moments.normal(noise), 0.0
+        normal, square = self.moments.normal(noise) if d else np.empty(0), 0.0
         for c, s in enumerate(self.sequences):
             white = whiten(flat[:, c], s, float(noise.sd[c]), float(noise.tau[c]))
             square += float(white @ white)
+            if not d:
+                continue
             a = coefficients(s.gaps, float(noise.tau[c]))[s.gap]
             scaled = white / (noise.sd[c] * np.sqrt(1 - a**2))
             own = self.rows[c] * scaled[:, None]
@@ -585,6 +587,10 @@ class Marginal:
             normal[:, :d, -1] += _window_sums(right, self.edges[c], s.window, self.windows)
             crossing = np.where(s.crosses[:, None], lagged, 0.0)
             normal[:, d : 2 * d, -1] += _window_sums(crossing, self.edges[c], s.window, self.windows)
+        if not d:  # recorded starts
+            none = np.zeros((0, 0))
+            starts, slopes = np.zeros((self.windows, 0)), np.zeros((self.windows, 0, 0))
+            return Arrow(none, np.zeros(0), 0.0, 0.0, 0.0, starts, slopes, none), square
         return eliminate(normal, 0, self.precision, -self.precision * starts), square
 
 
