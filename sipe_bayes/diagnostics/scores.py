@@ -183,8 +183,15 @@ def c2st(posterior: Posterior, reference: Any, seed: int = 0) -> float:
     given = posterior.space.check_shape(reference)
     if given.ndim != 2 or len(given) < 20:
         raise ValueError(f"reference: expected at least 20 draws (M, {len(posterior.space)}), got {given.shape}")
-    own = posterior.sample((len(given),), generator=torch.Generator().manual_seed(seed)).float()
-    return float(import_sbi("utils.metrics").c2st(torch.from_numpy(given).float(), own, seed=seed + 1))
+    generator = torch.Generator().manual_seed(seed)
+    if isinstance(posterior, Particles) and float(posterior.weights.max() - posterior.weights.min()) < 1e-12:
+        count = min(len(given), len(posterior.theta))  # without replacement: a repeated draw gives itself away
+        own = posterior.theta[torch.randperm(len(posterior.theta), generator=generator)[:count]]
+    else:
+        own = posterior.sample((len(given),), generator=generator)
+    return float(
+        import_sbi("utils.metrics").c2st(torch.from_numpy(given)[: len(own)].float(), own.float(), seed=seed + 1)
+    )
 
 
 def _checked(posterior: Posterior, truth: Any) -> FloatArray:

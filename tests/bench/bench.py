@@ -19,6 +19,8 @@ from typing import Any
 
 import arm
 import envs
+import fits
+import mdn
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -215,7 +217,7 @@ def chain() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    tables = ("engine", "rival", "stages", "chain", "envs", "memory")
+    tables = ("engine", "rival", "stages", "chain", "envs", "memory", "mdn", "fits")
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
     given = parser.parse_args()
@@ -231,6 +233,10 @@ def main() -> None:
             chain()
         elif name == "memory":
             envs.memory()
+        elif name == "mdn":
+            mdn.table(given.pairs)
+        elif name == "fits":
+            fits.table()
         elif name == "envs":
             envs.table(max(given.pairs, 7), side_by_side)
             envs.against_parsing(max(given.pairs, 7), side_by_side)
