@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 
 from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config
 from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
-from sipe_bayes.diagnostics.evaluate import channel_scores, fitted_residuals, signals
+from sipe_bayes.diagnostics.evaluate import channel_scores, fitted_residuals, signals, white_noise
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary, Ridge
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
+from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
+from sipe_bayes.noise import Noise
 from sipe_bayes.output import CHECKPOINT, RUN, claim, describe_run, release, write_all
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
@@ -196,14 +198,18 @@ def _method(
     progress: Progress | None = None,
 ) -> Estimator:
     config = problem.config
+    name = estimator or config.estimator
+    takes = estimator_class(name).searches
+    if not takes and config.search != type(config.search)():
+        raise ConfigError(f"{config.path}: key `search`: {name} does not search from several starts; drop the key")
     return get_estimator(
         problem.simulator,
-        estimator or config.estimator,
+        name,
         prior=problem.prior,
         likelihood=problem.likelihood,
         seed=config.seed if seed is None else seed,
         budget=config.budget if budget is None else budget,
-        **config.search.model_dump(),
+        **(config.search.model_dump() if takes else {}),
         checkpoint=checkpoint,
         progress=progress,
     )
@@ -233,6 +239,7 @@ def calibrate(
     dead = dead_ranges(fitted, theta)
     conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed, tell)
     method.warnings += [f"log {name} could not be fitted by itself; whether it agrees is unknown" for name in skipped]
+    noise = _noise_of(method, fitted, theta)
     tell("simulating the posterior's band")
     draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(method.seed))
     summaries = _summaries(problem, posterior, draws, dead, conflict)
@@ -251,9 +258,9 @@ def calibrate(
         holdout=scores.get("holdout", []),
         warnings=_warnings(problem, method, summaries, dead, found, conflict, scores.get("holdout", [])),
         signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
-        residuals=fitted_residuals(fitted, theta, method.diagnostics["noise_sd"], method.diagnostics["noise_tau"]),
+        residuals=fitted_residuals(fitted, theta, noise),
         ridges=found,
-        noise=_noise(fitted, method),
+        noise=_noise(fitted, noise),
         mixing=method.diagnostics.get("mixing"),
         logs=[r.to_dict() for r in problem.reports],
         rollouts=method.rollouts,
@@ -322,7 +329,8 @@ def _warnings(
     conflict: Disagreement | None,
     holdout: Sequence[ChannelScore],
 ) -> list[str]:
-    words = [*problem.warnings, *method.warnings] + [
+    own = [w for w in method.warnings if w != method.diagnostics.get("at_bound")]  # said below, with the value
+    words = [*problem.warnings, *own] + [
         f"{p.name}: its targets have different values in the model, so 'the model as given' stands for all at {p.default:.4g} {p.unit}"
         for p in problem.environment.space
         if problem.environment.uneven(p)
@@ -361,9 +369,16 @@ def _heldout_warning(s: ChannelScore) -> str:
     return f"{where}: {s.rmse:.3g} {s.unit} is not better than the model as given ({s.rmse_default:.3g})"
 
 
-def _noise(windows: Windows, method: Estimator) -> dict[str, dict[str, Any]]:
+def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
+    """The residuals' noise: the estimator's, or white of the size that its best point leaves."""
+    if "noise_sd" in method.diagnostics:
+        return Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
+    return white_noise(windows, theta)
+
+
+def _noise(windows: Windows, noise: Noise) -> dict[str, dict[str, Any]]:
     units = dict(zip(windows.simulator.environment.channels, _units(windows), strict=True))
-    rows = zip(windows.fitted, method.diagnostics["noise_sd"], method.diagnostics["noise_tau"], strict=True)
+    rows = zip(windows.fitted, noise.sd.tolist(), noise.tau.tolist(), strict=True)
     return {name: {"sd": sd, "tau": tau, "unit": units[name]} for name, sd, tau in rows}
 
 

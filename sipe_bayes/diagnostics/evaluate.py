@@ -121,15 +121,24 @@ def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior,
     return out
 
 
-def fitted_residuals(windows: Windows, theta: FloatArray, sd: list[float], tau: list[float]) -> list[Residual]:
+def white_noise(windows: Windows, theta: FloatArray) -> Noise:
+    """White noise of the size of the residuals at theta (N,), with the windows' starts at their best."""
+    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
+    none = np.zeros(len(spread))
+    starts = best_starts(windows, theta, Noise(np.maximum(0.05 * spread, windows.rounding), none))
+    residual = windows.residuals(theta[None], starts[None])[0][0]
+    size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(windows.observed.sum(axis=(0, 1)), 1))
+    return Noise(np.maximum(size, windows.rounding), none)
+
+
+def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise) -> list[Residual]:
     """Residuals at theta (N,) with the windows' starts at their best."""
-    noise = Noise(np.array(sd), np.array(tau))
     starts = best_starts(windows, theta, noise)
     residual = windows.residuals(theta[None], starts[None])[0][0]
     white = np.full((*residual.shape[:2], residual.shape[2]), np.nan)
     for c, s in enumerate(windows.sequences):
         flat = white[:, :, c].reshape(-1)
-        flat[s.index] = whiten(residual[:, :, c].reshape(-1), s, float(sd[c]), float(tau[c]))
+        flat[s.index] = whiten(residual[:, :, c].reshape(-1), s, float(noise.sd[c]), float(noise.tau[c]))
         white[:, :, c] = flat.reshape(residual.shape[:2])
     shown = np.where(windows.observed, residual, np.nan)
     out = []

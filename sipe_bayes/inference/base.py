@@ -64,6 +64,7 @@ class Estimator(ABC):
 
     name: ClassVar[str]
     amortised: ClassVar[bool] = False
+    searches: ClassVar[bool] = False  # takes ``restarts`` and ``candidates``
     uses_prior: ClassVar[bool] = True
     default_budget: ClassVar[int] = 1000
     checkpoint_seconds: float = 1.0
@@ -172,9 +173,9 @@ class Estimator(ABC):
             if sharp and min(m, 1 - m) < AT_BOUND
         ]
         if at:
-            self.warnings.append(
-                f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
-            )
+            said = f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
+            self.warnings.append(said)
+            self.diagnostics["at_bound"] = said
         return posterior
 
     def describe(self, state: State) -> str:

@@ -76,6 +76,7 @@ class Laplace(Estimator):
     """
 
     name: ClassVar[str] = "laplace"
+    searches: ClassVar[bool] = True
     default_budget: ClassVar[int] = 5000
 
     def __init__(

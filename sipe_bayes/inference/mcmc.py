@@ -57,6 +57,7 @@ class MCMC(Estimator):
     """
 
     name: ClassVar[str] = "mcmc"
+    searches: ClassVar[bool] = True
     default_budget: ClassVar[int] = 50_000
 
     def __init__(

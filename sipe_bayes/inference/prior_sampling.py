@@ -134,7 +134,7 @@ class PriorSampling(Estimator):
 
     def _looks(self, observations: NDArray[np.floating], trajectories: Trajectories) -> dict[str, FloatArray]:
         """What tells a log from simulations: statistics, and up to 50 samples as they are (of what the log has)."""
-        there = np.isfinite(trajectories.observations).all(-1).nonzero()
+        there = np.nonzero(np.isfinite(trajectories.observations).all(-1))
         kept = np.linspace(0, len(there[0]) - 1, min(_SAMPLES, len(there[0]))).round().astype(int)
         samples = observations[:, there[0][kept], there[1][kept]].reshape(len(observations), -1)
         return {"seen_statistics": self.statistics(observations, trajectories), "seen_samples": samples.astype(float)}
