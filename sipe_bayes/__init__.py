@@ -20,6 +20,7 @@ _PUBLIC = {
     "make_vec": "sipe_bayes.gym",
     "make_task": "sipe_bayes.envs.registry",
     "Simulator": "sipe_bayes.simulator",
+    "CallableSimulator": "sipe_bayes.callable_simulator",
     "Segments": "sipe_bayes.likelihood",
     "Posterior": "sipe_bayes.posterior",
     "Dirac": "sipe_bayes.posterior",

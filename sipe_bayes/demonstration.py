@@ -68,7 +68,7 @@ def demonstrations(
             f"type: the agent {agent_file(task.name, type)} cannot be read by this version; upgrade"
         )
     warnings.warn(
-        f"demonstrations: no {type} agent of {task.name} is installed; smooth random actions were used instead",
+        f"demonstrations: no {type} agent of {task.name} is installed; an excitation policy was used instead",
         UserWarning,
         stacklevel=_caller(),
     )

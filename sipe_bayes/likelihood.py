@@ -23,7 +23,7 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from sipe_bayes.function_simulator import FunctionSimulator
+from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.noise import Moments, Noise, Sequence, sequences, whiten
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -67,9 +67,14 @@ class Segments:
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
 
-    def bind(self, simulator: Simulator, trajectories: Trajectories) -> Windows:
+    def bind(self, simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> Windows:
         """Cut the trajectories into windows; raises ValueError for logs that do not fit the simulator."""
-        windows = Windows(self, simulator, trajectories)
+        if isinstance(simulator, CallableSimulator):
+            from sipe_bayes.callable_windows import CallableWindows
+
+            windows: Windows = CallableWindows(self, simulator, trajectories)
+        else:
+            windows = Windows(self, simulator, trajectories)
         for name, seen in zip(windows.fitted, windows.observed.any(axis=(0, 1)), strict=True):
             if not seen:
                 raise ValueError(
@@ -107,10 +112,10 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
     return states
 
 
-def first_states(simulator: Simulator | FunctionSimulator, trajectories: Trajectories) -> FloatArray:
+def first_states(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
     """Starting states (R, S) of R recorded trajectories: recorded, else estimated from the measurements."""
-    if isinstance(simulator, FunctionSimulator):
-        return simulator.first_states(trajectories)
+    if isinstance(simulator, CallableSimulator):
+        return np.empty((len(trajectories), 0))
     return np.stack([estimate_states(simulator, t)[0] for t in trajectories])
 
 

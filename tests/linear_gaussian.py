@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.function_simulator import FunctionSimulator
+from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import GaussianMixture
@@ -17,17 +17,16 @@ CENTRE = np.array([0.45, 0.6, 0.5, 0.4, 0.55])
 SD = 0.08  # of the function's noise
 
 
-def function_problem() -> tuple[FunctionSimulator, Trajectory, GaussianMixture, Segments]:
+def function_problem() -> tuple[CallableSimulator, Trajectory, GaussianMixture, Segments]:
     """x = M theta + noise: simulator, log, exact posterior, likelihood. M mixes the first two parameters."""
     mixing = np.eye(5)
     mixing[0, 1] = mixing[1, 0] = 0.7
 
-    def function(values: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        x = values @ mixing.T + SD * rng.standard_normal(values.shape)
-        return np.stack([np.zeros_like(x), x], axis=1)
+    def function(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return values @ mixing.T + SD * rng.standard_normal(values.shape)
 
     space = ParameterSpace([Parameter(f"p{j}", 0.0, 1.0) for j in range(5)])
-    simulator = FunctionSimulator(function, space, [f"x{j}" for j in range(5)], name="linear_gaussian")
+    simulator = CallableSimulator(function, space, name="linear_gaussian")
     x = mixing @ CENTRE + SD * np.random.default_rng(7).standard_normal(5)
     log = Trajectory(np.stack([np.zeros(5), x]), np.zeros((1, 0)), 1.0, name="log")
     covariance = np.linalg.inv(mixing.T @ mixing) * SD**2
@@ -71,14 +70,13 @@ def carts_problem() -> tuple[Simulator, Trajectory, GaussianMixture, Segments]:
     return simulator, log, exact, Segments(None, noise="white", noise_sd=(noise,) * 4, starts="recorded")
 
 
-def squared_function() -> tuple[FunctionSimulator, Trajectory, Segments]:
+def squared_function() -> tuple[CallableSimulator, Trajectory, Segments]:
     """x = (2 theta - 1)^2 plus noise of sd 0.03: modes at 0.5 +- 0.3 for x = 0.36."""
 
-    def function(values: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        x = (2 * values - 1) ** 2 + 0.03 * rng.standard_normal(values.shape)
-        return np.stack([np.zeros_like(x), x], axis=1)
+    def function(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return (2 * values - 1) ** 2 + 0.03 * rng.standard_normal(values.shape)
 
-    simulator = FunctionSimulator(function, ParameterSpace([Parameter("p", 0.0, 1.0)]), ["x"], name="squared")
+    simulator = CallableSimulator(function, ParameterSpace([Parameter("p", 0.0, 1.0)]), name="squared")
     return (
         simulator,
         Trajectory(np.array([[0.0], [0.36]]), np.zeros((1, 0)), 1.0, name="log"),

@@ -12,7 +12,7 @@ import torch
 from scipy import stats
 
 import sipe_bayes as sipe
-from sipe_bayes.function_simulator import FunctionSimulator
+from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.inference.npe import NPE
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.parameters import Parameter, ParameterSpace
@@ -36,14 +36,13 @@ SMALL: dict[str, Any] = {
 SPACE = ParameterSpace([Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)])
 
 
-def linear() -> FunctionSimulator:
+def linear() -> CallableSimulator:
     """x = (a, (a + b) / 2) plus normal noise of sd 0.08."""
 
-    def function(values: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        x = np.stack([values[:, 0], values.mean(1)], axis=1) + SD * rng.standard_normal(values.shape)
-        return np.stack([np.zeros_like(x), x], axis=1)
+    def function(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return np.stack([values[:, 0], values.mean(1)], axis=1) + SD * rng.standard_normal(values.shape)
 
-    return FunctionSimulator(function, SPACE, ["x", "y"], name="linear")
+    return CallableSimulator(function, SPACE, name="linear")
 
 
 def seen(x: float, y: float) -> sipe.Trajectory:

@@ -36,7 +36,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.function_simulator import FunctionSimulator
+from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.inference.npe import NPE
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
@@ -73,11 +73,6 @@ def exact_posterior(x: np.ndarray, count: int, rng: np.random.Generator) -> np.n
     return found[:count]
 
 
-def function(values: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Two moons as one control step without actions: zeros, then x."""
-    return np.stack([np.zeros_like(values), two_moons(values, rng)], axis=1)
-
-
 def log_of(x: np.ndarray) -> sipe.Trajectory:
     """An observation (2,) as the simulator gives it."""
     return sipe.Trajectory(np.stack([np.zeros(2), x]), np.zeros((1, 0)), 1.0)
@@ -93,7 +88,7 @@ def observations(count: int) -> np.ndarray:
 
 
 def estimator(seed: int, budget: int, rounds: int = 1) -> NPE:
-    simulator = FunctionSimulator(function, SPACE, ["x_1", "x_2"], name="two moons", seed=seed)
+    simulator = CallableSimulator(two_moons, SPACE, name="two moons", seed=seed)
     return NPE(simulator, embedding="none", likelihood=EXACT, budget=budget, seed=seed, rounds=rounds)
 
 

@@ -26,7 +26,12 @@ from sipe_bayes.posterior import Particles, Posterior
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1]))
-METHODS: dict[str, dict[str, Any]] = {"laplace": {}, "mcmc": {"effective": 10_000}, "npe": {"embedding": "none"}, "bayessim": {}}
+METHODS: dict[str, dict[str, Any]] = {
+    "laplace": {},
+    "mcmc": {"effective": 10_000},
+    "npe": {"embedding": "none"},
+    "bayessim": {},
+}
 
 
 def independent(posterior: Posterior, diagnostics: dict[str, Any]) -> torch.Tensor:

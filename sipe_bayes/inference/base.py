@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.demonstration import Given
 from sipe_bayes.inference.state import State, load_state, save_state
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
@@ -71,7 +72,7 @@ class Estimator(ABC):
 
     def __init__(
         self,
-        simulator: Simulator,
+        simulator: Simulator | CallableSimulator,
         *,
         prior: Posterior | None = None,
         budget: int | None = None,
@@ -87,7 +88,7 @@ class Estimator(ABC):
         if self.prior.space.names != self.space.names or not self.prior.has_density:
             raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
         self.budget = self.default_budget if budget is None else int(budget)
-        self.seed, self.likelihood = int(seed), likelihood or Segments()
+        self.seed, self.likelihood = int(seed), likelihood or _default_likelihood(simulator)
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.progress = progress
         self.rollouts = 0
@@ -96,6 +97,11 @@ class Estimator(ABC):
         self._state: State | None = None
         self._bound: tuple[Trajectories, Windows] | None = None
         self._given = Given()
+        self._observed: Trajectory | None = None
+        if self.searches and isinstance(simulator, CallableSimulator) and simulator.noise_sd is None:
+            raise ValueError(
+                f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
+            )
 
     @abstractmethod
     def start(self, trajectories: Trajectories) -> State: ...
@@ -109,13 +115,13 @@ class Estimator(ABC):
     def fit(self, trajectories: Recorded) -> Posterior:
         """The posterior given one or several trajectories, or an environment, which stands for its reference demonstrations;
         raises ValueError for ones that do not fit the simulator."""
-        batch = self._given.stack(trajectories, anew=True)
+        batch = self._given.stack(self._recorded(trajectories), anew=True)
         fingerprint = self._fingerprint(batch)
-        self.warnings, self.rollouts = [], 0
+        self.warnings, self.diagnostics, self.rollouts, self._bound = [], {}, 0, None
         state = None
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)
-            self.rollouts, self._bound = int(state["rollouts"]), None  # windows, once bound, count from here
+            self.rollouts = int(state["rollouts"])
             self.warnings = list(state["warnings"])
         saved = time.monotonic()
         try:
@@ -140,9 +146,12 @@ class Estimator(ABC):
     def update_parameter_estimate(self, trajectories: Recorded) -> None:
         """One step of the method, as the paper's interface names it; trajectories may differ from step to step. An
         environment stands for its reference demonstrations."""
-        batch = self._given.stack(trajectories)
+        batch = self._given.stack(self._recorded(trajectories))
         if self._state is None:
-            self._state = self._counted(self.start(batch), batch)
+            try:
+                self._state = self._counted(self.start(batch), batch)
+            except BudgetExhausted as error:
+                raise ValueError(f"budget: {error}; raise it") from None
         if not self._state["done"]:
             try:
                 self._state = self._counted(self.step(self._state, batch), batch)
@@ -160,7 +169,7 @@ class Estimator(ABC):
                 "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
             )
         self.warnings = list(self._state["warnings"])
-        return self._finished(self._state, self._given.stack(trajectories))
+        return self._finished(self._state, self._given.stack(self._recorded(trajectories)))
 
     def _finished(self, state: State, trajectories: Trajectories) -> Posterior:
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
@@ -177,6 +186,17 @@ class Estimator(ABC):
             self.warnings.append(said)
             self.diagnostics["at_bound"] = said
         return posterior
+
+    def _recorded(self, given: Recorded) -> Recorded:
+        """``given``, or the trajectory that an observed x (D,) of a CallableSimulator stands for."""
+        if not isinstance(self.simulator, CallableSimulator) or isinstance(given, Trajectory | Trajectories):
+            return given
+        if isinstance(given, list | tuple) and given and isinstance(given[0], Trajectory):
+            return given
+        made = self.simulator.trajectory(given)
+        if self._observed is None or not np.array_equal(made.observations, self._observed.observations, equal_nan=True):
+            self._observed = made
+        return self._observed
 
     def describe(self, state: State) -> str:
         """What is being done, in a few words, for the progress bar."""
@@ -209,6 +229,14 @@ class Estimator(ABC):
 
     def _fingerprint(self, trajectories: Trajectories) -> str:
         digest = hashlib.sha256(repr(self.settings()).encode())
-        for array in (trajectories.observations, trajectories.actions, trajectories.dt):
+        states = np.empty(0) if trajectories.states is None else trajectories.states
+        for array in (trajectories.observations, trajectories.actions, trajectories.dt, trajectories.length, states):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
+
+
+def _default_likelihood(simulator: Simulator | CallableSimulator) -> Segments:
+    if not isinstance(simulator, CallableSimulator):
+        return Segments()
+    sd = simulator.noise_sd or (0.0,) * len(simulator.environment.channels)  # 0: fn makes its own noise
+    return Segments(None, noise="white", noise_sd=sd, starts="recorded")

@@ -16,6 +16,7 @@ length does not matter; early stopping on held-out simulations; standardised inp
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -27,7 +28,7 @@ from sipe_bayes.inference.rounds import Rounds
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
 from sipe_bayes.models.mixture_density import Features, MixtureDensity
-from sipe_bayes.models.training import Training, restore, train, weights
+from sipe_bayes.models.training import Training, check_device, restore, train, weights
 from sipe_bayes.models.transitions import StepEmbedding, control_steps
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.trajectory import Trajectories
@@ -65,11 +66,11 @@ class BayesSim(Rounds):
             if value not in known:
                 raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
         self.components, self.features, self.summary = components, features, summary
-        self.training, self.device = training or Training(), device
+        self.training, self.device = training or Training(), check_device(device)
 
     def settings(self) -> dict[str, Any]:
-        own = ("components", "features", "summary", "training")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
+        own = ("components", "features", "summary", "device")
+        return {**super().settings(), **{name: getattr(self, name) for name in own}, "training": asdict(self.training)}
 
     def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
         torch_seed = int(np.random.SeedSequence([self.seed, 2]).generate_state(1)[0])

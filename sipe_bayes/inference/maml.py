@@ -28,7 +28,7 @@ from torch.func import functional_call, grad, vmap
 from sipe_bayes.inference.prior_sampling import PriorSampling, recorded_steps
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
-from sipe_bayes.models.training import restore, split, weights
+from sipe_bayes.models.training import check_device, restore, split, weights
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 from sipe_bayes.trajectory import Trajectories
@@ -67,7 +67,7 @@ class MAML(PriorSampling):
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        counts = {"neighbours": neighbours, "hidden": hidden, "tasks": tasks, "iterations": iterations}
+        counts = {"neighbours": neighbours, "hidden": hidden, "tasks": tasks, "iterations": iterations, "patience": patience}
         for name, value in counts.items():
             if value < 1:
                 raise ValueError(f"{name}: expected at least 1, got {value}")
@@ -77,14 +77,14 @@ class MAML(PriorSampling):
             raise ValueError(f"learning_rate: expected a number above zero, got {learning_rate}")
         self.gradient_steps, self.neighbours, self.hidden = gradient_steps, neighbours, hidden
         self.learning_rate, self.tasks, self.iterations = learning_rate, tasks, iterations
-        self.patience, self.device = patience, device
+        self.patience, self.device = patience, check_device(device)
 
     @property
     def reserved(self) -> int:
         return self.gradient_steps * self.neighbours
 
     def settings(self) -> dict[str, Any]:
-        own = ("gradient_steps", "neighbours", "hidden", "learning_rate", "tasks", "iterations", "patience")
+        own = ("gradient_steps", "neighbours", "hidden", "learning_rate", "tasks", "iterations", "patience", "device")
         return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def step(self, state: State, trajectories: Trajectories) -> State:

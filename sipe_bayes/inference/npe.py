@@ -36,6 +36,7 @@ from sipe_bayes.inference.rounds import Rounds
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
+from sipe_bayes.models.training import check_device
 from sipe_bayes.models.transitions import MOST_STEPS, Standardise, StepEmbedding, control_steps
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior.flow import Flow, spline_flow, to_line
@@ -45,10 +46,6 @@ FloatArray = NDArray[np.float64]
 
 _VALIDATION = 0.1  # share of the simulations
 _TABLE = 2**26  # numbers: control steps of all simulations that are held at once
-_TRUNCATED = 1e-4  # of the flow's mass lies outside the truncated prior
-_DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from
-_PROPOSALS = 2**17  # draws of the prior tried before resampling the flow's
-_FAR = 0.999  # quantile of the simulations' distances beyond which a log is unlike them
 
 
 class NPE(Rounds):
@@ -97,13 +94,11 @@ class NPE(Rounds):
         for name, value in counts.items():
             if value < (least := 2 if name == "bins" else 1):
                 raise ValueError(f"{name}: expected at least {least}, got {value}")
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise ValueError(f"device: {device!r} is not available here; use 'cpu'")
         self.embedding = embedding
         self.embedding_features = int(embedding_features)
         self.architecture = {"transforms": int(transforms), "hidden": int(hidden), "bins": int(bins)}
         self.batch_size, self.learning_rate = int(batch_size), float(learning_rate)
-        self.patience, self.max_epochs, self.device = int(patience), int(max_epochs), device
+        self.patience, self.max_epochs, self.device = int(patience), int(max_epochs), check_device(device)
 
     def settings(self) -> dict[str, Any]:
         return {

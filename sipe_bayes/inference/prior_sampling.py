@@ -6,6 +6,7 @@ conditions on other trajectories, if their actions and starting states are those
 
 from __future__ import annotations
 
+import hashlib
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar
@@ -61,19 +62,18 @@ class PriorSampling(Estimator):
 
     def start(self, trajectories: Trajectories) -> State:
         self._check(trajectories)
-        return {"simulated": 0, "trained": False, "done": False}
+        self._affordable(trajectories)
+        return {"simulated": 0, "trained": False, "done": False, "logs": digest(trajectories), "before": 0}
 
     def step(self, state: State, trajectories: Trajectories) -> State:
         """A block of simulations, or the training once the budget is spent."""
-        most = self.budget // len(trajectories) - self.reserved
-        if most < 1:
-            raise BudgetExhausted(
-                f"{1 + self.reserved} simulations of {len(trajectories)} rollouts are the least, the budget is {self.budget}"
-            )
+        if state["logs"] != digest(trajectories):  # other trajectories, other simulations; those made count
+            state = {**state, "simulated": 0, "logs": digest(trajectories), "before": self.rollouts}
+        most = self._affordable(trajectories, state["before"])
         if state["simulated"] < most:
             count = min(state["simulated"] + BLOCK, most)
             self._simulations(trajectories).first(count)
-            self.rollouts = count * len(trajectories)
+            self.rollouts = state["before"] + count * len(trajectories)
             return {**state, "simulated": count}
         return self._trained(state, trajectories)
 
@@ -81,8 +81,8 @@ class PriorSampling(Estimator):
         self._check(trajectories)
         state = state if state["trained"] else self._trained(state, trajectories)
         log = self._looks(trajectories.observations[None], trajectories)
-        same = [name for name in log if log[name].shape[1] == state[name].shape[1]]  # a log may be shorter
-        how_far = max(unlikeness(state[name], log[name][0]) for name in same)
+        alike = np.array_equal(np.isfinite(trajectories.observations).all(-1), state["seen_where"])
+        how_far = max(unlikeness(state[name], log[name][0]) for name in log) if alike else float("nan")
         self.diagnostics["unlikeness"] = how_far
         if how_far > 1:
             said = "the log is unlike every simulation: widen the bounds, or correct the model, before you trust the result"
@@ -97,6 +97,16 @@ class PriorSampling(Estimator):
             seen = np.where(np.isfinite(trajectories.observations), rows, np.nan)
             found.append(step_statistics(control_steps(seen, trajectories.actions, trajectories.length, None), o, a))
         return np.concatenate(found)
+
+    def _affordable(self, trajectories: Trajectories, before: int = 0) -> int:
+        """Simulations to train on that the budget has room for; raises BudgetExhausted if there are none."""
+        most = (self.budget - before) // len(trajectories) - self.reserved
+        if most < 1:
+            raise BudgetExhausted(
+                f"{1 + self.reserved} simulations of {len(trajectories)} rollouts are the least, the budget has "
+                f"{self.budget - before}"
+            )
+        return most
 
     @property
     def reserved(self) -> int:
@@ -143,7 +153,8 @@ class PriorSampling(Estimator):
         simulations = self.simulations(state, trajectories)
         seen = self._looks(simulations.observations[-_SEEN:], trajectories)
         trained = self.train(simulations, trajectories)
-        return {**state, **trained, **seen, "trained": True, "done": True}
+        where = np.isfinite(trajectories.observations).all(-1)
+        return {**state, **trained, **seen, "seen_where": where, "trained": True, "done": True}
 
     def _simulations(self, trajectories: Trajectories) -> Cache:
         if self._cached is None or self._cached[0] is not trajectories:
@@ -165,9 +176,18 @@ class PriorSampling(Estimator):
             )
 
 
+def digest(trajectories: Trajectories) -> str:
+    """Of what was observed and commanded."""
+    found = hashlib.sha256()
+    for array in (trajectories.observations, trajectories.actions):
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
 def unlikeness(seen: FloatArray, log: FloatArray) -> float:
     """Local outlier factor of a log's statistics (F,) among simulated ones (n, F), over the largest of the simulations' own
-    (M. Breunig et al. 2000, https://doi.org/10.1145/342009.335388): above 1 happens by chance once in n + 1 logs."""
+    (M. Breunig et al. 2000, https://doi.org/10.1145/342009.335388): above 1 happens by chance once in n + 1 logs,
+    of two looks twice as often."""
     from sklearn.neighbors import LocalOutlierFactor
 
     sd = seen.std(0)

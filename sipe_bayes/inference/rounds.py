@@ -12,14 +12,13 @@ posterior's own draws with weights prior / posterior (their section 4.3).
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.prior_sampling import PriorSampling
+from sipe_bayes.inference.prior_sampling import PriorSampling, digest
 from sipe_bayes.inference.simulations import BLOCK, Simulations
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted
@@ -49,6 +48,8 @@ class Rounds(PriorSampling):
         return {**super().settings(), "rounds": self.rounds}
 
     def start(self, trajectories: Trajectories) -> State:
+        if self.budget // len(trajectories) < self.rounds:
+            raise BudgetExhausted(f"{self.rounds} rounds take {self.rounds * len(trajectories)} rollouts or more")
         return {**super().start(trajectories), "round": 1}
 
     def step(self, state: State, trajectories: Trajectories) -> State:
@@ -56,11 +57,9 @@ class Rounds(PriorSampling):
         most = self.budget // len(trajectories)
         if self.rounds == 1:
             return super().step(state, trajectories)
-        if most < self.rounds:
-            raise BudgetExhausted(f"{self.rounds} rounds take {self.rounds * len(trajectories)} rollouts or more")
         until = most * state["round"] // self.rounds
         if state["simulated"] == until:
-            state = {**self._trained(state, trajectories), "trained_on": _digest(trajectories)}
+            state = {**self._trained(state, trajectories), "trained_on": digest(trajectories)}
             if state["round"] == self.rounds:
                 return state
             wanted = most * (state["round"] + 1) // self.rounds - until
@@ -77,7 +76,7 @@ class Rounds(PriorSampling):
         return {**state, "simulated": count}
 
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
-        if state.get("trained_on", _digest(trajectories)) != _digest(trajectories):
+        if state.get("trained_on", digest(trajectories)) != digest(trajectories):
             raise ValueError("trajectories: several rounds were trained for other ones; use rounds=1, or fit again")
         return super().posterior(state, trajectories)
 
@@ -106,6 +105,8 @@ class Rounds(PriorSampling):
         own = found.sample((max(_PROPOSALS // 4, 10 * count),), generator=generator)
         density = found.log_prob(own)
         weight = torch.where(density >= threshold, self.prior.log_prob(own) - density, -torch.inf)
+        if int(torch.isfinite(weight).sum()) < count:
+            raise BudgetExhausted(f"the truncated prior of round {state['round'] + 1} is too small to draw {count} theta from")
         chosen = torch.multinomial((weight - weight.max()).exp(), count, replacement=False, generator=generator)
         return own[chosen].numpy()
 
@@ -115,10 +116,3 @@ def _joined(state: State, new: Simulations) -> State:
     made = {f"round_{name}": getattr(new, name) for name in _FIELDS}
     kept = {k: np.concatenate([state[k], v]) if k in state else v for k, v in made.items()}
     return {**state, **kept, "proposed": state["proposed"][len(new) :]}
-
-
-def _digest(trajectories: Trajectories) -> str:
-    digest = hashlib.sha256()
-    for array in (trajectories.observations, trajectories.actions):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()

@@ -67,7 +67,8 @@ class Cache:
         prior = [x.tolist() for x in self.prior.gaussian_moments()]
         plain = (self.simulator.checksum(), self.simulator.space.to_dict(), repr(self.prior), prior, self.seed)
         digest.update(repr((*plain, self.trajectories.names)).encode())
-        for array in (self.trajectories.actions, self.trajectories.dt, self.trajectories.length, self.starts):
+        arrays = (self.trajectories.actions, self.trajectories.dt, self.trajectories.length, self.starts)
+        for array in (*arrays, np.nan_to_num(self.trajectories.observations[:, 0])):  # holds the goals, if there are any
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:24]
 

@@ -40,7 +40,8 @@ class RandomFourier(nn.Module):
 
     def __init__(self, inputs: int, features: int, seed: int) -> None:
         super().__init__()
-        points = scipy.stats.qmc.Sobol(inputs + 1, scramble=True, rng=np.random.default_rng(seed)).random(features // 2)
+        sobol = scipy.stats.qmc.Sobol(inputs + 1, scramble=True, rng=np.random.default_rng(seed))
+        points = sobol.random_base2(math.ceil(math.log2(max(2, features // 2))))[: features // 2]
         points = np.clip(points, 1e-9, 1 - 1e-9)
         normal = scipy.stats.norm.ppf(points[:, :-1])
         widened = normal * np.sqrt(5 / scipy.stats.chi2.ppf(points[:, -1:], 5))
@@ -95,7 +96,7 @@ class MixtureDensity(nn.Module):
         self.head.weight.mul_(0.1)
         bias = torch.zeros_like(self.head.bias)
         spread = theta.std(0).clamp_min(1e-3)
-        offsets = 0.5 * (torch.linspace(-1, 1, k)[:, None] if k > 1 else torch.zeros(1, 1)) * spread
+        offsets = 0.5 * (torch.linspace(-1, 1, k) if k > 1 else torch.zeros(1)).to(spread)[:, None] * spread
         bias[k : k + k * n] = (theta.mean(0) + offsets).reshape(-1)
         bias[k + k * n : k + 2 * k * n] = (-spread.log()).repeat(k)
         self.head.bias.copy_(bias)

@@ -26,6 +26,10 @@ class Training:
     learning_rate: float = 1e-3
     weight_decay: float = 0.0
 
+    def __post_init__(self) -> None:
+        if min(self.batch, self.epochs, self.patience) < 1 or not 0 < self.held_out < 1 or self.learning_rate <= 0:
+            raise ValueError(f"training: expected numbers above zero and held_out below 1, got {self}")
+
 
 @dataclass(frozen=True)
 class Trained:
@@ -35,6 +39,15 @@ class Trained:
     epochs: int
     steps: int
     converged: bool
+
+
+def check_device(device: str) -> str:
+    """``device`` if torch has it here; raises ValueError otherwise."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError):
+        raise ValueError(f"device: {device!r} is not available here; use 'cpu'") from None
+    return device
 
 
 def split(rows: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,117 @@
+"""Any Python function in MuJoCo's place: ``sipe.CallableSimulator(fn, space)``; ``estimator.fit(x)`` takes an observed x (D,).
+
+To the estimators an x is a trajectory of one step without actions, from zeros to x.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.trajectory import Trajectories, Trajectory
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CallableEnvironment:
+    """What a CallableSimulator observes: names of the D channels."""
+
+    channels: tuple[str, ...]
+    num_actions: int = 0
+
+
+class CallableSimulator:
+    """``fn(values (B, N)) -> x (B, D)``, or noisy: ``fn(values, generator) -> x``; NaN where a simulation failed.
+
+    values are physical. generator: a numpy Generator, fn's only source of randomness; each theta has one of its own, from
+    ``seed`` and theta, so that the same theta give the same x. likelihood: sd of independent normal noise about fn's x, one
+    number or (D,); ``laplace`` and ``mcmc`` need it, and the others add that noise to what they simulate. name: tells
+    functions apart in checkpoints and caches; default fn's qualified name. Raises ValueError for an fn of another form.
+    """
+
+    def __init__(
+        self,
+        fn: Callable[..., Any],
+        space: ParameterSpace,
+        likelihood: Any = None,
+        *,
+        seed: int = 0,
+        name: str | None = None,
+    ) -> None:
+        self.fn, self.space, self.seed = fn, space, int(seed)
+        self.name = name or f"{getattr(fn, '__module__', '')}.{getattr(fn, '__qualname__', type(fn).__name__)}"
+        self.noisy = len(inspect.signature(fn).parameters) > 1
+        if self.noisy and likelihood is not None:
+            raise ValueError(
+                "likelihood: the noise is either fn's own or normal with these sds; give fn(values) -> x without noise"
+            )
+        size = self._call(space.values(space.default_theta)[None], np.random.default_rng(self.seed)).shape[1]
+        self.environment = CallableEnvironment(tuple(f"x{j}" for j in range(size)))
+        self.noise_sd = None if likelihood is None else self._sds(likelihood, size)
+
+    def _sds(self, likelihood: Any, size: int) -> tuple[float, ...]:
+        sd = np.asarray(likelihood, float)
+        if sd.shape not in ((), (size,)) or not ((sd > 0) & np.isfinite(sd)).all():
+            raise ValueError(f"likelihood: expected one sd above zero or ({size},) of them, got {likelihood!r}")
+        return tuple(np.broadcast_to(sd, (size,)).tolist())
+
+    def checksum(self) -> str:
+        """SHA-256 of the name, the form and the seed: a changed function wants another name."""
+        plain = (self.name, self.environment.channels, self.noisy, self.noise_sd, self.seed)
+        return hashlib.sha256(repr(plain).encode()).hexdigest()
+
+    def trajectory(self, x: Any) -> Trajectory:
+        """An observed x (D,) as estimators see it; NaN where it was not observed."""
+        values, size = np.asarray(x, float), len(self.environment.channels)
+        if values.shape != (size,):
+            raise ValueError(f"x: expected shape ({size},), as fn returns, got {values.shape}")
+        return Trajectory(
+            np.stack([np.zeros(size), values]), np.zeros((1, 0)), 1.0, name="x", channels=self.environment.channels
+        )
+
+    def replay(self, theta: FloatArray, trajectories: Trajectories, starts: Any = None) -> Trajectories:
+        """As ``Simulator.replay``: B * R one-step trajectories of theta (B, N), R independent ones of each."""
+        theta, count = np.atleast_2d(np.asarray(theta, float)), len(trajectories)
+        if trajectories.actions.shape[1:] != (1, 0):
+            raise ValueError(f"trajectories: expected an x ({len(self.environment.channels)},), got a trajectory")
+        x = (
+            np.repeat(self._call(self.space.values(theta)), count, axis=0)
+            if not self.noisy
+            else self._drawn(theta, count)
+        )
+        batch = len(x)
+        observations = np.stack([np.zeros_like(x), x], axis=1)
+        valid = np.stack([np.ones(batch, bool), np.isfinite(x).all(1)], axis=1)
+        return Trajectories(
+            observations,
+            np.zeros((batch, 1, 0)),
+            np.ones(batch),
+            np.ones(batch, int),
+            valid,
+            None,
+            tuple(trajectories.names) * len(theta),
+            self.environment.channels,
+        )
+
+    def _drawn(self, theta: FloatArray, count: int) -> FloatArray:
+        rows = []
+        for row in theta:
+            digest = hashlib.sha256(np.ascontiguousarray(row).tobytes()).digest()[:8]
+            rng = np.random.default_rng([self.seed, int.from_bytes(digest, "little")])
+            rows.append(self._call(np.tile(self.space.values(row), (count, 1)), rng))
+        return np.concatenate(rows)
+
+    def _call(self, values: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
+        x = np.asarray(self.fn(values, rng) if self.noisy else self.fn(values), float)
+        if x.ndim != 2 or len(x) != len(values) or not math.prod(x.shape):
+            raise ValueError(f"fn: expected x ({len(values)}, D) for values {values.shape}, got shape {x.shape}")
+        return x
