@@ -124,7 +124,7 @@ class ADR(Search):
         self.diagnostics["search"] = {
             "steps": len(state["paths"]) - 1,
             "largest_sd": float(particles.std(0).max()),
-            "best_reward": float(reward.max()),
+            "best_reward": float(reward.max()) if len(reward) else float("-inf"),
         }
         return Particles(particles, self.space, best=best)
 

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from sipe_bayes.discrepancy import StateDifference, simulate
-from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.base import Estimator, Recorded
 from sipe_bayes.inference.state import State
 from sipe_bayes.learned_reward import LearnedReward
 from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.posterior.truncated_normal import interval_quantile
+from sipe_bayes.posterior import Posterior
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -51,6 +52,13 @@ class Search(Estimator):
             raise ValueError(f"learning_rate: expected a positive number, got {learning_rate}")
         self.reward, self.learning_rate = reward, learning_rate
         self._learned: tuple[Trajectories, LearnedReward] | None = None
+
+    def fit(self, trajectories: Recorded) -> Posterior:
+        """As ``Estimator.fit``; a warning if a prior was given, which a search does not use."""
+        found = super().fit(trajectories)
+        if (self.prior.gaussian_moments()[1].diagonal() < 1).any():  # a uniform prior counts as enormously wide
+            self.warnings.append(f"{self.name} searches within the bounds and does not use the prior; bayesopt and npe do")
+        return found
 
     def settings(self) -> dict[str, Any]:
         return {**super().settings(), "reward": self.reward, "learning_rate": self.learning_rate}

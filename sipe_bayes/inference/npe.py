@@ -125,11 +125,9 @@ class NPE(Rounds):
         with seeded(_number(self.seed, 4)), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             net, summary = self._optimise(((line - mean) / sd).float(), x)
-        with torch.no_grad():
-            context = torch.cat([net.embedding_net(part) for part in x.split(256)]).double()
         self._report(summary, len(x))
         weights = {f"weights.{key}": value.numpy() for key, value in net.state_dict().items()}
-        shape: State = {"features": x.shape[-1], "context_features": context.shape[1]}
+        shape: State = {"features": x.shape[-1]}
         return {**weights, **shape, "line_mean": mean.numpy(), "line_sd": sd.numpy()}
 
     def infer(self, state: State, trajectories: Trajectories) -> Posterior:

@@ -21,7 +21,8 @@ the weights p change in the mean and covariance of the draws against the weights
 p: those also hold the noise of q's own weights and what the cube cuts off, and collapse far from the optimum. The change
 of covariance counts the less the fewer the effective draws are; no variance shrinks below a quarter in an update or
 below 1e-10 at all; the mean stays in the cube, to which draws are restricted; and the step is cut back until the
-Gaussians' own KL is within epsilon. Diverged simulations have weight zero. "Covariance initialisation 0.2" is read as a
+Gaussians' own KL is within epsilon. The earlier Gaussians' densities are those before the cube cuts them: their
+masses within it, which differ, are taken as equal. Diverged simulations have weight zero. "Covariance initialisation 0.2" is read as a
 variance, and epsilon is chosen here. Policy training is not part of it: other trajectories may be given at each step.
 
 The result is a search distribution that narrows as long as it is fed: it finds, and does not say how sure one may be.

@@ -240,7 +240,7 @@ def _run(
     moves = [(emcee.moves.DEMove(), 0.6), (emcee.moves.DESnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
     if proposal is not None:
         moves = [(move, share / 2) for move, share in moves] + [(emcee.moves.MHMove(proposal), 0.5)]
-    state = emcee.State(begin, random_state=random.get_state())
+    state = emcee.State(getattr(begin, "coords", begin), random_state=random.get_state())
     sampler = emcee.EnsembleSampler(*state.coords.shape, log_density, vectorize=True, moves=moves)
     end = sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
     random.set_state(end.random_state)

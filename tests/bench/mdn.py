@@ -31,7 +31,8 @@ def looped(network: MixtureDensity, inputs: torch.Tensor, theta: torch.Tensor) -
         whitening = torch.eye(N).repeat(len(inputs), 1, 1)
         whitening[:, rows, columns] = below[:, k]
         whitening = whitening * diagonal[:, k].exp()[..., None]
-        component = MultivariateNormal(means[:, k], precision_matrix=whitening.mT @ whitening, validate_args=False)
+        root = torch.linalg.solve_triangular(whitening, torch.eye(N).expand_as(whitening), upper=False)
+        component = MultivariateNormal(means[:, k], scale_tril=root, validate_args=False)
         terms.append(log_weights[:, k] + component.log_prob(theta))
     return torch.stack(terms, -1).logsumexp(-1)
 

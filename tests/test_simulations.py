@@ -1,0 +1,204 @@
+"""The cache of simulations, and what BayesSim, MAML and the rest learn from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call
+
+from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.maml import MAML
+from sipe_bayes.inference.regression import _Linear
+from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
+from sipe_bayes.likelihood import first_states
+from sipe_bayes.models.mixture_density import MixtureDensity, RandomFourier
+from sipe_bayes.models.statistics import step_statistics
+from sipe_bayes.models.transitions import control_steps
+from sipe_bayes.posterior import prior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
+from tests.pendulums import log, pendulum
+
+TRUTH = [0.6, 0.05]
+
+
+class Counting(Simulator):
+    """Counts the lanes that are really simulated."""
+
+    def __init__(self) -> None:
+        super().__init__(pendulum().environment, num_threads=1)
+        self.lanes = 0
+
+    def rollout(self, theta: Any, *args: Any, **settings: Any) -> Trajectories:
+        made = super().rollout(theta, *args, **settings)
+        self.lanes += len(made)
+        return made
+
+
+def cache(simulator: Simulator, folder: Path | None = None, seed: int = 0) -> Cache:
+    recorded = Trajectories.stack(log(simulator, TRUTH, 1, steps=60))
+    return Cache(simulator, prior(simulator.space), recorded, first_states(simulator, recorded), seed, folder)
+
+
+def same(a: Simulations, b: Simulations) -> bool:
+    pairs = ((a.theta, b.theta), (a.observations, b.observations), (a.valid, b.valid))
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in pairs)
+
+
+def test_rows_are_the_same_however_many_are_made(tmp_path: Path) -> None:
+    """All at once, bit by bit, read from disk, and made again where a file is broken."""
+    simulator = Counting()
+    whole = cache(simulator).first(120)
+    grown = cache(simulator, tmp_path)
+    for count in (10, 70, 120):
+        assert len(grown.first(count)) == count
+    assert same(grown.first(120), whole)
+    again = cache(simulator, tmp_path)
+    simulator.lanes = 0
+    assert same(again.first(120), whole)
+    assert simulator.lanes == 0
+    next(tmp_path.glob("*/block-000001.npz")).write_bytes(b"torn")
+    again = cache(simulator, tmp_path)
+    simulator.lanes = 0
+    assert same(again.first(120), whole)
+    assert simulator.lanes == BLOCK
+    assert not same(cache(simulator, tmp_path, seed=1).first(120), whole)
+
+
+def test_two_estimators_share_one_cache_and_its_simulations_count(tmp_path: Path) -> None:
+    simulator = Counting()
+    recorded = log(simulator, TRUTH, 1, steps=60)
+    simulator.lanes = 0
+    for name in ("abc", "bayessim"):
+        estimator = get_estimator(simulator, name, budget=130, cache=tmp_path)
+        estimator.fit(recorded)
+        assert estimator.rollouts == 130
+    assert simulator.lanes == 130
+
+
+@pytest.mark.parametrize("name", ["abc", "maml", "cem", "bayesopt"])
+def test_no_more_is_simulated_than_the_budget_says(name: str) -> None:
+    """Two logs in turn, counted where they are simulated."""
+    simulator = Counting()
+    logs = [log(simulator, TRUTH, k, steps=60) for k in (1, 2)]
+    settings = {"iterations": 20} if name == "maml" else {}
+    estimator = get_estimator(simulator, name, budget=150, **settings)
+    simulator.lanes = 0
+    windows = -(-60 // 50)
+    for k in range(30):
+        estimator.update_parameter_estimate(logs[k % 2])
+    most = 150 * (windows if name in ("cem", "bayesopt") else 1)
+    assert 0 < simulator.lanes <= most
+    assert estimator.rollouts <= 150
+
+
+def test_where_the_invalid_simulations_lie_is_said() -> None:
+    rng, space = np.random.default_rng(0), pendulum().space
+    theta = rng.random((300, 2))
+    some = Simulations(theta, np.zeros((300, 1, 2, 1), np.float32), theta[:, 1] < 0.8)
+    assert "mostly at high damping" in str(describe_invalid(some, space))
+    scattered = Simulations(theta, some.observations, np.arange(300) % 10 > 0)
+    assert "all over the prior" in str(describe_invalid(scattered, space))
+    assert describe_invalid(Simulations(theta, some.observations, np.ones(300, bool)), space) is None
+
+
+def test_statistics_against_plain_loops() -> None:
+    rng = np.random.default_rng(0)
+    observations, actions = rng.standard_normal((2, 1, 6, 2)), rng.standard_normal((1, 5, 1))
+    observations[0, 0, 2, 0] = np.nan
+    found = step_statistics(control_steps(observations, actions, np.array([5])), 2, 1)
+    for k in range(2):
+        change = np.diff(observations[k, 0], axis=0)
+        good = np.isfinite(observations[k, 0]).all(1)
+        keep = good[:-1] & good[1:]
+        cross = [(change[keep, c] * actions[0, keep, 0]).mean() for c in range(2)]
+        expected = [*change[keep].mean(0), *change[keep].var(0), *cross]
+        np.testing.assert_allclose(found[k], expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("settings", [{}, {"features": "random_fourier"}, {"summary": "learned"}, {"rounds": 2}])
+def test_bayessim_narrows_around_the_truth(settings: dict[str, Any]) -> None:
+    """Each variant: the truth within 3 sd, both sds below the prior's."""
+    simulator = pendulum()
+    estimator = get_estimator(simulator, "bayessim", budget=400, seed=0, **settings)
+    posterior = estimator.fit(log(simulator, TRUTH, 1, steps=150))
+    truth = simulator.space.normalise(np.array(TRUTH))
+    print(settings, posterior.mean, posterior.stddev, truth)
+    assert (np.abs(posterior.mean.numpy() - truth) < 3 * posterior.stddev.numpy()).all()
+    assert (posterior.stddev.numpy() < 0.2).all()
+    assert estimator.amortised == ("rounds" not in settings)
+
+
+def test_the_mixture_density_is_that_of_its_mixture() -> None:
+    torch.manual_seed(0)
+    network = MixtureDensity(3, 4, 2).double()
+    theta, inputs = torch.rand(50, 4, dtype=torch.float64), torch.randn(1, 3, dtype=torch.float64)
+    log_weights, means, covariances = network.mixture(inputs[0])
+    parts = [
+        w + torch.distributions.MultivariateNormal(torch.from_numpy(m), torch.from_numpy(c)).log_prob(theta)
+        for w, m, c in zip(log_weights, means, covariances, strict=True)
+    ]
+    with torch.no_grad():
+        found = network.log_prob(inputs.expand(50, -1), theta)
+    torch.testing.assert_close(found, torch.logsumexp(torch.stack(parts), 0), rtol=1e-6, atol=1e-6)
+
+
+def test_random_features_approximate_their_kernel() -> None:
+    """Matern-5/2 at four distances, to 0.05 with 2,000 features."""
+    features = RandomFourier(3, 4000, seed=0)
+    x = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0, 1.0, 0], [0.5, -0.5, 0.5], [2.0, 1, -1]])
+    with torch.no_grad():
+        kernel = features(x) @ features(x[:1]).T
+    r = np.sqrt(5) * x.norm(dim=1).numpy()
+    np.testing.assert_allclose(kernel[:, 0].numpy(), (1 + r + r**2 / 3) * np.exp(-r), atol=0.05)
+
+
+def test_regression_descends_the_gradient_of_autograd() -> None:
+    torch.manual_seed(0)
+    network, inputs, targets = _Linear(3, 2), torch.randn(7, 3), torch.randn(7, 2)
+    slope, bias = torch.autograd.grad((network.map(inputs) - targets).square().mean(), list(network.parameters()))
+    before = [p.detach().clone() for p in network.parameters()]
+    network.descend(inputs, targets, 0.1)
+    torch.testing.assert_close(network.slope.data, before[0] - 0.1 * slope)
+    torch.testing.assert_close(network.bias.data, before[1] - 0.1 * bias)
+
+
+def test_mamls_outer_gradient_goes_through_the_inner_step() -> None:
+    """Against plain autograd with create_graph, one task; the first-order gradient differs."""
+    method = MAML(pendulum(), neighbours=2, hidden=5)
+    network = method._network(3, 0)
+    rng = torch.Generator().manual_seed(0)
+    inputs, theta, good = torch.randn(4, 6, 3, generator=rng), torch.rand(4, 2, generator=rng), torch.ones(4, 6)
+    tasks, pool = torch.tensor([0]), torch.arange(4)
+    fixed = torch.Generator().manual_seed(1)
+    ours = method._meta_loss(network, inputs, theta, good)(tasks, pool, fixed).sum()
+    parameters = dict(network.named_parameters())
+    outer = torch.autograd.grad(ours, list(parameters.values()))
+    picked = torch.randint(6, (6,), generator=torch.Generator().manual_seed(1))
+    near = (theta[1:] - theta[0]).norm(dim=1).argsort()[:2] + 1
+
+    def mean_square(weights: dict[str, torch.Tensor], rows: torch.Tensor) -> torch.Tensor:
+        out = functional_call(network, weights, (inputs[rows][:, picked],))
+        return (out - theta[rows][:, None]).square().mean()
+
+    inner = torch.autograd.grad(mean_square(parameters, near), list(parameters.values()), create_graph=True)
+    moved = {n: w - method.learning_rate * g for (n, w), g in zip(parameters.items(), inner, strict=True)}
+    plain = torch.autograd.grad(mean_square(moved, tasks), list(parameters.values()))
+    for a, b in zip(outer, plain, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-7)
+
+
+def test_maml_without_gradient_steps_simulates_nothing_more() -> None:
+    simulator = Counting()
+    recorded = log(simulator, TRUTH, 1, steps=60)
+    simulator.lanes = 0
+    for steps, reserved in ((0, 0), (2, 10)):
+        estimator = get_estimator(simulator, "maml", budget=100, gradient_steps=steps, iterations=20)
+        estimator.fit(recorded)
+        assert estimator.rollouts == 100
+        assert estimator.reserved == reserved
+    assert simulator.lanes == 200
