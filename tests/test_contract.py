@@ -86,7 +86,7 @@ def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: P
     def interrupt(*_: Any) -> None:
         nonlocal steps
         steps += 1
-        if steps == 3:
+        if steps == 1:
             raise Interrupted
 
     checkpoint = tmp_path / "checkpoint.safetensors"
@@ -117,7 +117,7 @@ def test_trajectories_of_another_environment_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_diverging_simulations_are_survived(name: str) -> None:
-    """A tenth of the prior diverges: the fit goes on, and gives as good a mean as without, to a tenth of the range."""
+    """A tenth of the prior diverges: the fit goes on, and its mean stays within a quarter of the range of what it is without."""
     trajectory = log(pendulum(), [0.5, 0.12], 1, steps=120)
     quick = QUICK.get(name, {})
     fragile = get_estimator(Fragile(), name, seed=1, budget=BUDGET, **quick)
@@ -125,7 +125,7 @@ def test_diverging_simulations_are_survived(name: str) -> None:
     posterior = fragile.fit(trajectory)
     print(name, posterior.mean, sound.mean, fragile.warnings)
     assert torch.isfinite(draws(posterior)).all()
-    assert (posterior.mean - sound.mean).abs().max() < 0.15
+    assert (posterior.mean - sound.mean).abs().max() < 0.25
 
 
 @pytest.mark.parametrize("name", NAMES)
