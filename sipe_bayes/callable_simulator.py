@@ -47,6 +47,10 @@ class CallableSimulator:
         seed: int = 0,
         name: str | None = None,
     ) -> None:
+        if not isinstance(space, ParameterSpace):
+            raise ValueError(
+                f"space: expected a ParameterSpace, got {type(space).__name__}; sipe.ParameterSpace([...])"
+            )
         self.fn, self.space, self.seed = fn, space, int(seed)
         self.name = name or f"{getattr(fn, '__module__', '')}.{getattr(fn, '__qualname__', type(fn).__name__)}"
         self.noisy = len(inspect.signature(fn).parameters) > 1
@@ -111,7 +115,15 @@ class CallableSimulator:
         return np.concatenate(rows)
 
     def _call(self, values: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
-        x = np.asarray(self.fn(values, rng) if self.noisy else self.fn(values), float)
+        try:
+            x = np.asarray(self.fn(values, rng) if self.noisy else self.fn(values), float)
+        except (IndexError, TypeError) as error:
+            raise ValueError(
+                f"fn: expected fn(values (B, {len(self.space)})) -> x (B, D), a row for each theta, values[:, 0] the first "
+                f"parameter; with values {values.shape} it raised {type(error).__name__}: {error}"
+            ) from error
         if x.ndim != 2 or len(x) != len(values) or not math.prod(x.shape):
-            raise ValueError(f"fn: expected x ({len(values)}, D) for values {values.shape}, got shape {x.shape}")
+            raise ValueError(
+                f"fn: expected x ({len(values)}, D) for values {values.shape}, a row for each theta, got shape {x.shape}"
+            )
         return x

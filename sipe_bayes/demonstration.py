@@ -130,7 +130,12 @@ class Given:
             return given
         if is_environment(given):
             return self._kept(_identity(given), lambda: demonstrations(given))
-        items = (given,) if isinstance(given, Trajectory) else tuple(given)
+        items = (given,) if isinstance(given, Trajectory) else tuple(given) if isinstance(given, list | tuple) else ()
+        if not isinstance(given, Trajectory | list | tuple) or not all(isinstance(item, Trajectory) for item in items):
+            raise ValueError(
+                f"trajectories: expected a Trajectory, several, or an environment, got {type(given).__name__}; make "
+                "sipe.Trajectory(observations (T+1, O), actions (T, A), dt)"
+            )
         self._key = () if anew else self._key
         return self._kept(items, lambda: Trajectories.stack(items))
 

@@ -63,6 +63,13 @@ def _info(step: Step) -> Info:
     return {key: value for key, value in found.items() if value is not None}
 
 
+def _checked(options: Info | None, known: tuple[str, ...]) -> Info:
+    unknown = sorted(set(options or {}) - set(known))
+    if unknown:
+        raise ValueError(f"options: no {unknown[0]!r}; expected any of {', '.join(known)}")
+    return options or {}
+
+
 class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
     """One lane of a task. ``set_parameters(theta)`` changes the simulator at once, ``reset(options={"theta": ...})`` from
     the new episode on; theta (N,) outside the unit cube only where ``options["allow_outside"]`` or the variant says."""
@@ -88,7 +95,7 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[FloatArray, Info]:
         super().reset(seed=seed)
-        options = options or {}
+        options = _checked(options, ("theta", "allow_outside"))
         if "theta" in options:
             self.set_parameters(options["theta"], bool(options.get("allow_outside", False)))
         if self._episodes is None:
@@ -169,7 +176,7 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     ) -> tuple[FloatArray, Info]:
         """options: ``reset_mask`` (B,) to begin anew in some lanes only, and for those ``theta`` (L, N) or (N,) with
         ``allow_outside``."""
-        options = options or {}
+        options = _checked(options, ("theta", "allow_outside", "reset_mask"))
         chosen = self._chosen("reset_mask", options.get("reset_mask"))
         seeds = self._seeds(seed)
         if "theta" in options:

@@ -19,7 +19,7 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 from tests.pendulums import log, pendulum
 
 NAMES = list(ESTIMATORS)
-BUDGET = 250
+BUDGET = 150
 QUICK = {
     "maml": {"iterations": 50},
     "npe": {"max_epochs": 20},
@@ -133,10 +133,10 @@ def test_a_truth_outside_the_prior_raises_suspicion(name: str) -> None:
     """The rod is three times as heavy as the bounds allow. A truth well inside raises none."""
     suspicious = ("at a bound", "unlike")
     heavy = light()
-    outside = get_estimator(heavy, name, seed=2, budget=BUDGET, **QUICK.get(name, {}))
+    outside = get_estimator(heavy, name, seed=2, budget=2 * BUDGET, **QUICK.get(name, {}))
     outside.fit(log(pendulum(), [0.99, 0.01], 1, steps=200))
     assert any(word in w for w in outside.warnings for word in suspicious), outside.warnings
-    inside = get_estimator(heavy, name, seed=2, budget=BUDGET, **QUICK.get(name, {}))
+    inside = get_estimator(heavy, name, seed=2, budget=2 * BUDGET, **QUICK.get(name, {}))
     inside.fit(log(heavy, [0.2, 0.1], 1, steps=200))
     assert not any(word in w for w in inside.warnings for word in suspicious), inside.warnings
 

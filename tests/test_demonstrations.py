@@ -33,7 +33,7 @@ def quietly(*args: Any, **settings: Any) -> Trajectories:
 
 
 def test_what_was_used_is_said_where_it_was_asked_for() -> None:
-    with pytest.warns(UserWarning, match="no expert agent of Pendulum is installed; smooth random") as caught:
+    with pytest.warns(UserWarning, match="no expert agent of Pendulum is installed; an excitation policy") as caught:
         sipe.demonstrations("Pendulum", steps=5)
     assert caught[0].filename == __file__
 
@@ -145,14 +145,14 @@ def test_wrong_input() -> None:
 
 def test_an_estimator_keeps_what_it_is_given() -> None:
     given, env = Given(), sipe.make("Pendulum")
-    with pytest.warns(UserWarning, match="smooth random"):
+    with pytest.warns(UserWarning, match="an excitation policy"):
         first = given.stack(env)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert given.stack(env) is first
         assert given.stack(gymnasium.Wrapper(env)) is first
     env.set_parameters(np.full(3, 0.4))
-    with pytest.warns(UserWarning, match="smooth random"):
+    with pytest.warns(UserWarning, match="an excitation policy"):
         assert given.stack(env) is not first
     trajectories = [log(pendulum(), [0.6, 0.05], seed, steps=10) for seed in (1, 2)]
     both = given.stack(trajectories)
@@ -172,7 +172,7 @@ def test_the_papers_snippet_runs(capsys: pytest.CaptureFixture[str], tmp_path: P
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    with pytest.warns(UserWarning, match="smooth random"):
+    with pytest.warns(UserWarning, match="an excitation policy"):
         posterior = module.main(str(tmp_path / "figure.png"))
     truth = sipe.make_task("Pendulum").theta("in_distribution")
     np.testing.assert_allclose(posterior.mean.numpy(), truth, atol=1e-6)
@@ -183,7 +183,7 @@ def test_the_papers_snippet_runs(capsys: pytest.CaptureFixture[str], tmp_path: P
 def test_an_environment_stands_for_its_demonstrations() -> None:
     env = sipe.make("Pendulum", "in_distribution")
     by_env, by_hand = (get_estimator("Pendulum", "laplace", budget=300, seed=1) for _ in range(2))
-    with pytest.warns(UserWarning, match="smooth random"):
+    with pytest.warns(UserWarning, match="an excitation policy"):
         found = by_env.fit(env)
     np.testing.assert_array_equal(found.mean.numpy(), by_hand.fit(quietly(env)).mean.numpy())
 

@@ -102,7 +102,7 @@ def test_posterior_predictive_holds_the_log_that_it_knows() -> None:
     """Draws within 1e-3 of the truth predict its log; the prior's band is wider everywhere on average."""
     env = sipe.make("Pendulum")
     env.set_parameters(np.array([0.4, 0.6, 0.3]))
-    with pytest.warns(UserWarning, match="smooth random"):
+    with pytest.warns(UserWarning, match="an excitation policy"):
         log = sipe.demonstrations(env, count=1, steps=50)[0]
     assert log.states is not None
     posterior = GaussianMixture([0.0], [env.theta], [1e-6 * np.eye(3)], env.task.space)

@@ -43,6 +43,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.discrepancy import StateDifference, simulate
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.state import State
@@ -155,7 +156,8 @@ class BayesOpt(Estimator):
             )
         process = self._process(state)
         found = SurrogatePosterior.sampled(process, self._threshold(state, process), self.prior, self.seed)
-        self._report(state, process, found, trajectories.states is not None)
+        known = trajectories.states is not None or isinstance(self.simulator, CallableSimulator)
+        self._report(state, process, found, known)
         return found
 
     def _affordable(self, trajectories: Trajectories) -> int:

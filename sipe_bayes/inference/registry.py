@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import inspect
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -41,4 +42,10 @@ def get_estimator(simulator: Any, name: str, **settings: Any) -> Estimator:
     from sipe_bayes.demonstration import is_environment, simulator_of
 
     engine = simulator_of(simulator)[0] if is_environment(simulator) else simulator
-    return estimator_class(name)(engine, **settings)
+    found = estimator_class(name)
+    known = sorted({p for c in found.__mro__[:-1] for p in inspect.signature(c).parameters} - {"simulator", "settings"})
+    for unknown in sorted(set(settings) - set(known)):
+        close = difflib.get_close_matches(unknown, known, 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(known)}"
+        raise ValueError(f"{name}: no setting {unknown!r}; {hint}")
+    return found(engine, **settings)
