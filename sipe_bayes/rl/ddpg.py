@@ -1,0 +1,233 @@
+"""DDPG: a deterministic actor that climbs its critic, learnt off policy.
+
+Lillicrap et al., "Continuous control with deep reinforcement learning", 2016, https://arxiv.org/abs/1509.02971, in the
+form that Fujimoto, van Hoof, Meger tuned, "Addressing Function Approximation Error in Actor-Critic Methods", 2018,
+https://arxiv.org/abs/1802.09477 ("our DDPG"). Of a batch of transitions (s, a, r, s') the critic follows
+
+    Q(s, a)  ->  y = r + gamma (1 - terminated) Q'(s', pi'(s')),     loss: the mean of (Q(s, a) - y)^2,
+
+the actor then climbs the mean of Q(s, pi(s)), and the targets Q' and pi' follow their networks by tau. An episode that
+runs out of time is not terminated, so its last value is asked for as any other's.
+
+Deviations from the 2018 paper's DDPG: hidden layers of 256 and 256, Adam at 3e-4 and batches of 256, as its authors later
+had them in their repository; before: 400 and 300, 1e-3, 100. Random actions at the start: 25,000 steps on every task.
+Options (``sipe_bayes.rl.settings``), each off unless asked for and each a deviation: ``normalise`` (observations), ``layer_norm``
+(critic's hidden layers; Ba, Kiros, Hinton, "Layer Normalization", 2016, https://arxiv.org/abs/1607.06450), ``n_step``
+(returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``lanes`` (environments stepped
+together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
+experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
+
+The two networks are small and of one kind, so gradients are written out by hand on flat vectors of parameters: the
+actor's step needs no gradient of the critic's weights, and Adam and the targets take a call each.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sipe_bayes.rl.normaliser import Normaliser
+from sipe_bayes.rl.policy import Policy
+from sipe_bayes.rl.replay import Batch
+from sipe_bayes.rl.settings import Settings
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+
+class Network:
+    """An MLP with ReLU, perhaps normalised hidden layers, in one flat vector (P,); forward and backward by hand."""
+
+    def __init__(self, sizes: tuple[int, ...], layer_norm: bool = False) -> None:
+        self.sizes, self.layer_norm = sizes, layer_norm
+        self._shapes: list[tuple[int, ...]] = []
+        for i, (before, after) in enumerate(pairwise(sizes)):
+            self._shapes += [(after, before), (after,)]
+            if layer_norm and i < len(sizes) - 2:
+                self._shapes += [(after,), (after,)]
+        self.parameters = torch.zeros(sum(int(np.prod(s)) for s in self._shapes))
+        self.gradients = torch.zeros_like(self.parameters)
+        self.layers, self._slopes = self._views(self.parameters), self._views(self.gradients)
+
+    def initialise(self, rng: np.random.Generator) -> None:
+        """Weights and biases uniform within 1 / sqrt(inputs), as torch.nn.Linear has them."""
+        for weight, bias, *norm in self.layers:
+            bound = weight.shape[1] ** -0.5
+            for part in (weight, bias):
+                part.copy_(torch.from_numpy(rng.uniform(-bound, bound, tuple(part.shape))))
+            if norm:
+                norm[0].fill_(1.0)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, list[Any]]:
+        """Outputs (B, out) of x (B, in), and what ``backward`` needs."""
+        tape: list[Any] = []
+        for weight, bias, *norm in self.layers[:-1]:
+            z = torch.addmm(bias, x, weight.t())
+            if norm:
+                normal, *statistics = torch.native_layer_norm(z, z.shape[1:], norm[0], norm[1], 1e-5)
+                tape.append((x, normal.relu_(), (z, *statistics)))
+            else:
+                tape.append((x, z.relu_(), ()))
+            x = tape[-1][1]
+        weight, bias = self.layers[-1]
+        tape.append((x, None, ()))
+        return torch.addmm(bias, x, weight.t()), tape
+
+    def backward(self, tape: list[Any], slope: Tensor, weights: bool = True, inputs: bool = False) -> Tensor | None:
+        """Fill ``gradients`` from slope (B, out) if ``weights``; returns the inputs' (B, in) if ``inputs``."""
+        for i in range(len(self.layers) - 1, -1, -1):
+            (x, y, statistics), (weight, _, *norm), out = tape[i], self.layers[i], self._slopes[i]
+            if y is not None:
+                slope = torch.ops.aten.threshold_backward(slope, y, 0)
+            if norm:
+                slope, gain, shift = torch.ops.aten.native_layer_norm_backward(
+                    slope, statistics[0], statistics[0].shape[1:], *statistics[1:], *norm, [True, weights, weights]
+                )
+                if weights:
+                    out[2].copy_(gain)
+                    out[3].copy_(shift)
+            if weights:
+                torch.mm(slope.t(), x, out=out[0])
+                torch.sum(slope, 0, out=out[1])
+            if i or inputs:
+                slope = torch.mm(slope, weight)
+        return slope if inputs else None
+
+    def twin(self) -> Network:
+        """Another network with the same parameters."""
+        other = Network(self.sizes, self.layer_norm)
+        other.parameters.copy_(self.parameters)
+        return other
+
+    def _views(self, flat: Tensor) -> list[list[Tensor]]:
+        """Weight, bias and, if any, gain and shift of each layer."""
+        parts = [
+            p.view(s) for p, s in zip(flat.split([int(np.prod(s)) for s in self._shapes]), self._shapes, strict=True)
+        ]
+        starts = [i for i, s in enumerate(self._shapes) if len(s) == 2] + [len(parts)]
+        return [parts[a:b] for a, b in pairwise(starts)]
+
+
+class Agent:
+    """Actor, critic, their targets and optimisers, for observations (B, O) and actions (B, A) between two bounds."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        action_low: float,
+        action_high: float,
+        settings: Settings,
+        rng: np.random.Generator,
+    ) -> None:
+        self.settings, self.observation_size = settings, observation_size
+        self.action_low, self.action_high = action_low, action_high
+        self._half, self._middle = (action_high - action_low) / 2, (action_high + action_low) / 2
+        self.actor = Network((observation_size, *settings.hidden, action_size))
+        self.critic = Network((observation_size + action_size, *settings.hidden, 1), settings.layer_norm)
+        self.actor.initialise(rng)
+        self.critic.initialise(rng)
+        self.target_actor, self.target_critic = self.actor.twin(), self.critic.twin()
+        self._actor_optimiser, self._critic_optimiser = _Adam(self.actor, settings), _Adam(self.critic, settings)
+        self.normaliser = Normaliser(observation_size, 5.0) if settings.normalise else None
+        self.updates = 0
+
+    def act(self, observations: FloatArray) -> FloatArray:
+        """Actions (B, A) of observations (B, O), without noise."""
+        x = torch.from_numpy(self._seen(observations.astype(np.float32)))
+        return np.asarray(self._bounded(self.actor.forward(x)[0].tanh_()).numpy(), float)
+
+    def update(self, batch: Batch) -> None:
+        """One step of the critic, the actor and the targets."""
+        observations, following = (
+            torch.from_numpy(self._seen(x)) for x in (batch.observations, batch.next_observations)
+        )
+        targets = self._targets(following, torch.from_numpy(batch.returns), torch.from_numpy(batch.discounts))
+        pairs = torch.cat([observations, torch.from_numpy(batch.actions)], 1)
+        values, tape = self.critic.forward(pairs)
+        self.critic.backward(tape, (values - targets).mul_(2 / len(values)))
+        self._critic_optimiser.step()
+        self._climb(observations)
+        for network, target in ((self.actor, self.target_actor), (self.critic, self.target_critic)):
+            target.parameters.lerp_(network.parameters, self.settings.tau)
+        self.updates += 1
+
+    def policy(self, task: str, goal_size: int = 0) -> Policy:
+        """What has been learnt so far."""
+        layers = tuple((w.numpy().copy(), b.numpy().copy()) for w, b in self.actor.layers)
+        low, high = self.action_low, self.action_high
+        if self.normaliser is None:
+            return Policy(task, layers, low, high, goal_size=goal_size)
+        seen = self.normaliser
+        return Policy(task, layers, low, high, seen.mean.copy(), seen.scale.copy(), seen.clip, goal_size)
+
+    def state(self) -> dict[str, Any]:
+        """Arrays and numbers from which ``restore`` goes on bit for bit."""
+        found: dict[str, Any] = {name: tensor.numpy().copy() for name, tensor in self._tensors().items()}
+        if self.normaliser is not None:
+            found |= {f"normaliser.{k}": v for k, v in self.normaliser.state().items()}
+        return {**found, "updates": self.updates}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        for name, tensor in self._tensors().items():
+            tensor.copy_(torch.from_numpy(state[name]).reshape(tensor.shape))  # a file's scalar is (1,)
+        if self.normaliser is not None:
+            self.normaliser.restore({k: state[f"normaliser.{k}"] for k in self.normaliser.state()})
+        self.updates = int(state["updates"])
+
+    def _tensors(self) -> dict[str, Tensor]:
+        networks = ("actor", "critic", "target_actor", "target_critic")
+        found = {name: getattr(self, name).parameters for name in networks}
+        for name, optimiser in (("actor", self._actor_optimiser), ("critic", self._critic_optimiser)):
+            found |= {f"{name}.{k}": v for k, v in optimiser.moments().items()}
+        return found
+
+    def _seen(self, observations: Float32Array) -> Float32Array:
+        return observations if self.normaliser is None else self.normaliser.apply(observations)
+
+    def _bounded(self, squashed: Tensor) -> Tensor:
+        return squashed * self._half + self._middle
+
+    def _targets(self, following: Tensor, returns: Tensor, discounts: Tensor) -> Tensor:
+        """y (B, 1)."""
+        actions = self._bounded(self.target_actor.forward(following)[0].tanh_())
+        values = self.target_critic.forward(torch.cat([following, actions], 1))[0]
+        found = torch.addcmul(returns[:, None], discounts[:, None], values)
+        return found.clamp_(-1 / (1 - self.settings.discount), 0.0) if self.settings.clip_targets else found
+
+    def _climb(self, observations: Tensor) -> None:
+        """The actor's step: along the critic's slope in the action, times what squashes it."""
+        outputs, tape = self.actor.forward(observations)
+        squashed = outputs.tanh_()
+        values, along = self.critic.forward(torch.cat([observations, self._bounded(squashed)], 1))
+        slope = self.critic.backward(along, torch.full_like(values, -1 / len(values)), weights=False, inputs=True)
+        assert slope is not None
+        inner = slope[:, self.observation_size :] * self._half
+        if self.settings.action_penalty:
+            inner = inner.add_(squashed, alpha=2 * self.settings.action_penalty / squashed.numel())
+        self.actor.backward(tape, inner.mul_(1 - squashed * squashed))
+        self._actor_optimiser.step()
+
+
+class _Adam:
+    """torch's fused Adam on a network's flat vector."""
+
+    def __init__(self, network: Network, settings: Settings) -> None:
+        network.parameters.grad = network.gradients
+        self._network = network
+        self._adam = torch.optim.Adam([network.parameters], settings.learning_rate, fused=True)
+        self._adam.step()  # makes the moments; a step along gradients of zero moves nothing
+        self._adam.state[network.parameters]["step"].zero_()
+
+    def step(self) -> None:
+        self._adam.step()
+
+    def moments(self) -> dict[str, Tensor]:
+        """The moments (P,) and the number of steps."""
+        state = self._adam.state[self._network.parameters]
+        return {name: state[name] for name in ("exp_avg", "exp_avg_sq", "step")}

@@ -1,0 +1,236 @@
+"""Replay buffer with hindsight, for lanes that are stepped together.
+
+A ring of rows, one for each control step, with a column for each lane; an observation is stored once, as the next row
+holds what followed. The row of an episode's last observation holds no transition and is passed over when sampling.
+
+Hindsight, strategy "future" with k = 4 (Andrychowicz et al., "Hindsight Experience Replay", 2017,
+https://arxiv.org/abs/1707.01495): k of every k + 1 transitions sampled get the goal that was reached at a later,
+uniformly drawn sample of their own episode, and the reward that the task gives for it. It is done when sampling, with
+probability k / (k + 1), and an episode that still runs counts as far as it has come: both deviations from the paper,
+which stores the k copies once an episode is over.
+
+Returns over n steps (Sutton, "Learning to Predict by the Methods of Temporal Differences", 1988,
+https://doi.org/10.1007/BF00115009) are summed when sampling, too, and stop at an episode's end. They are not corrected
+for the policy having changed since.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.episodes import Step
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+GoalReward = Callable[[NDArray[Any], NDArray[Any]], FloatArray]
+
+_STORED = ("observations", "actions", "rewards", "terminated", "transition", "ends", "achieved")
+
+
+class ReplayError(ValueError):
+    """A replay buffer's file that cannot be used."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """observations and next_observations (B, O), actions (B, A), returns (B,) of the steps between them, and discounts
+    (B,) of the value of the next observation: 0 where the episode terminated."""
+
+    observations: Float32Array
+    actions: Float32Array
+    returns: Float32Array
+    discounts: Float32Array
+    next_observations: Float32Array
+
+
+class Replay:
+    """Holds the last ``capacity`` steps, of all lanes together, in float32.
+
+    hindsight: k, 0 for none. goal_reward: rewards (...,) of achieved and desired goals (..., G); the desired goal is
+    the observation's last ``goal_size`` numbers. n_step: steps that a return sums.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        capacity: int,
+        lanes: int = 1,
+        discount: float = 0.99,
+        n_step: int = 1,
+        goal_size: int = 0,
+        hindsight: int = 0,
+        goal_reward: GoalReward | None = None,
+    ) -> None:
+        if capacity < 2 * lanes:
+            raise ValueError(f"capacity: expected at least 2 steps for each of {lanes} lanes, got {capacity}")
+        if hindsight and (goal_reward is None or not goal_size):
+            raise ValueError(f"hindsight: expected 0 for a task without goals, got {hindsight}")
+        self.rows, self.lanes, self.goal_size = capacity // lanes, lanes, goal_size
+        self.discount, self.n_step, self.hindsight, self._goal_reward = discount, n_step, hindsight, goal_reward
+        shape = (self.rows, lanes)
+        self.observations = np.zeros((*shape, observation_size), np.float32)
+        self.actions = np.zeros((*shape, action_size), np.float32)
+        self.rewards = np.zeros(shape, np.float32)
+        self.achieved = np.zeros((*shape, goal_size), np.float32)
+        self.terminated, self.transition = np.zeros(shape, bool), np.zeros(shape, bool)
+        self.ends = np.full(shape, -1)  # the step of the episode's last observation; -1 while it runs
+        self.head = 0  # the step of the newest observation, of which nothing followed yet
+        self._starts, self._over = np.zeros(lanes, int), np.zeros(lanes, bool)
+
+    def __len__(self) -> int:
+        """Transitions that may be sampled."""
+        return int(self.transition.sum())
+
+    def begin(self, step: Step) -> None:
+        """The first observations of all lanes; what was stored is forgotten."""
+        self.head, self._starts[:], self._over[:] = 0, 0, False
+        self.transition[:] = False
+        self._observe(step.observations, step.achieved_goals)
+
+    def add(self, actions: FloatArray, step: Step) -> None:
+        """What actions (L, A) led to. Lanes whose episode was over have begun a new one instead."""
+        row = self.head % self.rows
+        self.actions[row], self.rewards[row] = actions, step.rewards
+        self.terminated[row], self.transition[row] = step.terminated, step.valid & ~self._over
+        ended = (step.terminated | step.truncated) & ~self._over
+        for lane in np.flatnonzero(ended):
+            self._end(int(lane), self.head + bool(step.valid[lane]))
+        self._starts[self._over] = self.head + 1
+        self._over = ended
+        self.head += 1
+        self._observe(step.observations, step.achieved_goals)
+
+    def add_trajectories(self, trajectories: Trajectories, achieved: FloatArray | None = None) -> None:
+        """Fill an empty buffer, one lane for each of B trajectories with rewards; achieved: (B, T+1, G) where there are
+        goals. A trajectory that is not valid to its end counts as far as it is."""
+        batch, horizon = trajectories.actions.shape[:2]
+        if batch != self.lanes or horizon >= self.rows:
+            raise ValueError(
+                f"capacity: expected {batch} lanes of more than {horizon} rows, got {self.lanes} of {self.rows}"
+            )
+        if trajectories.rewards is None:
+            raise ValueError("trajectories: expected rewards, got none; record them from a task")
+        count = trajectories.valid.sum(1) - 1
+        steps = np.arange(horizon)[:, None]
+        self.observations[: horizon + 1] = np.nan_to_num(trajectories.observations.swapaxes(0, 1))
+        self.actions[:horizon], self.rewards[:horizon] = (
+            trajectories.actions.swapaxes(0, 1),
+            trajectories.rewards.swapaxes(0, 1),
+        )
+        if self.goal_size:
+            self.achieved[: horizon + 1] = np.nan_to_num(np.asarray(achieved).swapaxes(0, 1))
+        self.transition[:horizon] = steps < count
+        self.ends[:horizon] = np.where(steps < count, count, -1)
+        self.head = horizon
+
+    def sample(self, rng: np.random.Generator, count: int) -> Batch:
+        """``count`` transitions, uniformly and with replacement; raises ValueError where there are none."""
+        steps, lanes = self._draw(rng, count)
+        rows = steps % self.rows
+        ends = self.ends[rows, lanes]
+        ends = np.where(ends < 0, self.head, ends)
+        last = np.minimum(steps + self.n_step, ends)  # the step at which the value of what follows is asked for
+        observations, following = self.observations[rows, lanes], self.observations[last % self.rows, lanes]
+        goals = None
+        if self.hindsight:
+            goals = self._relabel(rng, steps, lanes, ends, observations, following)
+        returns, factor = np.zeros(count), np.ones(count)
+        for ahead in range(self.n_step):
+            at = steps + ahead
+            inside = at < ends
+            here = at % self.rows
+            rewards: NDArray[Any] = self.rewards[here, lanes]
+            if goals is not None and self._goal_reward is not None:
+                rewards = self._goal_reward(self.achieved[(at + 1) % self.rows, lanes], goals)
+            returns += np.where(inside, factor * rewards, 0.0)
+            factor = np.where(inside, factor * self.discount, factor)
+        factor *= ~self.terminated[(last - 1) % self.rows, lanes]
+        actions = self.actions[rows, lanes]
+        return Batch(observations, actions, returns.astype(np.float32), factor.astype(np.float32), following)
+
+    def save(self, path: Path) -> None:
+        """Write an npz file of what is filled, atomically."""
+        used = min(self.head + 1, self.rows)
+        arrays: dict[str, Any] = {name: getattr(self, name)[:used] for name in _STORED}
+        arrays |= {"head": np.array(self.head), "starts": self._starts, "over": self._over, "rows": np.array(self.rows)}
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            with temporary.open("wb") as file:
+                np.savez(file, **arrays)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def load(self, path: Path) -> None:
+        """Read what ``save`` wrote into a buffer of the same shape; raises ReplayError for anything else."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+            head, rows = int(arrays["head"]), int(arrays["rows"])
+            stored = {name: arrays[name] for name in _STORED}
+            starts, over = arrays["starts"], arrays["over"]
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise ReplayError(f"{path}: not a whole replay buffer ({error}); start training again") from None
+        used = min(head + 1, self.rows)
+        for name, value in stored.items():
+            expected = (used, *getattr(self, name).shape[1:])
+            if rows != self.rows or value.shape != expected:
+                raise ReplayError(
+                    f"{path}: {name}: expected {expected} of {self.rows} rows, got {value.shape} of {rows}"
+                )
+        for name, value in stored.items():
+            getattr(self, name)[:used] = value
+        self.head, self._starts, self._over = head, starts.copy(), over.copy()
+
+    def _observe(self, observations: FloatArray, achieved: FloatArray | None) -> None:
+        row = self.head % self.rows
+        self.observations[row], self.transition[row], self.ends[row] = observations, False, -1
+        if self.goal_size:
+            self.achieved[row] = achieved
+
+    def _end(self, lane: int, end: int) -> None:
+        steps = np.arange(max(self._starts[lane], self.head - self.rows + 1), self.head + 1)
+        self.ends[steps % self.rows, lane] = end
+
+    def _draw(self, rng: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
+        """Steps and lanes (count,) of transitions: places are drawn anew until enough of them hold one."""
+        oldest = max(0, self.head - self.rows + 1)
+        held = (self.head - oldest) * self.lanes
+        found = np.empty(0, int)
+        for _ in range(100):
+            places = rng.integers(held, size=count) if held else found
+            rows, lanes = (oldest + places // self.lanes) % self.rows, places % self.lanes
+            found = np.concatenate([found, places[self.transition[rows, lanes]]])
+            if len(found) >= count:
+                found = found[:count]
+                return oldest + found // self.lanes, found % self.lanes
+        raise ValueError("replay: holds no transitions to sample; add some first")
+
+    def _relabel(
+        self,
+        rng: np.random.Generator,
+        steps: IntArray,
+        lanes: IntArray,
+        ends: IntArray,
+        observations: Float32Array,
+        following: Float32Array,
+    ) -> Float32Array:
+        """Goals (B, G), most of them reached later, also written into the observations."""
+        later = steps + 1 + (rng.random(len(steps)) * (ends - steps)).astype(int)
+        chosen = rng.random(len(steps)) < self.hindsight / (self.hindsight + 1)
+        reached = self.achieved[later % self.rows, lanes]
+        goals: Float32Array = np.where(chosen[:, None], reached, observations[:, -self.goal_size :])
+        observations[:, -self.goal_size :] = following[:, -self.goal_size :] = goals
+        return goals

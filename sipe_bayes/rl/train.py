@@ -1,0 +1,205 @@
+"""Training DDPG on the batched engine: interruptible, resumable bit for bit, every number on disk.
+
+A policy is kept at every evaluation. ``suboptimal.safetensors`` is the one kept first at or after half of the steps;
+``expert.safetensors`` the one of the highest mean return among those after it, since DDPG does not end on its best.
+It is chosen by few episodes, so its return there flatters it: a card evaluates it on others.
+
+The folder holds ``curve.csv``, a TensorBoard log, ``policies/``, and ``checkpoint/``: networks, targets, optimisers,
+normaliser, every random generator and the lanes' states in one safetensors file, with the replay buffer beside it. The
+checkpoint names its buffer, and both are written before the previous ones go, so an interruption leaves a whole pair.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sipe_bayes.envs.registry import make_task
+from sipe_bayes.envs.task import Task
+from sipe_bayes.inference.state import load_state, save_state
+from sipe_bayes.output import write_text
+from sipe_bayes.rl.evaluation import evaluate
+from sipe_bayes.rl.policy import Policy, load_policy
+from sipe_bayes.rl.settings import Settings
+from sipe_bayes.rl.trainer import Draw, Trainer
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
+
+Report = Callable[[str, int, int], None]
+"""Called with a line of text, the steps taken and those to take."""
+
+CHECKPOINT = "checkpoint/state.safetensors"
+CURVE = ("step", "return_mean", "return_sd", "success_rate", "wall_seconds", "updates_per_second")
+_EVALUATION_SEED = 2_000_000  # of the curve's starts: other ones than a card's
+
+
+def train(
+    task: str | Task,
+    steps: int,
+    seed: int,
+    folder: Path,
+    settings: Settings | None = None,
+    *,
+    resume: bool = False,
+    draw: Draw | None = None,
+    demonstrations: Trajectories | None = None,
+    evaluate_every: int = 5_000,
+    evaluation_episodes: int = 10,
+    checkpoint_every: int = 25_000,
+    threads: int = 1,
+    report: Report | None = None,
+) -> Policy:
+    """Train for ``steps`` control steps and return the expert; see the module for what ``folder`` holds then.
+
+    resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than before; the result is that
+    of an uninterrupted run. Raises ValueError for arguments out of range, and for a folder that holds another run or,
+    without ``resume``, any.
+    """
+    task = make_task(task) if isinstance(task, str) else task
+    settings = settings or Settings()
+    least = {"steps": steps, "evaluate_every": evaluate_every, "evaluation_episodes": evaluation_episodes}
+    for name, value in {**least, "checkpoint_every": checkpoint_every}.items():
+        if value < 1:
+            raise ValueError(f"{name}: expected at least 1, got {value}")
+    if seed < 0:
+        raise ValueError(f"seed: expected at least 0, got {seed}")
+    folder = Path(folder)
+    if (folder / CHECKPOINT).is_file() and not resume:
+        raise ValueError(
+            f"--out {folder}: holds a run already; add --resume to go on with it, or choose another folder"
+        )
+    trainer = Trainer(task, settings, seed, draw, demonstrations, threads)
+    described = {
+        "task": task.name,
+        "model": trainer.episodes.simulator.checksum(),
+        "seed": seed,
+        "settings": settings.to_dict(),
+        "drawn": draw is not None,
+        "demonstrations": _checksum(demonstrations),
+        "evaluate_every": evaluate_every,
+        "evaluation_episodes": evaluation_episodes,
+    }
+    fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
+    log = _Log(folder, evaluation_episodes)
+    if resume and (folder / CHECKPOINT).is_file():
+        log.load(trainer, fingerprint)
+    log.begin(trainer)
+    while trainer.steps < steps:
+        before = trainer.steps
+        trainer.advance()
+        if trainer.steps // evaluate_every > before // evaluate_every or before < steps <= trainer.steps:
+            log.evaluate(trainer)
+        if trainer.steps // checkpoint_every > before // checkpoint_every or before < steps <= trainer.steps:
+            log.save(trainer, fingerprint)
+        if report is not None and trainer.steps // 100 > before // 100:
+            report(log.line(trainer), trainer.steps, steps)
+    return log.finish(task, steps)
+
+
+class _Log:
+    """What a run writes: the curve, the TensorBoard log, the policies and the checkpoint."""
+
+    def __init__(self, folder: Path, episodes: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._folder, self._episodes, self._board = folder, episodes, SummaryWriter
+        self._writer: Any = None
+        self._evaluator: Simulator | None = None
+        self.rows: list[list[float | None]] = []
+        self._spent = 0.0  # seconds of earlier parts of the run
+        self._kept = (folder / CHECKPOINT).parent
+        for made in (self._kept, folder / "policies"):
+            made.mkdir(parents=True, exist_ok=True)
+
+    def begin(self, trainer: Trainer) -> None:
+        self._began, self._first = time.perf_counter(), trainer.steps
+        self._last = (self._began, trainer.agent.updates)
+        self._writer = self._board(self._folder / "tensorboard", purge_step=trainer.steps)
+
+    def seconds(self) -> float:
+        return self._spent + time.perf_counter() - self._began
+
+    def line(self, trainer: Trainer) -> str:
+        rate = (trainer.steps - self._first) / (time.perf_counter() - self._began)
+        earned = f"return {self.rows[-1][1]:.0f}, " if self.rows else ""
+        return f"{trainer.task.name}: {earned}{rate:.0f} steps/s"
+
+    def evaluate(self, trainer: Trainer) -> None:
+        policy, now = trainer.policy(), time.perf_counter()
+        rate = (trainer.agent.updates - self._last[1]) / (now - self._last[0])
+        self._evaluator = self._evaluator or Simulator(trainer.task, trainer.episodes.simulator.num_threads)
+        found = evaluate(policy, self._evaluator, self._episodes, _EVALUATION_SEED)
+        policy.save(self._policy(trainer.steps))
+        measured = (found["mean"], found["sd"], found["success_rate"], self.seconds(), rate)
+        self.rows.append([trainer.steps, *measured])
+        self._write_curve()
+        for name, value in zip(CURVE[1:], measured, strict=True):
+            if value is not None:
+                self._writer.add_scalar(name, value, trainer.steps)
+        self._writer.flush()
+        self._last = (time.perf_counter(), trainer.agent.updates)
+
+    def save(self, trainer: Trainer, fingerprint: str) -> None:
+        name = f"replay-{trainer.steps}.npz"
+        trainer.replay.save(self._kept / name)
+        run = {"replay": name, "curve": json.dumps(self.rows), "seconds": self.seconds()}
+        save_state(self._folder / CHECKPOINT, {**trainer.state(), **run}, fingerprint)
+        for path in (*self._kept.glob("replay-*.npz"), *self._kept.glob(".replay-*")):  # also what an interruption left
+            if path.name != name:
+                path.unlink()
+
+    def load(self, trainer: Trainer, fingerprint: str) -> None:
+        state = load_state(self._folder / CHECKPOINT, fingerprint)
+        trainer.replay.load(self._kept / Path(state["replay"]).name)
+        trainer.restore(state)
+        self.rows, self._spent = json.loads(state["curve"]), float(state["seconds"])
+        self._write_curve()
+
+    def finish(self, task: Task, steps: int) -> Policy:
+        """Copy the two agents to their names."""
+        self._writer.close()
+        chosen = choose(self.rows, steps)
+        for name, step in chosen.items():
+            shutil.copyfile(self._policy(step), self._folder / f".{name}.tmp")
+            (self._folder / f".{name}.tmp").replace(self._folder / f"{name}.safetensors")
+        return load_policy(self._folder / "expert.safetensors", task.name)
+
+    def _policy(self, step: float) -> Path:
+        return self._folder / "policies" / f"{int(step)}.safetensors"
+
+    def _write_curve(self) -> None:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(CURVE)
+        writer.writerows(self.rows)
+        write_text(self._folder / "curve.csv", text.getvalue())
+
+
+def choose(rows: list[list[Any]], steps: int) -> dict[str, int]:
+    """The steps of the two agents, of a curve's rows."""
+    second = [row for row in rows if 2 * row[0] >= steps]
+    best = max(second[1:] or second, key=lambda row: row[1])
+    return {"suboptimal": int(second[0][0]), "expert": int(best[0])}
+
+
+def read_curve(folder: Path) -> list[list[Any]]:
+    """The rows of a finished run's curve; None where a number is missing."""
+    with (folder / "curve.csv").open(encoding="utf-8", newline="") as file:
+        _, *rows = csv.reader(file)
+    return [[int(step), *(float(x) if x else None for x in rest)] for step, *rest in rows]
+
+
+def _checksum(given: Trajectories | None) -> str:
+    if given is None:
+        return ""
+    digest = hashlib.sha256(given.observations.tobytes())
+    for part in (given.actions, given.rewards):
+        digest.update(b"" if part is None else part.tobytes())
+    return digest.hexdigest()

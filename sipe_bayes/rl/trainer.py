@@ -1,0 +1,168 @@
+"""An agent at work: lanes of a task that act, remember and learn, in small steps that can be stopped and gone on with.
+
+The lanes are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.envs.task import Task
+from sipe_bayes.episodes import Episodes
+from sipe_bayes.inference.state import State
+from sipe_bayes.rl.ddpg import Agent
+from sipe_bayes.rl.policy import Policy
+from sipe_bayes.rl.replay import Batch, Replay
+from sipe_bayes.rl.settings import Settings
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+Draw = Callable[[np.random.Generator, int], FloatArray]
+"""Parameters theta (B, N) for B episodes that begin."""
+
+
+class Trainer:
+    """An agent, its replay buffer and the lanes that it acts in. ``steps`` counts control steps, of all lanes together.
+
+    draw: theta of each episode, default the published model's. demonstrations: trajectories with rewards, from which
+    ``settings.demonstration_share`` of each batch is taken.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        settings: Settings,
+        seed: int = 0,
+        draw: Draw | None = None,
+        demonstrations: Trajectories | None = None,
+        threads: int = 1,
+    ) -> None:
+        if bool(settings.demonstration_share) != (demonstrations is not None):
+            raise ValueError(
+                f"demonstration_share: {settings.demonstration_share} with demonstrations "
+                f"{'missing' if demonstrations is None else 'given'}; give both or neither"
+            )
+        self.task, self.settings, self.draw = task, settings, draw
+        streams = np.random.SeedSequence(seed).spawn(4 + settings.lanes)
+        initial, self._noise, self._picks, self._draws, *lanes = (np.random.default_rng(s) for s in streams)
+        size = len(task.channels)
+        self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial)
+        self.replay = self._buffer(settings.capacity, settings.lanes)
+        self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
+        self.episodes = Episodes(Simulator(task, threads), task.theta("default"), lanes, allow_outside=True)
+        if draw is not None:
+            self._redraw(np.ones(settings.lanes, bool))
+            self.episodes.begin(np.ones(settings.lanes, bool))
+        self.replay.begin(self.episodes.first())
+        self._over = np.zeros(settings.lanes, bool)
+        self.steps, self._owed = 0, 0.0
+
+    def advance(self) -> None:
+        """One control step of every lane and the updates that go with it."""
+        settings, fresh = self.settings, self._over
+        actions = self._actions()
+        self._redraw(fresh)
+        step = self.episodes.step(actions)
+        self.replay.add(actions, step)
+        if self.agent.normaliser is not None:
+            self.agent.normaliser.update(step.observations)
+        self._over = step.terminated | step.truncated
+        taken = int((~fresh).sum())
+        self.steps += taken
+        if self.steps >= settings.start_steps:
+            self._owed += taken * settings.updates_per_step
+            while self._owed >= 1:
+                self.agent.update(self._batch())
+                self._owed -= 1
+
+    def policy(self) -> Policy:
+        """What has been learnt so far."""
+        return self.agent.policy(self.task.name, self.task.goal_size)
+
+    def state(self) -> State:
+        """Everything but the replay buffer, from which ``restore`` goes on bit for bit."""
+        generators = [self._noise, self._picks, self._draws, *self.episodes.generators]
+        arrays = {name: value.copy() for name, value in self._lanes().items()}
+        states = json.dumps([g.bit_generator.state for g in generators])
+        counts = {"steps": self.steps, "owed": self._owed}
+        return {**self.agent.state(), **arrays, **counts, "generators": states, "over": self._over}
+
+    def restore(self, state: State) -> None:
+        self.agent.restore(state)
+        self.episodes.set_theta(np.arange(self.settings.lanes), state["lanes.theta"])
+        for name, value in self._lanes().items():
+            value[...] = state[name]
+        generators = [self._noise, self._picks, self._draws, *self.episodes.generators]
+        for generator, found in zip(generators, json.loads(state["generators"]), strict=True):
+            generator.bit_generator.state = found
+        self.steps, self._owed, self._over = int(state["steps"]), float(state["owed"]), np.array(state["over"])
+
+    def _lanes(self) -> dict[str, NDArray[Any]]:
+        """The arrays that say where the lanes are."""
+        lanes = self.episodes
+        found = {
+            "theta": lanes.theta,
+            "states": lanes.states,
+            "goals": lanes.goals,
+            "observations": lanes.observations,
+            "elapsed": lanes.elapsed,
+            "derived": lanes._derived,
+            "over": lanes._over,
+        }
+        return {f"lanes.{name}": value for name, value in found.items() if value is not None}
+
+    def _actions(self) -> FloatArray:
+        """(L, A): random ones at first, then the actor's with noise."""
+        settings, task, lanes = self.settings, self.task, self.settings.lanes
+        size = (lanes, task.num_actions)
+        if self.steps < settings.start_steps:
+            return self._noise.uniform(task.action_low, task.action_high, size)
+        half = (task.action_high - task.action_low) / 2
+        actions = self.agent.act(self.episodes.observations)
+        actions += settings.exploration * half * self._noise.standard_normal(size)
+        if settings.random_share:
+            chosen = self._noise.random(lanes) < settings.random_share
+            actions[chosen] = self._noise.uniform(task.action_low, task.action_high, (int(chosen.sum()), size[1]))
+        return np.clip(actions, task.action_low, task.action_high)
+
+    def _redraw(self, lanes: NDArray[np.bool_]) -> None:
+        chosen = np.flatnonzero(lanes)
+        if self.draw is not None and len(chosen):
+            self.episodes.set_theta(chosen, self.draw(self._draws, len(chosen)))
+
+    def _batch(self) -> Batch:
+        count = self.settings.batch
+        if self._shown is None:
+            return self.replay.sample(self._picks, count)
+        shown = round(self.settings.demonstration_share * count)
+        parts = [b.sample(self._picks, n) for b, n in ((self.replay, count - shown), (self._shown, shown)) if n]
+        return Batch(*(np.concatenate([getattr(p, name) for p in parts]) for name in Batch.__annotations__))
+
+    def _buffer(self, capacity: int, lanes: int) -> Replay:
+        task, settings = self.task, self.settings
+        if capacity // lanes <= task.episode_steps:
+            raise ValueError(
+                f"capacity: expected room for more than an episode of {task.episode_steps} steps in each of {lanes} lanes, "
+                f"got {capacity}"
+            )
+        goals, reward = task.goal_size, task.goal_reward if task.goal_size else None
+        k = settings.hindsight if goals else 0
+        size = (len(task.channels), task.num_actions)
+        return Replay(*size, capacity, lanes, settings.discount, settings.n_step, goals, k, reward)
+
+    def _demonstrated(self, given: Trajectories) -> Replay:
+        batch, horizon = given.actions.shape[:2]
+        buffer = self._buffer(batch * (max(horizon, self.task.episode_steps) + 1), batch)
+        achieved = None
+        if self.task.goal_size:
+            if given.states is None:
+                raise ValueError("demonstrations: expected states, to know which goals were reached, got none")
+            achieved = self.task.achieved_goals(given.states, None)
+        buffer.add_trajectories(given, achieved)
+        return buffer
