@@ -28,6 +28,7 @@ _PUBLIC = {
     "GaussianMixture": "sipe_bayes.posterior",
     "load_posterior": "sipe_bayes.posterior",
     "demonstrations": "sipe_bayes.demonstration",
+    "from_minari": "sipe_bayes.minari_data",
     "get_estimator": "sipe_bayes.inference",
     "show_results": "sipe_bayes.show",
     "load_config": "sipe_bayes.config",

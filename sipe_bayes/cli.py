@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sipe_bayes import data_commands
 from sipe_bayes.inference.registry import ESTIMATORS
+from sipe_bayes.rl import commands as rl_commands
 
 if TYPE_CHECKING:
     from sipe_bayes.diagnostics.result import Calibration
@@ -20,6 +22,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(data_commands.app)
+app.command()(rl_commands.train)
+app.command()(rl_commands.agents)
 
 BAD_INPUT = 2
 _PIPED_WIDTH = 120
@@ -103,14 +108,14 @@ def _one_line(error: BaseException) -> str:
 class Progress:
     """A bar on a terminal; nothing when piped."""
 
-    def __init__(self, quiet: bool = False) -> None:
+    def __init__(self, quiet: bool = False, unit: str = "rollouts") -> None:
         self._bar: Any = None
         if not quiet and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
             from rich.progress import Progress as Bar
 
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed} rollouts"))
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(f"{{task.completed}} {unit}"))
             self._bar = Bar(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
             self._task = self._bar.add_task("reading", total=None)
 

@@ -1,10 +1,14 @@
 """Demonstrations of a benchmark task: trajectories of an agent in an environment of known or hidden parameters.
 
-``sipe.demonstrations(env, type="expert")``. An agent's file is looked for in ``sipe_bayes/data/agents``. Where there is none,
-an excitation policy stands in, and a UserWarning says so, from the task's own starting states: the task's ``excitation``
-where it has one (Fetch: the hand moves the object), else smooth random actions, open loop. For each action a sum of five sines between 0.1 and 2 Hz with random frequencies, phases and shares of an amplitude
-of 0.8 of the action's half range, so that its bounds are kept. Such a trajectory shows the dynamics, not the task: an arm may
-miss its object, a robot may fall, and it goes on after that, all ``episode_steps`` long.
+``sipe.demonstrations(env, type="expert")``. In this order:
+
+1. a trajectory set that is stored (``sipe_bayes.trajectory_sets``), where it was made with these parameters and seed and is as
+   large as asked for;
+2. a simulation of the agent, whose file is looked for in ``sipe_bayes/data/agents``, at these parameters; type "random"
+   needs none;
+3. where there is no such agent, an excitation policy stands in, and a UserWarning says so.
+
+How each of them acts is described in ``sipe_bayes.acting``.
 """
 
 from __future__ import annotations
@@ -14,65 +18,166 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes import acting, trajectory_sets
+from sipe_bayes.acting import AGENTS, SPLITS, Agent, Behaviour, Split
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.envs.task import Task
+from sipe_bayes.envs.task import VARIANTS, Task, Variant
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.trajectory_sets import COUNT, SHIPPED, SetName, TrajectorySetError
 
 FloatArray = NDArray[np.float64]
-Agent = Literal["expert", "suboptimal"]
-Split = Literal["reference", "validation", "test"]
 
-AGENTS = ("expert", "suboptimal")
-SPLITS = ("reference", "validation", "test")
-COUNT = 2  # trajectories where none is asked for
 _FOLDER = Path(__file__).parent / "data" / "agents"
-_SINES, _SLOWEST, _FASTEST, _AMPLITUDE = 5, 0.1, 2.0, 0.8  # number, Hz, Hz, of half the action's range
+_ROBOTS = {  # tasks that share the agent of another: what is unknown differs, the robot does not
+    "HalfCheetahJoints": "HalfCheetahLinks",
+    "HalfCheetahAllJoints": "HalfCheetahLinks",
+    "HumanoidJoints": "HumanoidLinks",
+}
+_LONGEST = 250  # control steps where none are asked for, of an episode that is longer
 
 
 def demonstrations(
     env: Any,
     type: Agent = "expert",
     split: Split = "reference",
+    variant: Variant | None = None,
     *,
     count: int = COUNT,
     seed: int = 0,
     steps: int | None = None,
+    noise: float | FloatArray = 0.0,
+    noise_seed: int = 0,
+    folder: str | Path | None = None,
 ) -> Trajectories:
-    """``count`` trajectories of ``steps`` control steps, default an episode, with states and rewards.
+    """``count`` trajectories of ``steps`` control steps, default an episode or its first 250, with states and rewards.
 
-    env: a task's name, a Task, a Simulator of one, or a Gymnasium environment of ``sipe.make`` (its parameters decide the
-    dynamics; the others' are the published model's). type: expert or suboptimal. split: reference, validation or test;
-    they differ in starting states and actions. The same arguments give the same trajectories. Raises ValueError for what has no
-    starting states, and RuntimeError where a simulation diverges.
+    env: a task's name, a Task, a Simulator of one, or a Gymnasium environment of ``sipe.make``. variant: the parameters, by
+    default the published model's; a Gymnasium environment has its own, and then a variant that differs from them is refused.
+    type: expert, suboptimal or random. split: reference, validation or test; they differ in starting states and actions. The same
+    arguments give the same trajectories, fewer begin alike.
+    noise: white noise on the observations, its sd as a share of each channel's spread over these trajectories, or (O,) in each
+    channel's unit; noise_seed: its own. Noisy trajectories hold neither states nor rewards, which would give the truth away.
+    folder: read what `sipe data generate --out` wrote there, and nothing else.
+
+    Raises ValueError for what has no starting states or is not in ``folder``, TrajectorySetError for a damaged file, and
+    RuntimeError where a simulation diverges.
     """
     for name, value, known in (("type", type, AGENTS), ("split", split, SPLITS)):
         if value not in known:
             raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+    simulator, theta = _placed(env, variant)
+    task = simulator.environment
+    assert isinstance(task, Task)
+    horizon = default_steps(task) if steps is None else steps
+    if count < 1 or horizon < 1:
+        raise ValueError(f"count and steps: expected at least 1 of each, got {count} and {horizon}")
+    found = _stored(simulator, theta, split, type, count, seed, horizon, SHIPPED if folder is None else Path(folder))
+    if found is None and folder is not None:
+        raise TrajectorySetError(
+            f"folder {folder}: holds no {type} {split} set of {task.name} with these parameters, seed {seed}, and at least "
+            f"{count} trajectories of {horizon} steps; make it with `sipe data generate`, or leave folder out"
+        )
+    if found is None:
+        behaviour = behaviour_of(task, type)
+        if behaviour is None:
+            warnings.warn(
+                f"demonstrations: no {type} agent of {task.name} is installed; an excitation policy was used instead",
+                UserWarning,
+                stacklevel=_caller(),
+            )
+            behaviour = acting.excitation(task, simulator.dt)
+        found, _ = acting.simulate(simulator, theta, behaviour, split, count, seed, horizon)
+    return _noisy(found, noise, noise_seed)
+
+
+def default_steps(task: Task) -> int:
+    """Control steps of a trajectory where none are asked for."""
+    return min(task.episode_steps, _LONGEST)
+
+
+def behaviour_of(task: Task, type: Agent) -> Behaviour | None:
+    """How the agent acts, or None where it is not installed; raises ValueError for a file that is no such policy."""
+    if type == "random":
+        return acting.random(task)
+    file = agent_file(task.name, type)
+    if file is None:
+        return None
+    from sipe_bayes.rl.policy import PolicyError, load_policy
+
+    policy = load_policy(file)
+    sizes, expected = (policy.observation_size, policy.action_size), (len(task.channels), task.num_actions)
+    if sizes != expected:
+        raise PolicyError(
+            f"{file}: expected {expected[0]} observations and {expected[1]} actions for {task.name}, got {sizes[0]} and "
+            f"{sizes[1]}; train it anew with `sipe train`"
+        )
+    return acting.agent(task, policy, type)
+
+
+def agent_file(task: str, type: str) -> Path | None:
+    """The file of a task's agent, or None where it is not installed."""
+    path = _FOLDER / f"{_ROBOTS.get(task, task)}-{type}.safetensors"
+    return path if path.is_file() else None
+
+
+def _placed(env: Any, variant: Variant | None) -> tuple[Simulator, FloatArray]:
+    """The simulator of ``env`` and the parameters (N,) asked for."""
     simulator, theta = simulator_of(env)
     task = simulator.environment
     if not isinstance(task, Task):
         raise ValueError(
             f"env: {task.__class__.__name__} has no starting states; record logs, or take a task of `sipe envs`"
         )
-    horizon = task.episode_steps if steps is None else steps
-    if count < 1 or horizon < 1:
-        raise ValueError(f"count and steps: expected at least 1 of each, got {count} and {horizon}")
-    if agent_file(task.name, type) is not None:
-        raise NotImplementedError(
-            f"type: the agent {agent_file(task.name, type)} cannot be read by this version; upgrade"
+    own = not isinstance(env, str | Task | Simulator)  # those stand for the published model
+    if own and variant is None:
+        return simulator, theta
+    wanted = task.theta(variant or "default")
+    if own and not np.array_equal(theta, wanted):
+        raise ValueError(
+            f"variant: env has parameters other than those of {variant!r}; leave variant out, or give the name {task.name!r}"
         )
-    warnings.warn(
-        f"demonstrations: no {type} agent of {task.name} is installed; an excitation policy was used instead",
-        UserWarning,
-        stacklevel=_caller(),
-    )
-    return _excited(simulator, task, theta, split, count, seed, horizon)
+    return simulator, wanted
+
+
+def _stored(
+    simulator: Simulator,
+    theta: FloatArray,
+    split: Split,
+    type: Agent,
+    count: int,
+    seed: int,
+    steps: int,
+    folder: Path,
+) -> Trajectories | None:
+    """What a folder of trajectory sets holds of it, or None."""
+    task = simulator.environment
+    assert isinstance(task, Task)
+    for variant in VARIANTS:
+        name = SetName(task.name, variant, split, type)
+        if np.array_equal(theta, task.theta(variant)):
+            entry = trajectory_sets.entry_of(folder, name, simulator)
+            if entry is not None and entry["seed"] == seed and count <= entry["count"] and steps <= entry["steps"]:
+                return trajectory_sets.read(folder, name, simulator, count, steps)
+    return None
+
+
+def _noisy(found: Trajectories, noise: float | FloatArray, seed: int) -> Trajectories:
+    """With white noise on the observations, from a generator for each trajectory."""
+    level, size = np.asarray(noise, float), found.observations.shape[-1]
+    if level.shape not in ((), (size,)) or not (np.isfinite(level) & (level >= 0)).all():
+        raise ValueError(f"noise: expected one number or ({size},), none below zero, got {noise!r}")
+    if not level.any():
+        return found
+    sd = level * found.observations.std((0, 1)) if level.ndim == 0 else level
+    shape = found.observations.shape[1:]
+    drawn = [np.random.default_rng([seed, i]).standard_normal(shape) for i in range(len(found))]
+    return replace(found, observations=found.observations + sd * np.stack(drawn), states=None, rewards=None)
 
 
 def _caller() -> int:
@@ -81,12 +186,6 @@ def _caller() -> int:
     while frame.f_back is not None and frame.f_code.co_filename.startswith(package):
         frame, level = frame.f_back, level + 1
     return level
-
-
-def agent_file(task: str, type: str) -> Path | None:
-    """The file of a task's agent, or None where it is not installed."""
-    path = _FOLDER / f"{task}-{type}.safetensors"
-    return path if path.is_file() else None
 
 
 def simulator_of(env: Any) -> tuple[Simulator, FloatArray]:
@@ -155,61 +254,3 @@ def _identity(env: Any) -> tuple[Any, ...]:
 
 def _same(a: Any, b: Any) -> bool:
     return a is b or (isinstance(a, str | bytes) and type(a) is type(b) and bool(a == b))
-
-
-def _excited(
-    simulator: Simulator, task: Task, theta: FloatArray, split: str, count: int, seed: int, steps: int
-) -> Trajectories:
-    """Each trajectory has a generator of its own, so that more of them begin with the same ones."""
-    actions, states, goals = [], [], []
-    for i in range(count):
-        rng = np.random.default_rng([seed, SPLITS.index(split), i])
-        state, goal = task.initial_states(rng, 1)
-        states.append(state[0])
-        goals.append(None if goal is None else goal[0])
-        actions.append(_exciting_actions(simulator, theta, state, goal, steps, rng))
-    targets = None if goals[0] is None else np.stack([g for g in goals if g is not None])
-    rows = np.tile(theta, (count, 1))
-    motion = simulator.rollout(rows, np.stack(actions), np.stack(states), allow_outside=True, goals=targets)
-    if not motion.valid.all():
-        raise RuntimeError(
-            f"demonstrations: {int((~motion.valid[:, -1]).sum())} of {count} simulations of {task.name} diverged; "
-            "take another seed, or fewer steps"
-        )
-    return replace(motion, names=tuple(f"{split}_{i}" for i in range(count)))
-
-
-def _exciting_actions(
-    simulator: Simulator,
-    theta: FloatArray,
-    state: FloatArray,
-    goal: FloatArray | None,
-    steps: int,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Actions (T, A) from a starting state (1, S): the task's own excitation, in closed loop, or smooth ones."""
-    task = simulator.environment
-    assert isinstance(task, Task)
-    actions = smooth_actions(task, simulator.dt, steps, rng)
-    for t in range(steps):
-        still = np.zeros((1, 1, task.num_actions))
-        seen = simulator.rollout(theta, still, state, allow_outside=True, goals=goal).observations[:, 0]
-        chosen = task.excitation(seen, rng)
-        if chosen is None:
-            return actions
-        actions[t] = chosen[0]
-        moved = simulator.rollout(theta, actions[None, t : t + 1], state, allow_outside=True, goals=goal).states
-        assert moved is not None
-        state = moved[:, 1]
-    return actions
-
-
-def smooth_actions(task: Task, dt: float, steps: int, rng: np.random.Generator) -> FloatArray:
-    """The excitation policy's actions (T, A), within the task's bounds."""
-    shape = (task.num_actions, _SINES)
-    frequency = np.exp(rng.uniform(np.log(_SLOWEST), np.log(_FASTEST), shape))
-    phase, share = rng.uniform(0, 2 * np.pi, shape), rng.dirichlet(np.ones(_SINES), task.num_actions)
-    time = np.arange(steps)[:, None, None] * dt
-    wave = (share * np.sin(2 * np.pi * frequency * time + phase)).sum(-1)
-    centre, half = (task.action_low + task.action_high) / 2, (task.action_high - task.action_low) / 2
-    return np.asarray(centre + _AMPLITUDE * half * wave)

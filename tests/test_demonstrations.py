@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,13 @@ from rich.console import Console
 
 import sipe_bayes as sipe
 from sipe_bayes import demonstration
-from sipe_bayes.demonstration import Given, smooth_actions
+from sipe_bayes.acting import smooth_actions
+from sipe_bayes.demonstration import Given
 from sipe_bayes.envs.registry import TASKS
+from sipe_bayes.envs.task import Task
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.posterior import Dirac
+from sipe_bayes.rl.policy import Policy
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
 from tests.pendulums import log, pendulum
@@ -55,7 +59,7 @@ def test_trajectories_have_states_rewards_and_names() -> None:
 def test_splits_and_seeds_differ_and_the_same_call_agrees() -> None:
     first = quietly("Pendulum", steps=20)
     np.testing.assert_array_equal(first.actions, quietly("Pendulum", steps=20).actions)
-    np.testing.assert_array_equal(first.actions, quietly("Pendulum", steps=20, count=4).actions[:2])
+    np.testing.assert_array_equal(first.actions, quietly("Pendulum", steps=20, count=7).actions[:5])
     others = [quietly("Pendulum", split="validation", steps=20), quietly("Pendulum", split="test", steps=20)]
     others.append(quietly("Pendulum", seed=1, steps=20))
     for other in others:
@@ -109,14 +113,108 @@ def test_the_excitation_is_smooth() -> None:
     assert 0.3 < np.abs(actions).max() <= 0.8 * task.action_high
 
 
-def test_an_installed_agent_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+# Agents, random actions, noise
+
+
+def agent(task: Task, seed: int = 0) -> Policy:
+    """A small policy of random weights."""
+    rng, sizes = np.random.default_rng(seed), (len(task.channels), 8, task.num_actions)
+    layers = tuple(
+        (rng.standard_normal((m, n)).astype(np.float32) / 2, np.zeros(m, np.float32)) for n, m in pairwise(sizes)
+    )
+    return Policy(task.name, layers, task.action_low, task.action_high)
+
+
+@pytest.fixture
+def agents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in place of that of the agents."""
     monkeypatch.setattr(demonstration, "_FOLDER", tmp_path)
-    assert demonstration.agent_file("Pendulum", "expert") is None
-    (tmp_path / "Pendulum-expert.safetensors").touch()
-    assert demonstration.agent_file("Pendulum", "expert") is not None
-    assert demonstration.agent_file("Pendulum", "suboptimal") is None
-    with pytest.raises(NotImplementedError, match="cannot be read"):
+    return tmp_path
+
+
+def test_an_installed_agent_acts(agents: Path) -> None:
+    """In closed loop, on what it observes, rounded to float32; whatever the number of trajectories."""
+    env = sipe.make("HalfCheetahJoints", "in_distribution")
+    policy = agent(env.task)
+    assert demonstration.agent_file("HalfCheetahJoints", "expert") is None
+    policy.save(agents / "HalfCheetahLinks-expert.safetensors")
+    found = sipe.demonstrations(env, steps=12)
+    for one in found:
+        wanted = np.stack([policy(o[None])[0] for o in one.observations[:-1]])
+        np.testing.assert_array_equal(one.actions, wanted.astype(np.float32))
+    assert np.abs(found.actions - found.actions[:1]).max() > 0.01
+    np.testing.assert_array_equal(found.actions[:2], sipe.demonstrations(env, steps=12, count=2).actions)
+    with pytest.warns(UserWarning, match="no suboptimal agent"):
+        sipe.demonstrations(env, "suboptimal", steps=2)
+
+
+def test_an_agent_acts_on_what_the_environment_shows(agents: Path) -> None:
+    """The humanoid's observations are late: those of its closed loop, not of a start from each state."""
+    env = sipe.make("HumanoidLinks")
+    policy = agent(env.task)
+    policy.save(agents / "HumanoidLinks-expert.safetensors")
+    found = sipe.demonstrations(env, steps=6, count=1)
+    rng = np.random.default_rng([0, 0, 0, 1])
+    env.reset()
+    assert env._episodes is not None
+    env._episodes.generators = [rng]
+    env._episodes.begin(np.ones(1, bool))
+    seen = env._episodes.observations[0]
+    for t in range(6):
+        np.testing.assert_array_equal(seen, found.observations[0, t])
+        seen = env.step(policy(seen[None])[0].astype(np.float32))[0]
+
+
+def test_an_agent_is_varied_where_every_episode_starts_alike(agents: Path) -> None:
+    task = sipe.make_task("Door")
+    policy = agent(task)
+    policy.save(agents / "Door-expert.safetensors")
+    found = sipe.demonstrations("Door", steps=40)
+    np.testing.assert_array_equal(found.states[:, 0], found.states[:1, 0].repeat(5, 0))  # type: ignore[index]
+    meant = np.stack([policy(o) for o in found.observations[:, :-1]])
+    error = found.actions - meant
+    inside = (np.abs(found.actions) < 1) & (np.abs(meant) < 0.7)
+    assert error[inside].std() == pytest.approx(0.05, rel=0.05)  # of thousands: three standard errors and clipping
+
+
+def test_an_agent_of_another_robot_is_refused(agents: Path) -> None:
+    agent(sipe.make_task("Hopper")).save(agents / "Pendulum-expert.safetensors")
+    with pytest.raises(ValueError, match=r"Pendulum-expert.safetensors: expected 3 observations and 1 actions"):
         sipe.demonstrations("Pendulum")
+
+
+def test_random_actions_are_uniform_and_need_no_agent() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = sipe.demonstrations("Pendulum", "random")
+    low, high = found.actions.min(), found.actions.max()
+    assert -2 <= low < -1.95
+    assert 1.95 < high <= 2
+    assert abs(np.corrcoef(found.actions[:, :-1].ravel(), found.actions[:, 1:].ravel())[0, 1]) < 0.1  # 3 in 1/sqrt(995)
+
+
+def test_variants_by_name() -> None:
+    env = sipe.make("Pendulum", "in_distribution")
+    expected = quietly(env, steps=9).observations
+    for given in ("Pendulum", sipe.make_task("Pendulum"), Simulator(sipe.make_task("Pendulum"), 1), env):
+        found = quietly(given, variant="in_distribution", steps=9)
+        np.testing.assert_array_equal(found.observations, expected)
+    with pytest.raises(ValueError, match="variant: env has parameters other than those of 'default'"):
+        quietly(env, variant="default", steps=9)
+
+
+def test_noise_is_of_the_level_asked_for_and_hides_the_truth() -> None:
+    clean = quietly("Pendulum")
+    noisy = quietly("Pendulum", noise=0.01)
+    error = (noisy.observations - clean.observations) / clean.observations.std((0, 1))
+    np.testing.assert_allclose(error.std((0, 1)), 0.01, rtol=0.08)  # 1005 samples: 3.5 standard errors
+    assert noisy.states is None
+    assert noisy.rewards is None
+    np.testing.assert_array_equal(noisy.observations, quietly("Pendulum", noise=0.01).observations)
+    assert np.abs(noisy.observations - quietly("Pendulum", noise=0.01, noise_seed=1).observations).max() > 0.01
+    one = quietly("Pendulum", noise=np.array([0.0, 0.0, 2.0]))
+    np.testing.assert_array_equal(one.observations[..., :2], clean.observations[..., :2])
+    assert (one.observations - clean.observations)[..., 2].std() == pytest.approx(2.0, rel=0.08)
 
 
 def test_wrong_input() -> None:
@@ -130,7 +228,10 @@ def test_wrong_input() -> None:
         ),
         (lambda: sipe.demonstrations("Pendulum", split="train"), ValueError, "split: expected one of reference"),
         (lambda: sipe.demonstrations("Pendulums"), ValueError, "did you mean 'Pendulum'"),
+        (lambda: sipe.demonstrations("Pendulum", variant="other"), ValueError, "variant: no 'other'"),
         (lambda: sipe.demonstrations("Pendulum", count=0), ValueError, "at least 1 of each"),
+        (lambda: quietly("Pendulum", noise=[0.1, 0.1]), ValueError, r"noise: expected one number or \(3,\)"),
+        (lambda: quietly("Pendulum", noise=-0.1), ValueError, "none below zero"),
         (lambda: sipe.demonstrations(pendulum()), ValueError, "no starting states"),
         (lambda: sipe.demonstrations(3), TypeError, "expected a task's name"),
         (lambda: sipe.demonstrations(lanes), ValueError, "lanes differ"),
