@@ -30,10 +30,10 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 
 FloatArray = NDArray[np.float64]
 
-_THETA_STEP = 1e-5  # finite differences, of the unit cube
+_THETA_STEP = (1e-5, 1e-3)  # finite differences, of the unit cube: least, and for windows of one control step
 _START_STEP = 1e-5  # rad or m, rad/s or m/s
 _START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
-_ROUNDING = 1e-9  # of a channel's size
+_ROUNDING = 1e-7  # of a channel's size: what the tolerance of MuJoCo's contact solver leaves, in its rare worst steps
 _SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
 
 
@@ -256,6 +256,12 @@ class Windows:
         return _ROUNDING * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
 
     @property
+    def theta_step(self) -> float:
+        """Of the finite differences: the longer a window, the more a small change grows, and the less smooth its effect."""
+        least, most = _THETA_STEP
+        return max(least, most / int(self.steps.max()))
+
+    @property
     def num_windows(self) -> int:
         return len(self.log)
 
@@ -339,10 +345,11 @@ class Windows:
         with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
         at this very point, which spares the one."""
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
-        sign = np.where(theta + _THETA_STEP <= 1, 1.0, -1.0)
+        size = self.theta_step
+        sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
         for j in range(n):
-            thetas[j + 1, j] += sign[j] * _THETA_STEP
+            thetas[j + 1, j] += sign[j] * size
         for j in range(d):
             all_starts[n + 1 + j, :, j] += _START_STEP
         if residual is None:
@@ -355,10 +362,10 @@ class Windows:
         if wrong and valid[0]:  # a step across a physical limit: look the other way
             sign[wrong] = -sign[wrong]
             again = np.tile(theta, (len(wrong), 1))
-            again[np.arange(len(wrong)), wrong] += sign[wrong] * _THETA_STEP
+            again[np.arange(len(wrong)), wrong] += sign[wrong] * size
             inside = np.clip(again, 0, 1)
             predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
-        scale = np.concatenate([sign[:n] * _THETA_STEP, np.full(d, _START_STEP)])
+        scale = np.concatenate([sign[:n] * size, np.full(d, _START_STEP)])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
         jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)

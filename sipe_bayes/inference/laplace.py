@@ -65,6 +65,7 @@ _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move al
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _NEAR = 0.1  # of the way to a known optimum
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
+_LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
 
@@ -338,7 +339,7 @@ class Laplace(Estimator):
     def _normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance, before truncation, of the quadratic model of data and prior at theta."""
         prior = self.quadratic_prior
-        covariance = np.linalg.inv(precision + prior.precision + _FLAT_PRECISION * np.eye(len(theta)))
+        covariance = _inverse(precision + prior.precision + _FLAT_PRECISION * np.eye(len(theta)))
         pull = gradient + prior.pull(theta) + _FLAT_PRECISION * (0.5 - theta)
         return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
 
@@ -357,6 +358,13 @@ class Laplace(Estimator):
     def _cost(self, trajectories: Trajectories) -> int:
         windows = self.windows(trajectories)
         return (windows.num_theta + windows.num_start + 2) * len(trajectories)
+
+
+def _inverse(precision: FloatArray) -> FloatArray:
+    """Positive definite also where rounding leaves a precision that is not, between parameters that do the same."""
+    sd = 1 / np.sqrt(np.diag(precision))
+    eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)
+    return sd[:, None] * ((axes / np.maximum(eigenvalues, _LEAST_EIGENVALUE)) @ axes.T) * sd
 
 
 def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -22,7 +22,6 @@ lacks.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import warnings
 from typing import Any, ClassVar
@@ -44,7 +43,6 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_VALIDATION = 0.1  # share of the simulations
 _TABLE = 2**26  # numbers: control steps of all simulations that are held at once
 
 
@@ -54,7 +52,8 @@ class NPE(Rounds):
     embedding: "transitions", for trajectories of any length, or "none", every finite sample as it is, for functions with few
     outputs. embedding_features: numbers it summarises a log in. rounds: more than one conditions on the log in hand and
     is not amortised. transforms, hidden, bins: layers of the spline flow, units in each of its two hidden layers, bins of a
-    spline. batch_size, learning_rate, patience (epochs without a better validation loss), max_epochs: of the training.
+    spline. batch_size (None: a twentieth of the simulations, 200 to 500), learning_rate, patience (epochs without a better
+    validation loss), max_epochs, held_out (share of the simulations that validates): of the training.
     device: "cpu" or "cuda", for the training alone.
     """
 
@@ -70,10 +69,11 @@ class NPE(Rounds):
         transforms: int = 3,
         hidden: int = 64,
         bins: int = 8,
-        batch_size: int = 200,
+        batch_size: int | None = None,
         learning_rate: float = 1e-3,
-        patience: int = 20,
+        patience: int = 40,
         max_epochs: int = 1000,
+        held_out: float = 0.1,
         device: str = "cpu",
         **settings: Any,
     ) -> None:
@@ -87,7 +87,7 @@ class NPE(Rounds):
             "transforms": transforms,
             "hidden": hidden,
             "bins": bins,
-            "batch_size": batch_size,
+            "batch_size": 1 if batch_size is None else batch_size,
             "patience": patience,
             "max_epochs": max_epochs,
         }
@@ -97,7 +97,10 @@ class NPE(Rounds):
         self.embedding = embedding
         self.embedding_features = int(embedding_features)
         self.architecture = {"transforms": int(transforms), "hidden": int(hidden), "bins": int(bins)}
-        self.batch_size, self.learning_rate = int(batch_size), float(learning_rate)
+        if not 0 < held_out < 1:
+            raise ValueError(f"held_out: expected a share between 0 and 1, got {held_out}; try 0.1")
+        self.batch_size, self.learning_rate = batch_size, float(learning_rate)
+        self.held_out = float(held_out)
         self.patience, self.max_epochs, self.device = int(patience), int(max_epochs), check_device(device)
 
     def settings(self) -> dict[str, Any]:
@@ -110,6 +113,7 @@ class NPE(Rounds):
             "learning_rate": self.learning_rate,
             "patience": self.patience,
             "max_epochs": self.max_epochs,
+            "held_out": self.held_out,
             "device": self.device,
         }
 
@@ -177,14 +181,15 @@ class NPE(Rounds):
             density_estimator=build, device=self.device, show_progress_bars=False, tracker=NoTracker()
         )
         trainer.append_simulations(u, x, exclude_invalid_x=False)
-        validation = len(x) - int((1 - _VALIDATION) * len(x))
+        validation = len(x) - int((1 - self.held_out) * len(x))
+        batch = min(500, max(200, len(x) // 20)) if self.batch_size is None else self.batch_size
         net = trainer.train(
             # sbi drops the validation set's last, smaller batch: cut it evenly
-            training_batch_size=max(1, validation // max(1, round(validation / self.batch_size)))
-            if validation > self.batch_size
-            else self.batch_size,
+            training_batch_size=max(1, validation // max(1, round(validation / batch)))
+            if validation > batch
+            else batch,
             learning_rate=self.learning_rate,
-            validation_fraction=_VALIDATION,
+            validation_fraction=self.held_out,
             stop_after_epochs=self.patience,
             max_num_epochs=self.max_epochs,
         )
