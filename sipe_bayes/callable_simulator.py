@@ -10,11 +10,12 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import whole
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.trajectory import Trajectories, Trajectory
 
@@ -38,6 +39,8 @@ class CallableSimulator:
     functions apart in checkpoints and caches; default fn's qualified name. Raises ValueError for an fn of another form.
     """
 
+    failure: ClassVar[str] = "made fn return NaN or infinity"  # what is said of simulations that are not valid
+
     def __init__(
         self,
         fn: Callable[..., Any],
@@ -51,7 +54,11 @@ class CallableSimulator:
             raise ValueError(
                 f"space: expected a ParameterSpace, got {type(space).__name__}; sipe.ParameterSpace([...])"
             )
-        self.fn, self.space, self.seed = fn, space, int(seed)
+        if not callable(fn):
+            raise ValueError(
+                f"fn: expected a function fn(values (B, {len(space)})) -> x (B, D), got a {type(fn).__name__}"
+            )
+        self.fn, self.space, self.seed = fn, space, whole("seed", seed, 0)
         self.name = name or f"{getattr(fn, '__module__', '')}.{getattr(fn, '__qualname__', type(fn).__name__)}"
         self.noisy = len(inspect.signature(fn).parameters) > 1
         if self.noisy and likelihood is not None:
@@ -63,7 +70,10 @@ class CallableSimulator:
         self.noise_sd = None if likelihood is None else self._sds(likelihood, size)
 
     def _sds(self, likelihood: Any, size: int) -> tuple[float, ...]:
-        sd = np.asarray(likelihood, float)
+        try:
+            sd = np.asarray(likelihood, float)
+        except (TypeError, ValueError):
+            sd = np.empty(0)
         if sd.shape not in ((), (size,)) or not ((sd > 0) & np.isfinite(sd)).all():
             raise ValueError(f"likelihood: expected one sd above zero or ({size},) of them, got {likelihood!r}")
         return tuple(np.broadcast_to(sd, (size,)).tolist())
@@ -74,10 +84,17 @@ class CallableSimulator:
         return hashlib.sha256(repr(plain).encode()).hexdigest()
 
     def trajectory(self, x: Any) -> Trajectory:
-        """An observed x (D,) as estimators see it; NaN where it was not observed."""
-        values, size = np.asarray(x, float), len(self.environment.channels)
+        """An observed x (D,) as estimators see it; NaN where it was not observed. Raises ValueError for another shape, infinity,
+        or an x of which nothing was observed."""
+        size = len(self.environment.channels)
+        try:
+            values = np.asarray(x, float)
+        except (TypeError, ValueError):
+            raise ValueError(f"x: expected numbers ({size},), as fn returns, got a {type(x).__name__}") from None
         if values.shape != (size,):
             raise ValueError(f"x: expected shape ({size},), as fn returns, got {values.shape}")
+        if np.isinf(values).any() or not np.isfinite(values).any():
+            raise ValueError(f"x: expected finite numbers, NaN where one is missing, got {values.tolist()}")
         return Trajectory(
             np.stack([np.zeros(size), values]), np.zeros((1, 0)), 1.0, name="x", channels=self.environment.channels
         )
@@ -117,7 +134,7 @@ class CallableSimulator:
     def _call(self, values: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
         try:
             x = np.asarray(self.fn(values, rng) if self.noisy else self.fn(values), float)
-        except (IndexError, TypeError) as error:
+        except (IndexError, TypeError, ValueError) as error:
             raise ValueError(
                 f"fn: expected fn(values (B, {len(self.space)})) -> x (B, D), a row for each theta, values[:, 0] the first "
                 f"parameter; with values {values.shape} it raised {type(error).__name__}: {error}"

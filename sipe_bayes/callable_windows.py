@@ -34,6 +34,11 @@ class CallableWindows(Windows):
         self.owned = np.tile([False, True], (count, 1))
         self.measured = trajectories.observations[:, :, self.channels]
         self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
+        unseen = [n for n, seen in zip(self.fitted, self.observed.any(axis=(0, 1)), strict=True) if not seen]
+        if unseen:
+            raise ValueError(
+                f"x: {', '.join(unseen)} is NaN; leave it out of fn and of x, or compare the others, Segments(fit=...)"
+            )
         self.actions = trajectories.actions
         self.sequences = sequences(self.observed, np.tile([0, 1], (count, 1)), self.log, self.dt)
         self.reference, self.num_start, self.start_precision = np.zeros((count, 0)), 0, np.zeros(0)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import logsigmoid
 
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.models.discriminator import Discriminator, Training
+from sipe_bayes.models.discriminator import HIDDEN, Discriminator, Training
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.noise_level import noise_level
 
@@ -39,14 +39,22 @@ _PREFIX = "reward_"
 class LearnedReward:
     """Reward of simulations of ``windows``; what is learned lives in the entries ``reward_*`` of a flat State.
 
-    learning_rate, batch: of Adam; half of a batch is recorded, half simulated. updates: Adam's steps at each ``train``.
+    learning_rate, batch: of Adam; half of a batch is recorded, half simulated. updates: Adam's steps at each ``train``. hidden:
+    units of the discriminator's two layers.
     Raises ValueError where no whole control step was recorded.
     """
 
     def __init__(
-        self, windows: Windows, *, seed: int = 0, learning_rate: float = 0.001, batch: int = 320, updates: int = 30
+        self,
+        windows: Windows,
+        *,
+        seed: int = 0,
+        learning_rate: float = 0.001,
+        batch: int = 320,
+        updates: int = 30,
+        hidden: int = HIDDEN,
     ) -> None:
-        self.windows, self.seed = windows, seed
+        self.windows, self.seed, self.hidden = windows, seed, hidden
         self.learning_rate, self.batch, self.updates = learning_rate, batch, updates
         sd = noise_level(windows.trajectories, windows.settings)
         self.noise = sd[windows.channels]
@@ -111,7 +119,7 @@ class LearnedReward:
         return out
 
     def _training(self, state: State | None) -> Training:
-        training = Training(Discriminator(self.recorded.shape[1], self.seed), self.learning_rate)
+        training = Training(Discriminator(self.recorded.shape[1], self.seed, self.hidden), self.learning_rate)
         if state is not None:
             training.load({k[len(_PREFIX) :]: v for k, v in state.items() if k.startswith(_PREFIX)})
         return training

@@ -7,8 +7,9 @@ numbers in physical units. A parameter on a linear scale maps affinely, one on a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -46,8 +47,13 @@ class Parameter:
 
     def __post_init__(self) -> None:
         where = f"parameter {self.name!r}"
-        if not self.name:
-            raise ValueError("parameter name: expected a non-empty string, got ''")
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"parameter name: expected a non-empty string, got {self.name!r}")
+        for field in ("low", "high", "default", "prior_mean", "prior_sd"):
+            given = getattr(self, field)
+            optional = field in ("default", "prior_mean", "prior_sd")
+            if isinstance(given, bool) or not (isinstance(given, Real) or (given is None and optional)):
+                raise ValueError(f"{where}: expected a number as {field}, got {given!r}")
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise ValueError(f"{where}: bounds must be finite, got [{self.low}, {self.high}]")
         if self.low >= self.high:
@@ -101,7 +107,15 @@ class ParameterSpace(Sequence[Parameter]):
     """An ordered set of parameters; immutable. ``theta`` (..., N) <-> ``values`` (..., N)."""
 
     def __init__(self, parameters: Iterable[Parameter]) -> None:
-        self._parameters = tuple(parameters)
+        given = (
+            None if isinstance(parameters, str | Mapping) or not isinstance(parameters, Iterable) else tuple(parameters)
+        )
+        if given is None or not all(isinstance(p, Parameter) for p in given):
+            what = f"a {type(parameters).__name__}" + (" of other things" if given is not None else "")
+            raise ValueError(
+                f"parameters: expected a list of Parameters, got {what}; ParameterSpace([Parameter(name, low, high), ...])"
+            )
+        self._parameters = given
         names = [p.name for p in self._parameters]
         if not names:
             raise ValueError("parameters: expected at least one, got none")
@@ -162,8 +176,13 @@ class ParameterSpace(Sequence[Parameter]):
         return np.array([0.5 if p.default is None else float(p.normalise(p.default)) for p in self._parameters])
 
     def check_shape(self, array: Any) -> FloatArray:
-        """``array`` as float64 (..., N); raises ValueError when its last axis is not N."""
-        array = np.asarray(array, dtype=np.float64)
+        """``array`` as float64 (..., N); raises ValueError when it is not numbers or its last axis is not N."""
+        try:
+            array = np.asarray(array, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"expected numbers, {len(self)} parameters on the last axis, got a {type(array).__name__}"
+            ) from None
         if array.ndim == 0 or array.shape[-1] != len(self):
             raise ValueError(f"expected {len(self)} parameters on the last axis, got shape {array.shape}")
         return array

@@ -17,12 +17,13 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import whole
 from sipe_bayes.engine import HUGE, Engine, quiet
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task
@@ -44,11 +45,14 @@ class Simulator:
     ``diverged`` the lanes that are not valid to their end. Not for two Python threads at a time.
     """
 
+    failure: ClassVar[str] = "diverged"  # what is said of simulations that are not valid to their end
+
     def __init__(self, environment: Environment, num_threads: int | None = None) -> None:
-        if num_threads is not None and num_threads < 1:
-            raise ValueError(f"num_threads: expected at least 1, got {num_threads}")
+        if not isinstance(environment, Environment):
+            hint = f"sipe.make_task({environment!r})" if isinstance(environment, str) else "one of sipe.make_task(name)"
+            raise ValueError(f"environment: expected an Environment, got {environment!r}; give {hint}")
         self.environment = environment
-        self.num_threads = num_threads or os.cpu_count() or 1
+        self.num_threads = (os.cpu_count() or 1) if num_threads is None else whole("num_threads", num_threads)
         self.model = environment.compile()
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show

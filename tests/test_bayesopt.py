@@ -20,6 +20,7 @@ from tests.pendulums import DT, log, pendulum
 from tests.surrogates import bowl, example_surrogate
 
 BUDGET = 60
+ROUGH: dict[str, Any] = {"effective_draws": 50, "most_steps": 100}  # draws, where only form counts
 TRUTH = np.array([0.6, 0.05])
 
 
@@ -109,7 +110,7 @@ def test_finds_the_optimum_within_the_budget(acquisition: str) -> None:
     posterior within 0.05 of it; a few far draws are what little was evaluated elsewhere."""
     simulator = pendulum()
     truth = simulator.space.normalise(TRUTH)
-    estimator = BayesOpt(simulator, budget=BUDGET, acquisition=acquisition)
+    estimator = BayesOpt(simulator, budget=BUDGET, acquisition=acquisition, effective_draws=500)
     posterior = estimator.fit(recorded(simulator))
     print(estimator.diagnostics, posterior.best.numpy() - truth, posterior.mean.numpy() - truth, posterior.stddev)
     assert estimator.rollouts == BUDGET
@@ -126,7 +127,7 @@ class Interrupted(Exception):
 def test_resumes_to_the_same_posterior(tmp_path: Path) -> None:
     simulator = pendulum()
     logs = [log(simulator, list(TRUTH), seed, f"log{seed}", steps=100) for seed in (1, 2)]
-    undisturbed = BayesOpt(simulator, budget=51, seed=3).fit(logs)
+    undisturbed = BayesOpt(simulator, budget=51, seed=3, **ROUGH).fit(logs)
     steps = 0
 
     def interrupt(*_: Any) -> None:
@@ -135,7 +136,7 @@ def test_resumes_to_the_same_posterior(tmp_path: Path) -> None:
         if steps == 3:
             raise Interrupted
 
-    settings: dict[str, Any] = {"budget": 51, "seed": 3, "checkpoint": tmp_path / "checkpoint.safetensors"}
+    settings: dict[str, Any] = {"budget": 51, "seed": 3, "checkpoint": tmp_path / "checkpoint.safetensors", **ROUGH}
     first = BayesOpt(simulator, progress=interrupt, **settings)
     first.checkpoint_seconds = 0.0
     with pytest.raises(Interrupted):
@@ -158,7 +159,7 @@ def test_diverging_simulations_are_survived(monkeypatch: pytest.MonkeyPatch) -> 
         return result
 
     monkeypatch.setattr(Simulator, "rollout", diverging)
-    estimator = BayesOpt(simulator, budget=40)
+    estimator = BayesOpt(simulator, budget=40, **ROUGH)
     posterior = estimator.fit(trajectory)
     assert estimator.diagnostics["diverged"] > 0
     assert any("diverged" in warning for warning in estimator.warnings)

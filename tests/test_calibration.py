@@ -16,6 +16,7 @@ import torch
 from sipe_bayes.diagnostics.calibration import (
     LEVELS,
     CalibrationCheck,
+    _mass,
     check_calibration,
     tarp_values,
     uniformity,
@@ -127,6 +128,19 @@ def test_tarp_is_that_of_sbi() -> None:
     ours = tarp_values(list(draws), truths, references, rng)
     curve = (ours[:, None] <= level.numpy() + 1 / 400).mean(0)
     np.testing.assert_allclose(curve, share.numpy(), atol=0.03)
+
+
+def test_ranks_are_those_of_sbi() -> None:
+    """sbi counts the draws below the truth; our masses are these counts, and a share of one draw, in units of all draws and one."""
+    sbc = import_sbi("diagnostics.sbc")
+    rng = np.random.default_rng(5)
+    truths, draws = rng.random((30, 2)), rng.random((200, 30, 2))
+    theta, seen = torch.from_numpy(truths), torch.zeros(30, 1)
+    counts = sbc._run_sbc(theta, seen, torch.from_numpy(draws), "marginals", show_progress_bar=False).numpy()
+    ours = np.stack([_mass(draws[:, i], truths[i], rng) for i in range(30)])
+    np.testing.assert_array_equal(np.floor(ours * 201), counts)
+    p_values = sbc.check_uniformity_frequentist(torch.from_numpy(counts), 200).numpy()
+    assert all((p > 0.01) == (uniformity(column).p > 0.01) for p, column in zip(p_values, ours.T, strict=True))
 
 
 def test_the_same_seed_gives_the_same_answer_as_plain_data() -> None:

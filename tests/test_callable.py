@@ -11,23 +11,12 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.inference import ESTIMATORS
+from tests.quick import SMALL
 
 SPACE = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=2.0), sipe.Parameter("b", low=-1.0, high=1.0)])
 MATRIX = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, -1.0]])
 X = MATRIX @ np.array([0.9, 0.2])
 SD = 0.1
-QUICK: dict[str, dict[str, Any]] = {
-    "maml": {"iterations": 100},
-    "npe": {
-        "embedding": "none",
-        "transforms": 2,
-        "hidden": 24,
-        "batch_size": 50,
-        "learning_rate": 3e-3,
-        "max_epochs": 60,
-    },
-    "bayesopt": {"budget": 60},
-}
 
 
 def plain(values: np.ndarray) -> np.ndarray:
@@ -48,7 +37,7 @@ def exact() -> tuple[np.ndarray, np.ndarray]:
 def test_every_estimator_takes_an_observed_x(name: str) -> None:
     """Those with a likelihood or a density find the exact posterior, mean to 0.4 sd and sds to 40 %; all give something."""
     simulator = sipe.CallableSimulator(plain, SPACE, likelihood=SD)
-    estimator = sipe.get_estimator(simulator, name, **{"seed": 0, "budget": 1500, **QUICK.get(name, {})})
+    estimator = sipe.get_estimator(simulator, name, **{"seed": 0, "budget": 1500, **SMALL.get(name, {})})
     posterior = estimator.fit(X)
     values = posterior.values(4000, generator=torch.Generator().manual_seed(0))
     mean, sd = exact()
@@ -77,12 +66,47 @@ def test_failed_simulations_are_named() -> None:
 
     estimator = sipe.get_estimator(sipe.CallableSimulator(fails, SPACE, likelihood=SD), "abc", budget=400)
     estimator.fit(X)
-    assert any("simulations diverged, mostly at high a" in w for w in estimator.warnings), estimator.warnings
+    assert any("simulations made fn return NaN or infinity, mostly at high a" in w for w in estimator.warnings)
+
+
+def test_a_missing_output_is_skipped_where_it_can_be() -> None:
+    """laplace told to compare two of three outputs is wider, and right."""
+    simulator, mean = sipe.CallableSimulator(plain, SPACE, likelihood=SD), exact()[0]
+    missing, two = [X[0], X[1], np.nan], sipe.Segments(None, noise="white", noise_sd=(SD, SD), fit=("x0", "x1"))
+    whole = sipe.get_estimator(simulator, "laplace").fit(X)
+    part = sipe.get_estimator(simulator, "laplace", likelihood=two).fit(missing)
+    assert (part.stddev > whole.stddev).all()
+    np.testing.assert_allclose(SPACE.values(part.mean.numpy()), mean, atol=0.02)
+
+
+def always_nan(values: np.ndarray) -> np.ndarray:
+    return np.full((len(values), 3), np.nan)
 
 
 @pytest.mark.parametrize(
     ("call", "words"),
     [
+        (lambda: sipe.CallableSimulator("name", SPACE), "fn: expected a function"),
+        (lambda: sipe.CallableSimulator(plain, SPACE, seed="one"), "seed: expected a whole number"),
+        (lambda: sipe.CallableSimulator(plain, SPACE, likelihood="small"), "likelihood: expected one sd"),
+        (lambda: sipe.CallableSimulator(plain, SPACE).trajectory([np.nan] * 3), "x: expected finite numbers"),
+        (lambda: sipe.CallableSimulator(plain, SPACE).trajectory([np.inf, 0, 0]), "x: expected finite numbers"),
+        (lambda: sipe.CallableSimulator(plain, SPACE).trajectory("abc"), "x: expected numbers"),
+        *(
+            (
+                lambda n=name: sipe.get_estimator(sipe.CallableSimulator(plain, SPACE, SD), n).fit([0.0, 0.0, np.nan]),
+                r"x: .*x(2|\[2\]) is NaN; leave it out of fn",
+            )
+            for name in ESTIMATORS
+        ),
+        (
+            lambda: sipe.get_estimator(sipe.CallableSimulator(always_nan, SPACE), "abc", budget=50).fit(X),
+            "0 of 50 simulations are valid, abc needs 10, the others made fn return NaN or infinity",
+        ),
+        (
+            lambda: sipe.get_estimator(sipe.CallableSimulator(always_nan, SPACE), "bayesopt", budget=8).fit(X),
+            "simulations made fn return NaN",
+        ),
         (lambda: sipe.get_estimator(sipe.CallableSimulator(noisy, SPACE), "laplace"), "likelihood: laplace needs one"),
         (lambda: sipe.get_estimator(sipe.CallableSimulator(noisy, SPACE), "mcmc"), "likelihood: mcmc needs one"),
         (lambda: sipe.CallableSimulator(noisy, SPACE, likelihood=0.1), "fn's own"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,19 +15,21 @@ import torch
 from sipe_bayes.inference import ESTIMATORS, get_estimator
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.inference.state import CheckpointError
-from sipe_bayes.posterior import IndependentPrior, Posterior, load_posterior
+from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.posterior import IndependentPrior, Posterior, load_posterior, uniform
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
 from tests.pendulums import log, pendulum
+from tests.quick import FORM
 
 NAMES = list(ESTIMATORS)
 BUDGET = 150
-QUICK = {
-    "maml": {"iterations": 50},
-    "npe": {"max_epochs": 20},
-    "regression": {"epochs": 20},
-}  # training, where only form counts
 TRUTH = [0.6, 0.05]
+
+
+def quick(name: str, budget: int = BUDGET) -> dict[str, Any]:
+    """Budget and settings where only form counts."""
+    return {"budget": budget, **FORM.get(name, {})}
 
 
 def draws(posterior: Posterior, count: int = 200) -> torch.Tensor:
@@ -54,13 +58,13 @@ def test_support_seeds_budget_and_files(name: str, tmp_path: Path) -> None:
     simulator = pendulum()
     logs = [log(simulator, TRUTH, 1, "a", steps=120), log(simulator, TRUTH, 2, "b", steps=90)]
     logs[0].observations[20:40] = np.nan
-    fits = [get_estimator(simulator, name, seed=3, budget=BUDGET, **QUICK.get(name, {})) for _ in range(2)]
+    fits = [get_estimator(simulator, name, seed=3, **quick(name)) for _ in range(2)]
     one, other = (f.fit(logs) for f in fits)
     assert draws(one).dtype == torch.float64
     assert draws(one).shape == (200, 2)
     assert ((draws(one) >= 0) & (draws(one) <= 1)).all()
     assert one.mean.shape == one.stddev.shape == one.mode.shape == (2,)
-    assert 0 < fits[0].rollouts <= BUDGET
+    assert 0 < fits[0].rollouts <= fits[0].budget
     assert torch.equal(draws(one), draws(other))
     one.save(tmp_path / "posterior")
     again = load_posterior(tmp_path / "posterior")
@@ -71,6 +75,62 @@ def test_support_seeds_budget_and_files(name: str, tmp_path: Path) -> None:
         assert torch.equal(one.log_prob(theta), again.log_prob(theta))
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_every_setting_is_part_of_what_tells_runs_apart(name: str) -> None:
+    """Whatever an estimator takes by name changes the result, but for where it works and what it tells."""
+    silent = {"simulator", "settings", "checkpoint", "progress", "cache", "device"}
+    taken = {p for c in estimator_class(name).__mro__[:-1] for p in inspect.signature(c).parameters}
+    stated = get_estimator(pendulum(), name).settings()
+    assert taken - silent <= set(stated), taken - silent - set(stated)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda s: get_estimator(s, "abc", seed="one"), "seed: expected a whole number, got 'one'"),
+        (lambda s: get_estimator(s, "abc", seed=None), "seed: expected a whole number, got None"),
+        (lambda s: get_estimator(s, "abc", seed=0.5), "seed: expected a whole number, got 0.5"),
+        (lambda s: get_estimator(s, "abc", seed=-1), "seed: expected at least 0, got -1"),
+        (lambda s: get_estimator(s, "abc", budget="all"), "budget: expected a whole number, got 'all'"),
+        (lambda s: get_estimator(s, "abc", budget=True), "budget: expected a whole number"),
+        (lambda s: get_estimator(s, "abc", budget=0), "budget: expected at least 1 rollout, got 0"),
+        (lambda s: get_estimator(s, "abc", prior="file"), "prior: expected a posterior with a density"),
+        (lambda s: get_estimator(s, "abc", accepted="few"), "accepted: expected a positive number"),
+        (lambda s: get_estimator(s, "abc", accepted=1.5), "accepted: expected a fraction"),
+        (lambda s: get_estimator(s, "regression", held_out=1.0), "held_out: expected a share"),
+        (lambda s: get_estimator(s, "maml", spread=0), "spread: expected a positive number"),
+        (lambda s: get_estimator(s, "maml", look_every=1.5), "look_every: expected a whole number"),
+        (lambda s: get_estimator(s, "bayessim", hidden=1), "hidden: expected at least 2"),
+        (lambda s: get_estimator(s, "bayessim", summary_features=0), "summary_features: expected at least 1"),
+        (lambda s: get_estimator(s, "bayessim", training={"epochs": 3}), "training: expected models.training.Training"),
+        (lambda s: get_estimator(s, "bayessim", truncated=0), "truncated: expected a share"),
+        (lambda s: get_estimator(s, "simopt", damping=-1), "damping: expected at least 0"),
+        (lambda s: get_estimator(s, "simopt", discriminator_batch=1), "discriminator_batch: expected at least 2"),
+        (lambda s: get_estimator(s, "adr", ridge=0), "ridge: expected a positive number"),
+        (lambda s: get_estimator(s, "bayesopt", growth=0.5), "growth: expected at least 1"),
+        (lambda s: get_estimator([s], "abc"), "simulator: expected a Simulator"),
+        (lambda s: Simulator("Pendulum"), r"environment: expected an Environment.*make_task"),
+        (lambda s: Simulator(s.environment, num_threads=0), "num_threads: expected at least 1"),
+        (lambda s: ParameterSpace({"mass": (0, 1)}), "parameters: expected a list of Parameters, got a dict"),
+        (lambda s: ParameterSpace("mass"), "parameters: expected a list of Parameters, got a str"),
+        (lambda s: ParameterSpace(["mass"]), "parameters: expected a list of Parameters, got a list of other"),
+        (lambda s: ParameterSpace(Parameter("mass")), "parameters: expected a list of Parameters, got a Parameter"),
+        (lambda s: Parameter("mass", low="0"), "'mass': expected a number as low, got '0'"),
+        (lambda s: Parameter(3), "parameter name: expected a non-empty string, got 3"),
+        (lambda s: s.space.values("abc"), "expected numbers, 2 parameters"),
+        (lambda s: uniform(s.space).values(-1), "n: expected at least 0, got -1"),
+        (lambda s: uniform(s.space).values("ten"), "n: expected a whole number"),
+        (lambda s: uniform(s.space).sample(10), r"sample_shape: expected sizes such as \(1000,\)"),
+        (lambda s: uniform(s.space).sample((-5,)), "sample_shape: expected at least 0"),
+        (lambda s: uniform(s.space).quantile("half"), "q: expected a number"),
+    ],
+)
+def test_wrong_arguments_are_named_in_one_line(call: Callable[[Simulator], Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words) as raised:
+        call(pendulum())
+    assert "\n" not in str(raised.value)
+
+
 class Interrupted(Exception):
     """Stands for a killed process."""
 
@@ -79,8 +139,7 @@ class Interrupted(Exception):
 def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: Path) -> None:
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
-    quick = QUICK.get(name, {})
-    undisturbed = get_estimator(simulator, name, seed=5, budget=BUDGET, **quick).fit(trajectory)
+    undisturbed = get_estimator(simulator, name, seed=5, **quick(name)).fit(trajectory)
     steps = 0
 
     def interrupt(*_: Any) -> None:
@@ -90,7 +149,7 @@ def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: P
             raise Interrupted
 
     checkpoint = tmp_path / "checkpoint.safetensors"
-    settings = {"seed": 5, "budget": BUDGET, "checkpoint": checkpoint, **quick}
+    settings = {"seed": 5, "checkpoint": checkpoint, **quick(name)}
     first = get_estimator(simulator, name, progress=interrupt, **settings)
     first.checkpoint_seconds = 0.0
     with pytest.raises(Interrupted):
@@ -119,9 +178,8 @@ def test_trajectories_of_another_environment_are_refused(name: str) -> None:
 def test_diverging_simulations_are_survived(name: str) -> None:
     """A tenth of the prior diverges: the fit goes on, and its mean stays within a quarter of the range of what it is without."""
     trajectory = log(pendulum(), [0.5, 0.12], 1, steps=120)
-    quick = QUICK.get(name, {})
-    fragile = get_estimator(Fragile(), name, seed=1, budget=BUDGET, **quick)
-    sound = get_estimator(pendulum(), name, seed=1, budget=BUDGET, **quick).fit(trajectory)
+    fragile = get_estimator(Fragile(), name, seed=1, **quick(name))
+    sound = get_estimator(pendulum(), name, seed=1, **quick(name)).fit(trajectory)
     posterior = fragile.fit(trajectory)
     print(name, posterior.mean, sound.mean, fragile.warnings)
     assert torch.isfinite(draws(posterior)).all()
@@ -133,10 +191,10 @@ def test_a_truth_outside_the_prior_raises_suspicion(name: str) -> None:
     """The rod is three times as heavy as the bounds allow. A truth well inside raises none."""
     suspicious = ("at a bound", "unlike")
     heavy = light()
-    outside = get_estimator(heavy, name, seed=2, budget=2 * BUDGET, **QUICK.get(name, {}))
+    outside = get_estimator(heavy, name, seed=2, **quick(name, 2 * BUDGET))
     outside.fit(log(pendulum(), [0.99, 0.01], 1, steps=200))
     assert any(word in w for w in outside.warnings for word in suspicious), outside.warnings
-    inside = get_estimator(heavy, name, seed=2, budget=2 * BUDGET, **QUICK.get(name, {}))
+    inside = get_estimator(heavy, name, seed=2, **quick(name, 2 * BUDGET))
     inside.fit(log(heavy, [0.2, 0.1], 1, steps=200))
     assert not any(word in w for w in inside.warnings for word in suspicious), inside.warnings
 
@@ -144,7 +202,6 @@ def test_a_truth_outside_the_prior_raises_suspicion(name: str) -> None:
 def light() -> Simulator:
     """A pendulum whose rod is believed to be between 0.1 and 0.3 kg."""
     from sipe_bayes.envs.mjcf import MjcfEnvironment
-    from sipe_bayes.parameters import Parameter
     from tests.pendulums import XML
 
     parameters = [
@@ -163,7 +220,7 @@ def test_a_prior_counts(name: str) -> None:
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
     prior = IndependentPrior([0.9, 0.5], [1e-3, float("inf")], simulator.space)
-    posterior = get_estimator(simulator, name, prior=prior, budget=BUDGET, **QUICK.get(name, {})).fit(trajectory)
+    posterior = get_estimator(simulator, name, prior=prior, **quick(name)).fit(trajectory)
     assert abs(float(posterior.mean[0]) - 0.9) < 2e-2
 
 
@@ -172,10 +229,10 @@ def test_the_papers_loop(name: str) -> None:
     """update_parameter_estimate as often as one likes, get_parameter_estimate in between; no budget is overdrawn."""
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
-    estimator = get_estimator(simulator, name, budget=BUDGET, **QUICK.get(name, {}))
+    estimator = get_estimator(simulator, name, **quick(name))
     with pytest.raises(ValueError, match="nothing has been fitted"):
         estimator.get_parameter_estimate(trajectory)
     for _ in range(40):
         estimator.update_parameter_estimate(trajectory)
-    assert estimator.rollouts <= BUDGET
+    assert estimator.rollouts <= estimator.budget
     assert torch.isfinite(estimator.get_parameter_estimate(trajectory).mean).all()

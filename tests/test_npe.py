@@ -19,20 +19,12 @@ from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Flow, IndependentPrior, load_posterior
 from sipe_bayes.posterior.flow import spline_flow, to_cube, to_line
 from sipe_bayes.trajectory import Trajectories
+from tests import quick
 from tests.pendulums import log, pendulum
 
 SD = 0.08  # of the noise, theta units
 QUIET = Segments(noise_sd=(0.0, 0.0))  # the function makes its own noise
-SMALL: dict[str, Any] = {
-    "embedding": "none",
-    "likelihood": QUIET,
-    "transforms": 2,
-    "hidden": 24,
-    "batch_size": 50,
-    "learning_rate": 3e-3,
-    "patience": 8,
-    "max_epochs": 60,
-}
+SMALL: dict[str, Any] = {**quick.SMALL["npe"], "likelihood": QUIET, "patience": 8}
 SPACE = ParameterSpace([Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)])
 
 
@@ -175,9 +167,9 @@ def test_a_prior_that_is_not_uniform() -> None:
 def test_rounds_sharpen_and_stay_exact() -> None:
     """Two rounds of 400 against one of 800, at a log in a corner: where the truncated prior is small."""
     mean, sd = exact(0.15, 0.2)
-    errors = {}
+    errors, many_steps = {}, {**SMALL, "batch_size": 50, "learning_rate": 3e-3, "max_epochs": 60}
     for rounds in (1, 2):
-        method = NPE(linear(), budget=800, seed=0, rounds=rounds, **SMALL)
+        method = NPE(linear(), budget=800, seed=0, rounds=rounds, **many_steps)
         posterior = method.fit(seen(0.15, 0.2))
         errors[rounds] = (
             np.abs((posterior.mean.numpy() - mean) / sd).max(),
@@ -246,6 +238,8 @@ def test_a_log_unlike_all_simulations_is_reported() -> None:
 def test_wrong_input() -> None:
     simulator = linear()
     gap = sipe.Trajectory(np.array([[0.0, 0.0], [np.nan, 0.1]]), np.zeros((1, 0)), 1.0)
+    missing = log(pendulum(), [0.6, 0.05], 1, steps=60)
+    missing.observations[1::2] = np.nan
     longer = sipe.Trajectory(np.zeros((3, 2)), np.zeros((2, 0)), 1.0)
     trained = NPE(simulator, **TINY)
     trained.fit(seen(0.4, 0.5))
@@ -255,8 +249,9 @@ def test_wrong_input() -> None:
         (lambda: NPE(simulator, rounds=0), "rounds: expected at least 1"),
         (lambda: NPE(simulator, bins=1), "bins: expected at least 2"),
         (lambda: NPE(simulator, learning_rate=0.0), "learning_rate"),
-        (lambda: NPE(simulator, **TINY).fit(gap), "use 'transitions'"),
-        (lambda: NPE(simulator, likelihood=QUIET, max_epochs=1, budget=50).fit(gap), "no control step"),
+        (lambda: NPE(simulator, **TINY).fit(gap), r"x: npe learns from whole ones, but x\[0\] is NaN"),
+        (lambda: NPE(pendulum(), embedding="none", budget=50).fit(missing), "use 'transitions'"),
+        (lambda: NPE(pendulum(), max_epochs=1, budget=50).fit(missing), "no control step"),
         (lambda: NPE(simulator, **{**TINY, "budget": 5}).fit(seen(0.4, 0.5)), "raise the budget"),
         (lambda: trained.posterior(trained._state or {}, Trajectories.stack(longer)), "logs of one length only"),
     ]

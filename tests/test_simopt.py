@@ -65,6 +65,21 @@ def test_the_new_gaussian_stays_within_the_bound_and_follows_the_reward() -> Non
     np.testing.assert_allclose(unchanged[1], covariance, atol=1e-8)
 
 
+def test_damping_slows_the_covariance_and_leaves_the_mean() -> None:
+    """None: a variance follows the weights as far as least_factor allows; much: it stays; one is the default."""
+    rng = np.random.default_rng(1)
+    mean, covariance = np.full(2, 0.5), 0.01 * np.eye(2)
+    theta, base = rng.multivariate_normal(mean, covariance, 60), np.full(60, 1 / 60)
+    reward = -((theta[:, 0] - 0.5) ** 2)
+    weights = reps_weights(reward, np.log(base), reps_temperature(reward, np.log(base), 1.0))
+    found = {d: fitted(theta, weights, base, mean, covariance, 10.0, d) for d in (0.0, 1.0, 1e6)}
+    assert found[0.0][1][0, 0] < found[1.0][1][0, 0] < found[1e6][1][0, 0]
+    np.testing.assert_allclose(found[1e6][1], covariance, rtol=1e-3, atol=1e-6)
+    np.testing.assert_array_equal(found[0.0][0], found[1e6][0])
+    default = fitted(theta, weights, base, mean, covariance, 10.0)
+    np.testing.assert_array_equal(default[1], found[1.0][1])
+
+
 def test_every_update_of_a_fit_respects_the_bound() -> None:
     simulator, trajectory, _ = problem()
     fit = SimOpt(simulator, budget=150, seed=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,20 @@ import torch
 from torch.func import functional_call
 
 from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.maml import MAML
 from sipe_bayes.inference.regression import _Linear
 from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.likelihood import first_states
 from sipe_bayes.models.mixture_density import MixtureDensity, RandomFourier
 from sipe_bayes.models.statistics import step_statistics
+from sipe_bayes.models.training import Training
 from sipe_bayes.models.transitions import control_steps
-from sipe_bayes.posterior import prior
+from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
-from tests.pendulums import log, pendulum
+from sipe_bayes.trajectory import Trajectories, Trajectory
+from tests.pendulums import DT, log, pendulum
+from tests.quick import FORM
 
 TRUTH = [0.6, 0.05]
 
@@ -85,8 +89,7 @@ def test_no_more_is_simulated_than_the_budget_says(name: str) -> None:
     """Two logs in turn, counted where they are simulated."""
     simulator = Counting()
     logs = [log(simulator, TRUTH, k, steps=60) for k in (1, 2)]
-    settings = {"iterations": 20} if name == "maml" else {}
-    estimator = get_estimator(simulator, name, budget=150, **settings)
+    estimator = get_estimator(simulator, name, **{**FORM.get(name, {}), "budget": 150})
     simulator.lanes = 0
     windows = -(-60 // 50)
     for k in range(30):
@@ -124,13 +127,33 @@ def test_statistics_against_plain_loops() -> None:
 def test_bayessim_narrows_around_the_truth(settings: dict[str, Any]) -> None:
     """Each variant: the truth within 3 sd, both sds below the prior's."""
     simulator = pendulum()
-    estimator = get_estimator(simulator, "bayessim", budget=400, seed=0, **settings)
+    estimator = get_estimator(
+        simulator, "bayessim", budget=400, seed=0, training=Training(learning_rate=3e-3), **settings
+    )
     posterior = estimator.fit(log(simulator, TRUTH, 1, steps=150))
     truth = simulator.space.normalise(np.array(TRUTH))
     print(settings, posterior.mean, posterior.stddev, truth)
     assert (np.abs(posterior.mean.numpy() - truth) < 3 * posterior.stddev.numpy()).all()
     assert (posterior.stddev.numpy() < 0.2).all()
     assert estimator.amortised == ("rounds" not in settings)
+
+
+@pytest.mark.parametrize(("truncated", "count"), [(1e-2, 500), (1e-4, 500), (1e-4, 5000)])
+def test_proposals_of_a_tiny_region_have_the_priors_density(
+    truncated: float, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A posterior of sd 0.002: uniform over the ellipse, whose squared radius is uniform then: its mean within 5 standard errors
+    of half the largest, of as many as are different. Weighted draws without replacement are not (measured: 0.36 and 0.26 at 1e-4)."""
+    simulator = pendulum()
+    found = GaussianMixture([0.0], [[0.5, 0.5]], [0.002**2 * np.eye(2)], simulator.space)
+    estimator = get_estimator(simulator, "bayessim", rounds=2, truncated=truncated)
+    monkeypatch.setattr(type(estimator), "infer", lambda *_: found)
+    theta = estimator._propose({"round": 1}, count, Trajectories.stack(log(simulator, TRUTH, 1, steps=60)))
+    square = ((theta - 0.5) ** 2).sum(1)
+    different = len(np.unique(theta, axis=0))
+    print(truncated, different, square.mean() / square.max())
+    assert abs(square.mean() / square.max() - 0.5) < 5 * np.sqrt(1 / 12 / different)
+    assert (different < count) == any("different ones" in w for w in estimator.warnings)
 
 
 def test_the_mixture_density_is_that_of_its_mixture() -> None:
@@ -202,3 +225,71 @@ def test_maml_without_gradient_steps_simulates_nothing_more() -> None:
         assert estimator.rollouts == 100
         assert estimator.reserved == reserved
     assert simulator.lanes == 200
+
+
+def trained(name: str = "abc") -> tuple[Simulator, Estimator, Trajectory]:
+    simulator = pendulum()
+    recorded = log(simulator, TRUTH, 1, steps=60)
+    estimator = get_estimator(simulator, name, budget=100, **FORM.get(name, {}))
+    estimator.fit(recorded)
+    return simulator, estimator, recorded
+
+
+def again(simulator: Simulator, actions: np.ndarray, angle: float = 0.0, states: bool = False) -> Trajectory:
+    """A log of another theta under given actions from a given angle."""
+    start = simulator.default_state()
+    start[1] = angle
+    motion = simulator.rollout(np.array([0.8, 0.3]), actions, start, dt=DT)
+    seen = motion.observations[0] + 0.01 * np.random.default_rng(5).standard_normal(motion.observations[0].shape)
+    assert motion.states is not None
+    return Trajectory(seen, actions, DT, motion.states[0] if states else None, "again", simulator.environment.channels)
+
+
+@pytest.mark.parametrize("name", ["abc", "npe"])
+def test_a_log_of_the_same_experiment_needs_no_other_simulations(name: str) -> None:
+    simulator, estimator, recorded = trained(name)
+    estimator.get_parameter_estimate(again(simulator, recorded.actions))
+    assert not any("another experiment" in w for w in estimator.warnings), estimator.warnings
+
+
+@pytest.mark.parametrize("name", ["abc", "npe"])
+@pytest.mark.parametrize("what", ["actions", "starting states", "number or lengths"])
+def test_a_log_of_another_experiment_is_named(name: str, what: str) -> None:
+    simulator, estimator, recorded = trained(name)
+    logs = {
+        "actions": again(simulator, recorded.actions + 0.05),
+        "starting states": again(simulator, recorded.actions, angle=0.5),
+        "number or lengths": again(simulator, recorded.actions[:50]),
+    }
+    estimator.get_parameter_estimate(logs[what])
+    said = [w for w in estimator.warnings if "another experiment; fit again" in w]
+    assert len(said) == 1, estimator.warnings
+    assert f"the log's {what} differ" in said[0]
+
+
+def test_recorded_starting_states_are_compared_exactly() -> None:
+    """A velocity does not show in the first sample of an angle."""
+    simulator = pendulum()
+    actions = log(simulator, TRUTH, 1, steps=60).actions
+    estimator = get_estimator(simulator, "abc", budget=100)
+    whole = again(simulator, actions, states=True)
+    estimator.fit(whole)
+    estimator.get_parameter_estimate(whole)
+    assert not any("another experiment" in w for w in estimator.warnings)
+    assert whole.states is not None
+    moving = whole.states.copy()
+    moving[:, 2] += 0.1
+    estimator.get_parameter_estimate(replace(whole, states=moving))
+    assert any("starting states differ" in w for w in estimator.warnings)
+
+
+def test_an_estimate_in_between_simulates_nothing_more() -> None:
+    """Trained on what was simulated, it speaks of another log, and says that it is of another experiment."""
+    simulator = Counting()
+    one, other = (log(simulator, TRUTH, k, steps=60) for k in (1, 2))
+    estimator = get_estimator(simulator, "abc", budget=150)
+    estimator.update_parameter_estimate(one)
+    simulator.lanes = 0
+    estimator.get_parameter_estimate(other)
+    assert simulator.lanes == 0
+    assert any("the log's actions differ" in w for w in estimator.warnings)

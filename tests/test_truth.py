@@ -9,19 +9,10 @@ import pytest
 import torch
 
 from sipe_bayes.inference import get_estimator
+from tests import quick
 from tests.linear_gaussian import carts_problem, function_problem, squared_function, squared_rod
 
-SMALL: dict[str, dict[str, Any]] = {
-    "npe": {
-        "embedding": "none",
-        "transforms": 2,
-        "hidden": 24,
-        "batch_size": 50,
-        "learning_rate": 3e-3,
-        "max_epochs": 60,
-    },
-    "bayessim": {"components": 2},
-}
+SMALL = {**quick.SMALL, "bayessim": {"components": 2}}
 
 
 @pytest.mark.parametrize("name", ["laplace", "mcmc", "npe", "bayessim"])

@@ -13,6 +13,12 @@ Compared with uniform by the largest deviation of the empirical distribution, on
 probability there, calibrated by simulation; its simultaneous band is that of T. Sailynoja, P.-C. Burkner, A. Vehtari 2022,
 "Graphical test for discrete uniformity", https://arxiv.org/abs/2103.10522.
 
+sbi has these checks too (``sbi.diagnostics``) and is not called, because it would lose what is said here. Its ``run_sbc`` and
+``run_tarp`` draw from sbi's own posteriors and x; under them, ranks are counts without ties broken, so that particles of unequal
+weights and points pile up, and TARP is a histogram between the smallest and the largest credibility, whose ``check_tarp`` compares
+two curves of bins by Kolmogorov-Smirnov as if bins were independent draws: its p-value does not depend on the number of
+truths. On the same draws ours are theirs (tested): the counts of ranks exactly, TARP's curve up to its bins.
+
 Deviations: masses are those of ``draws`` draws, a tie or a gap between draws broken at random, which makes them exactly
 uniform for a right posterior; TARP's references are uniform in the cube. A method that returns the prior passes all three:
 look at contraction too. Draws of an ill-mixed chain fail though their distribution be right.

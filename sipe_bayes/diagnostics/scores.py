@@ -12,12 +12,14 @@ that they are, weights included. Otherwise CRPS_j = 2 int (1[theta*_j < q_a] - a
 the midpoint rule, and the energy score from draws, without bias (C. Ferro 2014, "Fair scores for ensemble forecasts").
 
 Mind: the prior's mean is a perfect guess of a truth at the centre of the range, and out of distribution, where the truth lies
-outside the support, only CRPS, energy score, ``distance`` and ``noticed`` mean anything.
+outside the support, only CRPS, energy score, ``distance`` and ``noticed`` mean anything. A truth more than a whole range away is
+scored with a warning: it is most often physical values where theta is expected.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -36,6 +38,7 @@ FloatArray = NDArray[np.float64]
 LEVELS = (0.5, 0.9, 0.95)  # of the central intervals
 _QUANTILES = 400
 _DRAWS = 2000
+_FAR = 1.5  # from the centre: a whole range beyond a bound
 
 
 @dataclass(frozen=True)
@@ -96,8 +99,10 @@ class Scores:
 
 def score(posterior: Posterior, truth: Any, prior: Posterior | None = None) -> Scores:
     """Scores of a posterior against the truth (N,) in theta, which may lie outside [0, 1]. prior: what was believed before,
-    default what the parameters say. The same posterior has the same scores. Raises ValueError for another truth."""
+    default what the parameters say. The same posterior has the same scores. Raises ValueError for another truth, and warns of one
+    that is more than the range of a parameter away from its bounds."""
     theta = _checked(posterior, truth)
+    _warn_if_far(posterior, theta)
     before = default_prior(posterior.space) if prior is None else prior
     if before.space.names != posterior.space.names:
         raise ValueError(f"prior: expected parameters {list(posterior.space.names)}, got {list(before.space.names)}")
@@ -195,10 +200,26 @@ def c2st(posterior: Posterior, reference: Any, seed: int = 0) -> float:
 
 
 def _checked(posterior: Posterior, truth: Any) -> FloatArray:
-    theta = posterior.space.check_shape(truth.numpy() if isinstance(truth, torch.Tensor) else truth)
+    if not isinstance(posterior, Posterior):
+        raise ValueError(f"posterior: expected one, as fit(...) returns, got a {type(posterior).__name__}")
+    try:
+        theta = posterior.space.check_shape(truth.numpy() if isinstance(truth, torch.Tensor) else truth)
+    except ValueError as error:
+        raise ValueError(f"truth: {error}; give theta, space.normalise(values)") from None
     if theta.ndim != 1 or not np.isfinite(theta).all():
         raise ValueError(f"truth: expected {len(posterior.space)} finite numbers in theta, got {theta.tolist()}")
     return theta
+
+
+def _warn_if_far(posterior: Posterior, theta: FloatArray) -> None:
+    j = int(np.abs(theta - 0.5).argmax())
+    if abs(theta[j] - 0.5) > _FAR:
+        warnings.warn(
+            f"truth: theta of {posterior.space.names[j]} is {theta[j]:.4g}, far outside [0, 1]; physical values become theta by "
+            "space.normalise(values)",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _covered(posterior: Posterior, theta: FloatArray, level: float) -> tuple[bool, ...]:

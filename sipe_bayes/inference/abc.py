@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import positive
 from sipe_bayes.inference.prior_sampling import PriorSampling
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
@@ -46,9 +47,9 @@ class ABC(PriorSampling):
 
     def __init__(self, simulator: Any, *, accepted: float = 0.05, regression: bool = False, **settings: Any) -> None:
         super().__init__(simulator, **settings)
-        if not 0 < accepted <= 1:
+        self.accepted, self.regression = positive("accepted", accepted), bool(regression)
+        if self.accepted > 1:
             raise ValueError(f"accepted: expected a fraction above 0 and at most 1, got {accepted}; try 0.05")
-        self.accepted, self.regression = float(accepted), bool(regression)
 
     def settings(self) -> dict[str, Any]:
         return {**super().settings(), "accepted": self.accepted, "regression": self.regression}

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import rankdata
 
+from sipe_bayes.checks import positive, whole
 from sipe_bayes.inference.gaussian_search import Search
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import Particles
@@ -41,17 +42,14 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_POOL_STEPS = 10  # of the latest, whose draws take part
-_LEAST_SPREAD = 0.005
-_LONGEST_MOVE = 1.0  # of a particle in a step, in units of the spread
-_RIDGE = 0.1
-
 
 class ADR(Search):
     """Particles of equal weights where they stand; ``state["paths"]`` (steps + 1, M, N) is where they went.
 
     particles: how many. temperature: alpha, for rewards as centred ranks. step_size: of the particles. exploration: sd of their
-    policies in units of the particles' spread. reward: see ``Search``.
+    policies in units of the particles' spread. pool_steps: the latest steps whose draws take part. least_spread: floor of the
+    spread, in theta. longest_move: of a particle in a step, in units of the spread. ridge: of the gradients' regression, in
+    units of the draws' mean variance. reward: see ``Search``.
     """
 
     name: ClassVar[str] = "adr"
@@ -65,20 +63,22 @@ class ADR(Search):
         temperature: float = 0.03,
         step_size: float = 0.5,
         exploration: float = 0.5,
+        pool_steps: int = 10,
+        least_spread: float = 0.005,
+        longest_move: float = 1.0,
+        ridge: float = 0.1,
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        if particles < 2:
-            raise ValueError(f"particles: expected at least 2, got {particles}")
-        for name, value in (("temperature", temperature), ("step_size", step_size), ("exploration", exploration)):
-            if not value > 0:
-                raise ValueError(f"{name}: expected a positive number, got {value}")
-        self.particles, self.temperature = particles, temperature
-        self.step_size, self.exploration = step_size, exploration
+        self.particles, self.temperature = whole("particles", particles, 2), positive("temperature", temperature)
+        self.step_size, self.exploration = positive("step_size", step_size), positive("exploration", exploration)
+        self.pool_steps, self.least_spread = whole("pool_steps", pool_steps), positive("least_spread", least_spread)
+        self.longest_move, self.ridge = positive("longest_move", longest_move), positive("ridge", ridge)
 
     def settings(self) -> dict[str, Any]:
         own = ("particles", "temperature", "step_size", "exploration")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
+        limits = ("pool_steps", "least_spread", "longest_move", "ridge")
+        return {**super().settings(), **{name: getattr(self, name) for name in own + limits}}
 
     def start(self, trajectories: Trajectories) -> State:
         state = self.empty_pool(trajectories)
@@ -96,21 +96,21 @@ class ADR(Search):
         if not self.affordable(1, trajectories):
             return {**state, "done": True}
         particles = state["paths"][-1]
-        spread = np.maximum(particles.std(0), _LEAST_SPREAD)
+        spread = np.maximum(particles.std(0), self.least_spread)
         random = self.random(state)
         noise = self.exploration * spread * random.standard_normal(particles.shape)
         count = self.affordable(self.particles, trajectories)
         chosen = random.permutation(self.particles)[:count]
         theta = _folded(particles + noise)[chosen]
-        state = self.evaluated(state, theta, trajectories, _POOL_STEPS * self.particles)
+        state = self.evaluated(state, theta, trajectories, self.pool_steps * self.particles)
         moved = particles
         if np.isfinite(state["pool_reward"]).sum() > 1:
             utility = centred_ranks(state["pool_reward"])
             z = particles / spread
-            gradients = policy_gradients(z, state["pool_theta"] / spread, utility)
+            gradients = policy_gradients(z, state["pool_theta"] / spread, utility, self.ridge)
             move = self.step_size * stein_direction(z, gradients / self.temperature)
             length = np.linalg.norm(move, axis=1, keepdims=True)
-            move *= np.minimum(1.0, _LONGEST_MOVE / np.maximum(length, 1e-300))
+            move *= np.minimum(1.0, self.longest_move / np.maximum(length, 1e-300))
             moved = np.clip(particles + spread * move, 0.0, 1.0)
         paths = np.concatenate([state["paths"], moved[None]])
         return {**state, "paths": paths, "done": not self.affordable(1, trajectories)}
@@ -135,10 +135,10 @@ def centred_ranks(reward: FloatArray) -> FloatArray:
     return ranks / max(len(reward) - 1, 1) - 0.5
 
 
-def policy_gradients(particles: FloatArray, theta: FloatArray, utility: FloatArray) -> FloatArray:
+def policy_gradients(particles: FloatArray, theta: FloatArray, utility: FloatArray, ridge: float = 0.1) -> FloatArray:
     """grad J (M, N) at particles (M, N) from draws theta (n, N) with utility (n,): local weighted ridge regression."""
     wanted = min(2.0 * (theta.shape[1] + 1), 0.9 * len(theta))
-    return np.stack([_slope(theta - particle, utility, wanted) for particle in particles])
+    return np.stack([_slope(theta - particle, utility, wanted, ridge) for particle in particles])
 
 
 def stein_direction(particles: FloatArray, scores: FloatArray) -> FloatArray:
@@ -154,7 +154,7 @@ def stein_direction(particles: FloatArray, scores: FloatArray) -> FloatArray:
     return out
 
 
-def _slope(offset: FloatArray, utility: FloatArray, wanted: float) -> FloatArray:
+def _slope(offset: FloatArray, utility: FloatArray, wanted: float, ridge: float) -> FloatArray:
     """Slope (N,) of utility (n,) at offset (n, N) zero, from ``wanted`` effective draws around it."""
     square = (offset**2).sum(1)
     square = square - square.min()
@@ -170,7 +170,7 @@ def _slope(offset: FloatArray, utility: FloatArray, wanted: float) -> FloatArray
     centre = weights @ offset
     centred = offset - centre
     moment = centred.T @ (weights[:, None] * centred)
-    ridge = _RIDGE * max(float(np.trace(moment)) / len(centre), 1e-12)
+    ridge *= max(float(np.trace(moment)) / len(centre), 1e-12)
     slope: FloatArray = np.linalg.solve(
         moment + ridge * np.eye(len(centre)), centred.T @ (weights * (utility - weights @ utility))
     )

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.callable_simulator import CallableSimulator
+from sipe_bayes.checks import whole
 from sipe_bayes.demonstration import Given
 from sipe_bayes.inference.state import State, load_state, save_state
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
@@ -81,14 +82,19 @@ class Estimator(ABC):
         checkpoint: str | Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        if budget is not None and budget < 1:
-            raise ValueError(f"budget: expected at least 1 rollout, got {budget}")
+        if not isinstance(simulator, Simulator | CallableSimulator):
+            raise ValueError(
+                f"simulator: expected a Simulator or a CallableSimulator, got {simulator!r}; sipe.get_estimator takes the "
+                "name of an environment as well"
+            )
+        if prior is not None and not isinstance(prior, Posterior):
+            raise ValueError(f"prior: expected a posterior with a density, such as load_posterior(path), got {prior!r}")
         self.simulator, self.space = simulator, simulator.space
         self.prior = default_prior(self.space) if prior is None else prior
         if self.prior.space.names != self.space.names or not self.prior.has_density:
             raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
-        self.budget = self.default_budget if budget is None else int(budget)
-        self.seed, self.likelihood = int(seed), likelihood or _default_likelihood(simulator)
+        self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
+        self.seed, self.likelihood = whole("seed", seed, 0), likelihood or _default_likelihood(simulator)
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.progress = progress
         self.rollouts = 0
@@ -182,7 +188,9 @@ class Estimator(ABC):
             if sharp and min(m, 1 - m) < AT_BOUND
         ]
         if at:
-            said = f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
+            said = (
+                f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
+            )
             self.warnings.append(said)
             self.diagnostics["at_bound"] = said
         return posterior

@@ -44,21 +44,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sipe_bayes.callable_simulator import CallableSimulator
+from sipe_bayes.checks import at_least, positive, whole
 from sipe_bayes.discrepancy import StateDifference, simulate
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Windows
 from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
 from sipe_bayes.posterior import IndependentPrior, SurrogatePosterior
-from sipe_bayes.posterior.surrogate import log_acceptance
+from sipe_bayes.posterior.surrogate import EFFECTIVE, MOST_STEPS, log_acceptance
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
 ACQUISITIONS = ("upper_confidence_bound", "expected_improvement")
 _FEWEST = 4  # evaluations below which there is nothing to fit
-_GROWTH = 1.2  # of the data between fits of the hyper-parameters
-_POOL = 256  # random candidates and as many changed ones
 _PARENTS, _CHANGED = 5, 10  # best points that are changed, coordinates that change
 _CLIMBS, _CLIMB_STEPS = 3, 20  # candidates that climb together, iterations of L-BFGS
 _CHECKED = 2000  # draws of the prior from which one of the posterior is picked
@@ -76,7 +75,9 @@ class BayesOpt(Estimator):
     evaluations of the quasi-random design that comes first, default 2 (N + 1), never more than half of what the budget affords.
     batch: evaluations of one step. checks: share of them that are drawn from the posterior. floor: added to the cost before its
     logarithm, in squared spreads of the channels: without one the valley is so sharp that the process's lengthscales become
-    short and the posterior's tails heavy. epsilon: the threshold as a cost, default by the residuals at the best theta.
+    short and the posterior's tails heavy. epsilon: the threshold as a cost, default by the residuals at the best theta. growth: of
+    the data between two fits of the process's hyper-parameters. pool: random points, and as many changed ones, that a candidate
+    starts from. effective_draws, most_steps: of the posterior's chains, which end at the first or the second.
     """
 
     name: ClassVar[str] = "bayesopt"
@@ -93,25 +94,29 @@ class BayesOpt(Estimator):
         checks: float = 0.25,
         floor: float = 1e-2,
         epsilon: float | None = None,
+        growth: float = 1.2,
+        pool: int = 256,
+        effective_draws: float = EFFECTIVE,
+        most_steps: int = MOST_STEPS,
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
         if acquisition not in ACQUISITIONS:
             raise ValueError(f"acquisition: expected one of {', '.join(ACQUISITIONS)}, got {acquisition!r}")
-        for name, value, least in (("kappa", kappa, 0), ("xi", xi, 0), ("batch", batch, 1), ("initial", initial, 2)):
-            if value is not None and not value >= least:
-                raise ValueError(f"{name}: expected at least {least}, got {value}")
-        if not 0 <= checks < 1:
+        self.acquisition, self.kappa, self.xi = acquisition, at_least("kappa", kappa, 0), at_least("xi", xi, 0)
+        if at_least("checks", checks, 0) >= 1:
             raise ValueError(f"checks: expected a share of the evaluations in [0, 1), got {checks}")
-        for name, number in (("floor", floor), ("epsilon", epsilon)):
-            if number is not None and not 0 < number < math.inf:
-                raise ValueError(f"{name}: expected a positive number, got {number}")
-        self.acquisition, self.kappa, self.xi, self.initial = acquisition, float(kappa), float(xi), initial
-        self.batch, self.checks, self.floor, self.epsilon = int(batch), float(checks), float(floor), epsilon
+        self.initial = None if initial is None else whole("initial", initial, 2)
+        self.batch, self.checks, self.floor = whole("batch", batch), float(checks), positive("floor", floor)
+        self.epsilon = None if epsilon is None else positive("epsilon", epsilon)
+        self.growth, self.pool = at_least("growth", growth, 1), whole("pool", pool, _CLIMBS)
+        self.effective_draws = positive("effective_draws", effective_draws)
+        self.most_steps = whole("most_steps", most_steps, 20)
 
     def settings(self) -> dict[str, Any]:
         own = ("acquisition", "kappa", "xi", "initial", "batch", "checks", "floor", "epsilon")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
+        effort = ("growth", "pool", "effective_draws", "most_steps")
+        return {**super().settings(), **{name: getattr(self, name) for name in own + effort}}
 
     def start(self, trajectories: Trajectories) -> State:
         self.windows(trajectories)
@@ -151,11 +156,13 @@ class BayesOpt(Estimator):
     def posterior(self, state: State, trajectories: Trajectories) -> SurrogatePosterior:
         if not np.isfinite(state["cost"]).any():
             raise ValueError(
-                f"bayesopt: none of {len(state['cost'])} simulations stayed finite; narrow the bounds or shorten the "
-                "model's timestep"
+                f"bayesopt: all of {len(state['cost'])} simulations {self.simulator.failure}; narrow the bounds, or mend the "
+                "simulation"
             )
         process = self._process(state)
-        found = SurrogatePosterior.sampled(process, self._threshold(state, process), self.prior, self.seed)
+        found = SurrogatePosterior.sampled(
+            process, self._threshold(state, process), self.prior, self.seed, self.effective_draws, self.most_steps
+        )
         known = trajectories.states is not None or isinstance(self.simulator, CallableSimulator)
         self._report(state, process, found, known)
         return found
@@ -202,7 +209,7 @@ class BayesOpt(Estimator):
     def _fitted(self, state: State) -> State:
         """``state`` with new hyper-parameters where the data have grown enough."""
         count = len(state["theta"])
-        if count < _GROWTH * state["fitted"]:
+        if count < self.growth * state["fitted"]:
             return state
         previous = self._process(state) if state["fitted"] else None
         process = fit_gaussian_process(torch.from_numpy(state["theta"]), self._values(state), self.seed, previous)
@@ -243,14 +250,14 @@ class BayesOpt(Estimator):
     def _pool(
         self, process: GaussianProcess, low: FloatArray, high: FloatArray, rng: np.random.Generator
     ) -> FloatArray:
-        """Random points of the box, and the best evaluated points changed in a few coordinates (2 _POOL, N)."""
+        """Random points of the box, and the best evaluated points changed in a few coordinates (2 ``pool``, N)."""
         n = len(low)
-        everywhere = rng.uniform(low, high, (_POOL, n))
+        everywhere = rng.uniform(low, high, (self.pool, n))
         best = process.x[process.y.argsort(stable=True)[:_PARENTS]].numpy()
-        parents = best[rng.integers(len(best), size=_POOL)]
-        changed = rng.random((_POOL, n)) < min(1.0, _CHANGED / n)
-        reach = (high - low) * 10 ** rng.uniform(-3, -0.5, (_POOL, 1))
-        return np.concatenate([everywhere, parents + changed * reach * rng.standard_normal((_POOL, n))])
+        parents = best[rng.integers(len(best), size=self.pool)]
+        changed = rng.random((self.pool, n)) < min(1.0, _CHANGED / n)
+        reach = (high - low) * 10 ** rng.uniform(-3, -0.5, (self.pool, 1))
+        return np.concatenate([everywhere, parents + changed * reach * rng.standard_normal((self.pool, n))])
 
     def _merit(self, process: GaussianProcess, theta: Tensor) -> Tensor:
         """What a candidate maximises (B,) of theta (B, N)."""
@@ -314,10 +321,12 @@ class BayesOpt(Estimator):
             )
         at = [n for n, x in zip(self.space.names, found.best.tolist(), strict=True) if min(x, 1 - x) < _AT_BOUND]
         if at:
-            doubts.append(f"the best point has {', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds")
+            doubts.append(
+                f"the best point has {', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds"
+            )
         if diverged:
             doubts.append(
-                f"{diverged} of {count} simulations diverged and count as the worst finite cost: narrow the bounds"
+                f"{diverged} of {count} simulations {self.simulator.failure} and count as the worst finite cost: narrow the bounds"
             )
         if mixing["rhat"] > _MIXED_RHAT or mixing["ess"] < _MIXED_ESS:
             doubts.append(

@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from sipe_bayes.checks import whole
 from sipe_bayes.inference.rounds import Rounds
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
@@ -33,14 +34,15 @@ from sipe_bayes.models.transitions import StepEmbedding, control_steps
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.trajectory import Trajectories
 
-_WIDTH = {"mlp": 24, "random_fourier": 500}
-_LEARNED = 32  # summaries
+_HIDDEN: dict[str, int] = {"mlp": 24, "random_fourier": 500}  # where none is given
 
 
 class BayesSim(Rounds):
     """A GaussianMixture; see the module's docstring.
 
-    components: of the mixture. training: of the network, ``models.training.Training``. device: where it is trained.
+    components: of the mixture. hidden: units of each of the network's two layers, default 24, or of its random features, default
+    500. summary_features, summary_hidden: of ``summary="learned"``: numbers it makes of a log, units of its layers. training: of
+    the network, ``models.training.Training``. device: where it is trained.
     """
 
     name: ClassVar[str] = "bayessim"
@@ -52,24 +54,30 @@ class BayesSim(Rounds):
         components: int = 5,
         features: Features = "mlp",
         summary: str = "statistics",
+        hidden: int | None = None,
+        summary_features: int = 32,
+        summary_hidden: int = 64,
         training: Training | None = None,
         device: str = "cpu",
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        if components < 1:
-            raise ValueError(f"components: expected at least 1, got {components}")
         for name, value, known in (
             ("features", features, get_args(Features)),
             ("summary", summary, ("statistics", "learned")),
         ):
             if value not in known:
                 raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
-        self.components, self.features, self.summary = components, features, summary
+        if training is not None and not isinstance(training, Training):
+            raise ValueError(f"training: expected models.training.Training(...), got a {type(training).__name__}")
+        self.components, self.features, self.summary = whole("components", components), features, summary
+        self.hidden = whole("hidden", _HIDDEN[features] if hidden is None else hidden, 2)
+        self.summary_features = whole("summary_features", summary_features)
+        self.summary_hidden = whole("summary_hidden", summary_hidden)
         self.training, self.device = training or Training(), check_device(device)
 
     def settings(self) -> dict[str, Any]:
-        own = ("components", "features", "summary", "device")
+        own = ("components", "features", "summary", "hidden", "summary_features", "summary_hidden", "device")
         return {**super().settings(), **{name: getattr(self, name) for name in own}, "training": asdict(self.training)}
 
     def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
@@ -114,11 +122,13 @@ class BayesSim(Rounds):
     def _network(self, trajectories: Trajectories) -> _Summarised:
         environment = self.simulator.environment
         o, a = len(environment.channels), environment.num_actions
-        embedding = StepEmbedding(2 * o + a, _LEARNED) if self.summary == "learned" else None
-        size = _LEARNED if embedding is not None else o * a + 2 * o
-        density = MixtureDensity(
-            size, len(self.space), self.components, self.features, _WIDTH[self.features], self.seed
-        )
+        embedding, size = None, o * a + 2 * o
+        if self.summary == "learned":
+            embedding, size = (
+                StepEmbedding(2 * o + a, self.summary_features, self.summary_hidden),
+                self.summary_features,
+            )
+        density = MixtureDensity(size, len(self.space), self.components, self.features, self.hidden, self.seed)
         return _Summarised(embedding, density)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import positive, share, whole
 from sipe_bayes.inference.gaussian_search import Search, draw_in_cube
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import Particles
@@ -32,14 +33,13 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-10
-_CONVERGED_SD = 1e-4
 
 
 class CEM(Search):
     """The last elites as Particles of equal weights, the best of them as mode.
 
     population: simulated in each generation, default 12 + 4 N. elites: share of the population. smoothing: share of the way to the
-    elites' mean and covariance that a generation goes.
+    elites' mean and covariance that a generation goes. converged_sd: of every parameter, in theta, where the search ends.
     """
 
     name: ClassVar[str] = "cem"
@@ -53,19 +53,19 @@ class CEM(Search):
         population: int | None = None,
         elites: float = 0.25,
         smoothing: float = 0.6,
+        converged_sd: float = 1e-4,
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        if population is not None and population < 4:
-            raise ValueError(f"population: expected at least 4, got {population}")
         for name, value in (("elites", elites), ("smoothing", smoothing)):
-            if not 0 < value <= 1:
-                raise ValueError(f"{name}: expected a share in (0, 1], got {value}")
-        self.population = 12 + 4 * len(self.space) if population is None else population
+            if value != 1:
+                share(name, value)
+        self.population = whole("population", 12 + 4 * len(self.space) if population is None else population, 4)
         self.elites, self.smoothing = elites, smoothing
+        self.converged_sd = positive("converged_sd", converged_sd)
 
     def settings(self) -> dict[str, Any]:
-        own = ("population", "elites", "smoothing")
+        own = ("population", "elites", "smoothing", "converged_sd")
         return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def start(self, trajectories: Trajectories) -> State:
@@ -94,7 +94,7 @@ class CEM(Search):
         for name in ("pool_theta", "pool_reward", "pool_draw"):
             state = {**state, name: state[name][kept]}
         state = self._fit(state)
-        converged = bool(state["generations"]) and bool((np.diag(state["covariance"]) < _CONVERGED_SD**2).all())
+        converged = bool(state["generations"]) and bool((np.diag(state["covariance"]) < self.converged_sd**2).all())
         return {**state, "done": converged or not self.affordable(1, trajectories)}
 
     def _draw(self, state: State, count: int) -> FloatArray:

@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from sipe_bayes.checks import positive, whole
 from sipe_bayes.discrepancy import StateDifference, simulate
 from sipe_bayes.inference.base import Estimator, Recorded
 from sipe_bayes.inference.state import State
 from sipe_bayes.learned_reward import LearnedReward
 from sipe_bayes.likelihood import BudgetExhausted
-from sipe_bayes.posterior.truncated_normal import interval_quantile
+from sipe_bayes.models.discriminator import HIDDEN
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior.truncated_normal import interval_quantile
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -34,7 +36,8 @@ class Search(Estimator):
     """Base of the methods that simulate where they expect good rewards.
 
     reward: "state_difference", minus the cost of ``discrepancy.StateDifference``, or "learned", a discriminator's (see
-    ``learned_reward``) whose Adam has ``learning_rate``. The State holds pool_theta (P, N), pool_reward (P,), -inf where the simulation diverged,
+    ``learned_reward``), with two layers of ``discriminator_hidden`` units, which takes ``discriminator_updates`` steps of Adam, of
+    ``learning_rate`` and on batches of ``discriminator_batch``, after each draw. The State holds pool_theta (P, N), pool_reward (P,), -inf where the simulation diverged,
     pool_draw (P,), the number of the draw that each came from, and, with learned rewards, pool_features (P, M, F) and the
     discriminator.
     """
@@ -43,25 +46,37 @@ class Search(Estimator):
     rewards: ClassVar[tuple[str, ...]] = REWARDS
 
     def __init__(
-        self, simulator: Any, *, reward: str = "state_difference", learning_rate: float = 0.001, **settings: Any
+        self,
+        simulator: Any,
+        *,
+        reward: str = "state_difference",
+        learning_rate: float = 0.001,
+        discriminator_batch: int = 320,
+        discriminator_updates: int = 30,
+        discriminator_hidden: int = HIDDEN,
+        **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
         if reward not in self.rewards:
             raise ValueError(f"reward: expected one of {', '.join(self.rewards)}, got {reward!r}")
-        if not learning_rate > 0:
-            raise ValueError(f"learning_rate: expected a positive number, got {learning_rate}")
-        self.reward, self.learning_rate = reward, learning_rate
+        self.reward, self.learning_rate = reward, positive("learning_rate", learning_rate)
+        self.discriminator_batch = whole("discriminator_batch", discriminator_batch, 2)
+        self.discriminator_updates = whole("discriminator_updates", discriminator_updates)
+        self.discriminator_hidden = whole("discriminator_hidden", discriminator_hidden)
         self._learned: tuple[Trajectories, LearnedReward] | None = None
 
     def fit(self, trajectories: Recorded) -> Posterior:
         """As ``Estimator.fit``; a warning if a prior was given, which a search does not use."""
         found = super().fit(trajectories)
         if (self.prior.gaussian_moments()[1].diagonal() < 1).any():  # a uniform prior counts as enormously wide
-            self.warnings.append(f"{self.name} searches within the bounds and does not use the prior; bayesopt and npe do")
+            self.warnings.append(
+                f"{self.name} searches within the bounds and does not use the prior; bayesopt and npe do"
+            )
         return found
 
     def settings(self) -> dict[str, Any]:
-        return {**super().settings(), "reward": self.reward, "learning_rate": self.learning_rate}
+        own = ("reward", "learning_rate", "discriminator_batch", "discriminator_updates", "discriminator_hidden")
+        return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def empty_pool(self, trajectories: Trajectories) -> State:
         """The pool's entries before the first simulation."""
@@ -82,7 +97,14 @@ class Search(Estimator):
     def learned(self, trajectories: Trajectories) -> LearnedReward:
         """The discriminator's reward on the trajectories."""
         if self._learned is None or self._learned[0] is not trajectories:
-            made = LearnedReward(self.windows(trajectories), seed=self.seed, learning_rate=self.learning_rate)
+            made = LearnedReward(
+                self.windows(trajectories),
+                seed=self.seed,
+                learning_rate=self.learning_rate,
+                batch=self.discriminator_batch,
+                updates=self.discriminator_updates,
+                hidden=self.discriminator_hidden,
+            )
             self._learned = (trajectories, made)
         return self._learned[1]
 
@@ -138,7 +160,7 @@ class Search(Estimator):
         self.diagnostics["diverged"] = state["diverged"]
         if state["diverged"]:
             self.warn(
-                f"{state['diverged']} of {state['simulated']} simulations diverged and counted as worst; "
+                f"{state['diverged']} of {state['simulated']} simulations {self.simulator.failure} and counted as worst; "
                 "narrow the bounds if they are many"
             )
 

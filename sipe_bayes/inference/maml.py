@@ -25,28 +25,26 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.func import functional_call, grad, vmap
 
+from sipe_bayes.checks import positive, share, whole
 from sipe_bayes.inference.prior_sampling import PriorSampling, recorded_steps
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
-from sipe_bayes.models.training import check_device, restore, split, weights
+from sipe_bayes.models.training import EarlyStopping, check_device, restore, split, weights
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 from sipe_bayes.trajectory import Trajectories
 
 Weights = dict[str, Tensor]
 
-_NEAR = 0.1  # sd of the theta simulated around the estimate
-_STEPS = 40  # control steps of a simulation that enter one gradient
-_HELD_OUT = 0.1
-_ROUND = 50  # outer steps between looks at the held-out tasks
-
 
 class MAML(PriorSampling):
     """A Dirac; see the module's docstring.
 
-    gradient_steps: at test time, 0 or more. neighbours: simulations that one of them takes. hidden: units of both layers.
-    learning_rate: of the inner and the outer loop. tasks: in a meta-batch. iterations: outer steps at most. patience: looks at
-    the held-out tasks, every 50 outer steps, without improvement. device: where meta-training runs.
+    gradient_steps: at test time, 0 or more. neighbours: simulations that one of them takes, their theta drawn around the
+    estimate with sd ``spread`` of the range. hidden: units of both layers. learning_rate: of the inner and the outer loop.
+    tasks: in a meta-batch. steps_per_simulation: control steps that enter one gradient. iterations: outer steps at most. held_out:
+    share of the simulations; patience: looks at them, every ``look_every`` outer steps, without improvement. device: where
+    meta-training runs.
     """
 
     name: ClassVar[str] = "maml"
@@ -58,34 +56,36 @@ class MAML(PriorSampling):
         *,
         gradient_steps: int = 5,
         neighbours: int = 5,
+        spread: float = 0.1,
         hidden: int = 60,
         learning_rate: float = 0.005,
         tasks: int = 10,
+        steps_per_simulation: int = 40,
         iterations: int = 1000,
+        held_out: float = 0.1,
         patience: int = 8,
+        look_every: int = 50,
         device: str = "cpu",
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        counts = {"neighbours": neighbours, "hidden": hidden, "tasks": tasks, "iterations": iterations, "patience": patience}
-        for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
-        if gradient_steps < 0:
-            raise ValueError(f"gradient_steps: expected 0 or more, got {gradient_steps}")
-        if not learning_rate > 0:
-            raise ValueError(f"learning_rate: expected a number above zero, got {learning_rate}")
-        self.gradient_steps, self.neighbours, self.hidden = gradient_steps, neighbours, hidden
-        self.learning_rate, self.tasks, self.iterations = learning_rate, tasks, iterations
-        self.patience, self.device = patience, check_device(device)
+        self.gradient_steps = whole("gradient_steps", gradient_steps, 0)
+        self.neighbours, self.spread = whole("neighbours", neighbours), positive("spread", spread)
+        self.hidden, self.learning_rate = whole("hidden", hidden), positive("learning_rate", learning_rate)
+        self.tasks = whole("tasks", tasks)
+        self.steps_per_simulation = whole("steps_per_simulation", steps_per_simulation)
+        self.iterations, self.held_out = whole("iterations", iterations), share("held_out", held_out)
+        self.patience, self.look_every = whole("patience", patience), whole("look_every", look_every)
+        self.device = check_device(device)
 
     @property
     def reserved(self) -> int:
         return self.gradient_steps * self.neighbours
 
     def settings(self) -> dict[str, Any]:
-        own = ("gradient_steps", "neighbours", "hidden", "learning_rate", "tasks", "iterations", "patience", "device")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
+        own = ("gradient_steps", "neighbours", "spread", "hidden", "learning_rate", "tasks", "iterations")
+        rest = ("steps_per_simulation", "held_out", "patience", "look_every", "device")
+        return {**super().settings(), **{name: getattr(self, name) for name in own + rest}}
 
     def step(self, state: State, trajectories: Trajectories) -> State:
         """A block of simulations, the meta-training, or one gradient step at test time."""
@@ -107,27 +107,24 @@ class MAML(PriorSampling):
             inputs = network.standardise(steps.to(self.device)).nan_to_num()
         good, targets = steps.isfinite().all(-1).float().to(self.device), theta.to(self.device)
         loss = self._meta_loss(network, inputs, targets, good)
-        inside, outside = split(len(theta), _HELD_OUT, generator)
+        inside, outside = split(len(theta), self.held_out, generator)
         parameters = list(network.parameters())
         optimiser = torch.optim.Adam(parameters, self.learning_rate, foreach=True)
-        best, best_weights, waited = np.inf, weights(network), 0
+        stopping = EarlyStopping(network, self.patience, absolute=1e-5)
         for k in range(1, self.iterations + 1):
             chosen = inside[torch.randint(len(inside), (self.tasks,), generator=generator)]
             optimiser.zero_grad(set_to_none=True)
             loss(chosen, inside, generator).mean().backward()
             torch.nn.utils.clip_grad_norm_(parameters, 5.0)
             optimiser.step()
-            if k % _ROUND and k < self.iterations:
+            if k % self.look_every and k < self.iterations:
                 continue
             fixed = torch.Generator().manual_seed(seed)
             now = float(loss(outside[:100], inside, fixed).mean().detach())
-            if now < best - 1e-5:
-                best, best_weights, waited = now, weights(network), 0
-            else:
-                waited += 1
-            if waited >= self.patience:
+            if stopping.stops(now):
                 break
-        return {**best_weights, "held_out_loss": float(best), "iterations": k}
+        stopping.restore()
+        return {**weights(network), "held_out_loss": float(stopping.best), "iterations": k}
 
     def _meta_loss(self, network: _Regressor, inputs: Tensor, theta: Tensor, good: Tensor) -> Any:
         """A function of tasks (t,), the rows their neighbours come from, and a generator: query losses (t,) after the inner
@@ -148,7 +145,9 @@ class MAML(PriorSampling):
             distance = torch.cdist(theta[tasks], theta[pool])
             distance = distance + (tasks[:, None] == pool).to(distance) * 1e6
             near = pool[distance.topk(min(self.neighbours, len(pool) - 1), largest=False).indices.cpu()]
-            picked = torch.randint(inputs.shape[1], (min(_STEPS, inputs.shape[1]),), generator=generator)
+            picked = torch.randint(
+                inputs.shape[1], (min(self.steps_per_simulation, inputs.shape[1]),), generator=generator
+            )
             support = (inputs[near][:, :, picked], theta[near], good[near][:, :, picked])
             query = (inputs[tasks][:, None, picked], theta[tasks][:, None], good[tasks][:, None, picked])
             return batched(dict(network.named_parameters()), support, query)
@@ -161,7 +160,9 @@ class MAML(PriorSampling):
         network = self._network(steps.shape[-1], 0)
         restore(network, state)
         rng = np.random.default_rng([self.seed, 4, state["adapted"]])
-        theta = np.clip(self._estimate(network, steps) + _NEAR * rng.standard_normal((self.neighbours, self.n)), 0, 1)
+        theta = np.clip(
+            self._estimate(network, steps) + self.spread * rng.standard_normal((self.neighbours, self.n)), 0, 1
+        )
         made = self.simulate(theta, trajectories, rng)
         self.rollouts += self.neighbours * len(trajectories)
         if made.valid.any():

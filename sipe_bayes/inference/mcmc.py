@@ -72,9 +72,7 @@ class MCMC(Estimator):
     ) -> None:
         super().__init__(simulator, **settings)
         if self.likelihood.noise == "sandwich":
-            raise ValueError(
-                "noise: 'sandwich' is a width without a likelihood, for laplace only; use 'ar1' with mcmc"
-            )
+            raise ValueError("noise: 'sandwich' is a width without a likelihood, for laplace only; use 'ar1' with mcmc")
         if walkers is not None and walkers < 2 * len(self.space) + 2:
             raise ValueError(f"walkers: expected at least {2 * len(self.space) + 2}, got {walkers}")
         self.walkers, self.effective = walkers, effective
@@ -232,9 +230,7 @@ class MCMC(Estimator):
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
         if not len(state["chain"]):
-            raise ValueError(
-                f"budget: {self.budget} rollouts were not enough for one block of steps; raise it"
-            )
+            raise ValueError(f"budget: {self.budget} rollouts were not enough for one block of steps; raise it")
         n = len(self.space)
         chain = self._kept(state)
         thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
@@ -257,9 +253,7 @@ class MCMC(Estimator):
 
     def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
         target = _Target(self, self.windows(trajectories), state)
-        sd, tau = target.noise(
-            np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None]
-        )
+        sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
         return {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
 
     def _linearisation_error(self, state: State, trajectories: Trajectories) -> float:
@@ -324,16 +318,10 @@ class _Target:
 
     def noise(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """sd and tau (B, C) of walkers."""
-        logs = np.tile(
-            np.log(np.maximum(np.concatenate([self.fit["sd"], self.fit["tau"]]), 1e-300)), (len(points), 1)
-        )
+        logs = np.tile(np.log(np.maximum(np.concatenate([self.fit["sd"], self.fit["tau"]]), 1e-300)), (len(points), 1))
         logs[:, self.free] = points[:, self.n :]
         channels = len(self.fit["sd"])
-        tau = (
-            np.exp(logs[:, channels:])
-            if self.owner.likelihood.noise == "ar1"
-            else np.zeros((len(points), channels))
-        )
+        tau = np.exp(logs[:, channels:]) if self.owner.likelihood.noise == "ar1" else np.zeros((len(points), channels))
         return np.exp(logs[:, :channels]), tau
 
     def __call__(self, points: FloatArray) -> FloatArray:

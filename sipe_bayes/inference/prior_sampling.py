@@ -1,7 +1,8 @@
 """What the estimators that learn from simulations of the prior share: regression, MAML, BayesSim, NPE, ABC.
 
-Simulating goes block by block, kept in the cache; then the method trains once on what is valid. The trained state
-conditions on other trajectories, if their actions and starting states are those of the training's.
+Simulating goes block by block, kept in the cache; then the method trains once on what is valid. Simulations replay the
+actions of the log in hand from its starts, so the trained state conditions on other trajectories if they have the same: of others
+the posterior would be that of another experiment, and a warning says so (``unlike_experiment``).
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.base import Estimator
+from sipe_bayes.callable_simulator import CallableSimulator
+from sipe_bayes.inference.base import Estimator, Recorded
 from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, first_states
@@ -23,7 +25,7 @@ from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.trajectory import Trajectories, Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -79,14 +81,15 @@ class PriorSampling(Estimator):
 
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
         self._check(trajectories)
-        state = state if state["trained"] else self._trained(state, trajectories)
+        state = state if state["trained"] else self._trained(state, self._simulated(state, trajectories))
+        self.warn(unlike_experiment(state, trajectories, noise_level(trajectories, self.likelihood)))
         log = self._looks(trajectories.observations[None], trajectories)
         alike = np.array_equal(np.isfinite(trajectories.observations).all(-1), state["seen_where"])
         how_far = max(unlikeness(state[name], log[name][0]) for name in log) if alike else float("nan")
         self.diagnostics["unlikeness"] = how_far
         if how_far > 1:
             said = "the log is unlike every simulation: widen the bounds, or correct the model, before you trust the result"
-            self.warnings += [said] * (said not in self.warnings)
+            self.warn(said)
         return self.infer(state, trajectories)
 
     def statistics(self, observations: NDArray[np.floating], trajectories: Trajectories) -> FloatArray:
@@ -123,14 +126,12 @@ class PriorSampling(Estimator):
     def simulations(self, state: State, trajectories: Trajectories) -> Simulations:
         """The valid simulations so far, with noise."""
         made = self._simulations(trajectories).first(state["simulated"])
-        said = describe_invalid(made, self.space)
-        if said is not None and said not in self.warnings:
-            self.warnings.append(said)
+        self.warn(describe_invalid(made, self.space, self.simulator.failure))
         self.diagnostics["invalid_simulations"] = int((~made.valid).sum())
         if made.valid.sum() < _FEWEST:
             raise ValueError(
-                f"budget: {int(made.valid.sum())} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}; "
-                "raise the budget, or narrow the bounds"
+                f"budget: {int(made.valid.sum())} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}, the others "
+                f"{self.simulator.failure}; raise the budget, or narrow the bounds"
             )
         valid = Simulations(made.theta[made.valid], made.observations[made.valid], made.valid[made.valid])
         return self._noisy(valid, trajectories, np.random.default_rng([self.seed, 1]))
@@ -154,7 +155,22 @@ class PriorSampling(Estimator):
         seen = self._looks(simulations.observations[-_SEEN:], trajectories)
         trained = self.train(simulations, trajectories)
         where = np.isfinite(trajectories.observations).all(-1)
-        return {**state, **trained, **seen, "seen_where": where, "trained": True, "done": True}
+        replayed = _experiment(trajectories, simulations.observations[:, :, 0])
+        return {**state, **trained, **seen, **replayed, "seen_where": where, "trained": True, "done": True}
+
+    def _simulated(self, state: State, trajectories: Trajectories) -> Trajectories:
+        """The trajectories whose simulations the untrained state counts: these, or the last ones that were stepped on."""
+        for candidate in (trajectories, *([] if self._cached is None else [self._cached[0]])):
+            if digest(candidate) == state["logs"]:
+                return candidate
+        raise ValueError(
+            "trajectories: nothing was simulated for these; call update_parameter_estimate with them first"
+        )
+
+    def warn(self, sentence: str | None) -> None:
+        """Add a sentence to the warnings, once."""
+        if sentence is not None and sentence not in self.warnings:
+            self.warnings.append(sentence)
 
     def _simulations(self, trajectories: Trajectories) -> Cache:
         if self._cached is None or self._cached[0] is not trajectories:
@@ -162,6 +178,18 @@ class PriorSampling(Estimator):
             made = Cache(self.simulator, self.prior, trajectories, starts, self.seed, self.cache)
             self._cached = (trajectories, made)
         return self._cached[1]
+
+    def _recorded(self, given: Recorded) -> Recorded:
+        """As the base's; an observed x of a CallableSimulator must be whole, as what these methods learn from is."""
+        found = super()._recorded(given)
+        if isinstance(self.simulator, CallableSimulator):
+            for trajectory in [found] if isinstance(found, Trajectory) else found:
+                missing = np.flatnonzero(np.isnan(trajectory.observations).any(0)).tolist()
+                if missing:
+                    raise ValueError(
+                        f"x: {self.name} learns from whole ones, but x{missing} is NaN; leave it out of fn and of x"
+                    )
+        return found
 
     def _check(self, trajectories: Trajectories) -> None:
         environment = self.simulator.environment
@@ -182,6 +210,53 @@ def digest(trajectories: Trajectories) -> str:
     for array in (trajectories.observations, trajectories.actions):
         found.update(np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
+
+
+def _experiment(trajectories: Trajectories, first: NDArray[np.floating]) -> State:
+    """What the simulations replayed: actions (R, T, A), steps (R,), seconds (R,), starting states (R, S) where recorded, else
+    (0, 0), and the range of the simulations' first samples (n, R, O)."""
+    states = trajectories.states
+    return {
+        "replayed_actions": np.asarray(trajectories.actions, float),
+        "replayed_length": np.asarray(trajectories.length, np.int64),
+        "replayed_dt": np.asarray(trajectories.dt, float),
+        "replayed_starts": np.empty((0, 0)) if states is None else np.asarray(states[:, 0], float),
+        "first_low": np.asarray(first.min(0), float),
+        "first_high": np.asarray(first.max(0), float),
+    }
+
+
+def unlike_experiment(state: State, trajectories: Trajectories, noise: FloatArray) -> str | None:
+    """What is to be said where trajectories are not of the experiment that the simulations of ``state`` replayed; None where they are.
+
+    Actions, lengths and seconds have to be equal. So have starting states where both are recorded; else the first samples
+    must lie within the simulated ones' range, give or take three sds of the ``noise`` (O,): velocities do not show in them.
+    """
+    differs = _differs(state, trajectories, noise)
+    if differs is None:
+        return None
+    return (
+        f"the log's {differs} differ from those that the simulations replayed: the posterior is that of another experiment; "
+        "fit again with this log"
+    )
+
+
+def _differs(state: State, trajectories: Trajectories, noise: FloatArray) -> str | None:
+    """What of the experiment differs."""
+    length, dt, actions = (state[f"replayed_{name}"] for name in ("length", "dt", "actions"))
+    if not np.array_equal(length, trajectories.length):
+        return "number or lengths"
+    if not (
+        np.allclose(dt, trajectories.dt, rtol=1e-9, atol=0) and np.allclose(actions, trajectories.actions, rtol=1e-9)
+    ):
+        return "actions"
+    starts, first = state["replayed_starts"], trajectories.observations[:, 0]
+    if len(starts) and trajectories.states is not None:  # noise may have been added to what was observed
+        same = np.allclose(starts[:, 1:], trajectories.states[:, 0, 1:], rtol=1e-6, atol=1e-6)
+        return None if same else "starting states"
+    low, high = state["first_low"], state["first_high"]
+    slack = 3 * noise + 1e-5 * (1 + np.maximum(np.abs(low), np.abs(high)))
+    return "starting states" if ((first < low - slack) | (first > high + slack)).any() else None
 
 
 def unlikeness(seen: FloatArray, log: FloatArray) -> float:

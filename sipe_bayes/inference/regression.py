@@ -13,43 +13,47 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import nn
 
+from sipe_bayes.checks import positive, share, whole
 from sipe_bayes.inference.prior_sampling import PriorSampling, recorded_steps
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
-from sipe_bayes.models.training import restore, split, weights
+from sipe_bayes.models.training import EarlyStopping, restore, split, weights
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 from sipe_bayes.trajectory import Trajectories
-
-_HELD_OUT = 0.1
-_PATIENCE = 5
 
 
 class Regression(PriorSampling):
     """A Dirac; see the module's docstring.
 
-    learning_rate, batch: of the stochastic gradient, in control steps. epochs: passes at most.
+    learning_rate, batch: of the stochastic gradient, in control steps. epochs: passes at most. held_out: share of the
+    simulations; patience: passes without a lower loss of theirs.
     """
 
     name: ClassVar[str] = "regression"
 
     def __init__(
-        self, simulator: Any, *, learning_rate: float = 1e-3, batch: int = 320, epochs: int = 100, **settings: Any
+        self,
+        simulator: Any,
+        *,
+        learning_rate: float = 1e-3,
+        batch: int = 320,
+        epochs: int = 100,
+        held_out: float = 0.1,
+        patience: int = 5,
+        **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        if not learning_rate > 0 or batch < 1 or epochs < 1:
-            raise ValueError(
-                f"learning_rate, batch, epochs: expected numbers above zero, got {learning_rate}, {batch}, {epochs}"
-            )
-        self.learning_rate, self.batch, self.epochs = learning_rate, batch, epochs
+        self.learning_rate = positive("learning_rate", learning_rate)
+        self.batch, self.epochs = whole("batch", batch), whole("epochs", epochs)
+        self.held_out, self.patience = share("held_out", held_out), whole("patience", patience)
 
     def settings(self) -> dict[str, Any]:
-        own = {"learning_rate": self.learning_rate, "batch": self.batch, "epochs": self.epochs}
-        return {**super().settings(), **own}
+        own = ("learning_rate", "batch", "epochs", "held_out", "patience")
+        return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
         generator = torch.Generator().manual_seed(self.seed)
@@ -58,23 +62,20 @@ class Regression(PriorSampling):
         network = _Linear(steps.shape[-1], len(self.space))
         network.standardise.fit(steps)
         network.bias.data.copy_(theta.mean(0))
-        inside, outside = split(len(theta), _HELD_OUT, generator)
+        inside, outside = split(len(theta), self.held_out, generator)
         inputs, targets = _rows(network, steps[inside], theta[inside])
         held_inputs, held_targets = _rows(network, steps[outside], theta[outside])
-        best, best_weights, waited = np.inf, weights(network), 0
+        stopping = EarlyStopping(network, self.patience, relative=1e-4)
         for _ in range(self.epochs):
             order = torch.randperm(len(inputs), generator=generator)
             with torch.no_grad():
                 for chosen in order.split(self.batch):
                     network.descend(inputs[chosen], targets[chosen], self.learning_rate)
                 loss = float((network.map(held_inputs) - held_targets).square().mean())
-            if loss < best * (1 - 1e-4):
-                best, best_weights, waited = loss, weights(network), 0
-            else:
-                waited += 1
-            if waited == _PATIENCE:
+            if stopping.stops(loss):
                 break
-        return {**best_weights, "held_out_loss": float(best)}
+        stopping.restore()
+        return {**weights(network), "held_out_loss": float(stopping.best)}
 
     def infer(self, state: State, trajectories: Trajectories) -> Dirac:
         steps = recorded_steps(trajectories)

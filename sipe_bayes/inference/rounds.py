@@ -6,8 +6,11 @@ its mass. On that region the theta of every round have the prior's density up to
 p(theta) / p~(theta) is one and the loss stays what it is; the network is then right there only, for the log in hand.
 
 Deviations. From the second round on the network is trained from the beginning on all rounds, as its standardisation changes.
-When fewer than one draw of the prior in a thousand falls into the truncated region, proposals are resampled from the
-posterior's own draws with weights prior / posterior (their section 4.3).
+When fewer than one draw of the prior in a thousand falls into the truncated region, proposals come from the posterior's own
+draws with weights prior / posterior (their section 4.3): accepted with probability weight / largest weight, which leaves
+the prior's density; and where that leaves too few, drawn with replacement, so that theta of large weight come several times, as
+a warning says. Draws without replacement would have a density between the prior's and the posterior's, and the network would
+count the log twice.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import share, whole
 from sipe_bayes.inference.prior_sampling import PriorSampling, digest
 from sipe_bayes.inference.simulations import BLOCK, Simulations
 from sipe_bayes.inference.state import State
@@ -27,25 +31,23 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_TRUNCATED = 1e-4  # of the posterior's mass lies outside the truncated prior
 _DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from
 _PROPOSALS = 2**17  # draws of the prior tried before resampling the posterior's
 _FIELDS = ("theta", "observations", "valid")
 
 
 class Rounds(PriorSampling):
-    """Base of NPE and BayesSim. rounds: more than one conditions on the log in hand and is not amortised."""
+    """Base of NPE and BayesSim. rounds: more than one conditions on the log in hand and is not amortised. truncated: the share of
+    the posterior's mass that lies outside the truncated prior of the next round."""
 
-    def __init__(self, simulator: Any, *, rounds: int = 1, **settings: Any) -> None:
+    def __init__(self, simulator: Any, *, rounds: int = 1, truncated: float = 1e-4, **settings: Any) -> None:
         super().__init__(simulator, **settings)
-        if rounds < 1:
-            raise ValueError(f"rounds: expected at least 1, got {rounds}")
-        self.rounds = int(rounds)
+        self.rounds, self.truncated = whole("rounds", rounds), share("truncated", truncated)
         if self.rounds > 1:
             self.amortised = False  # type: ignore[misc]  # this instance conditions on one log
 
     def settings(self) -> dict[str, Any]:
-        return {**super().settings(), "rounds": self.rounds}
+        return {**super().settings(), "rounds": self.rounds, "truncated": self.truncated}
 
     def start(self, trajectories: Trajectories) -> State:
         if self.budget // len(trajectories) < self.rounds:
@@ -96,19 +98,28 @@ class Rounds(PriorSampling):
         seed = np.random.SeedSequence([self.seed, 3, state["round"]]).generate_state(1)[0]
         generator = torch.Generator().manual_seed(int(seed))
         own = found.sample((_DENSITY_DRAWS,), generator=generator)
-        threshold = found.log_prob(own).quantile(_TRUNCATED)
+        threshold = found.log_prob(own).quantile(self.truncated)
         tried = self.prior.sample((_PROPOSALS,), generator=generator)
         inside = tried[found.log_prob(tried) >= threshold]
         self.diagnostics[f"truncated_prior_{state['round'] + 1}"] = len(inside) / _PROPOSALS
         if len(inside) >= count and len(inside) > 1e-3 * _PROPOSALS:
             return inside[:count].numpy()
-        own = found.sample((max(_PROPOSALS // 4, 10 * count),), generator=generator)
+        own = found.sample((_PROPOSALS,), generator=generator)
         density = found.log_prob(own)
-        weight = torch.where(density >= threshold, self.prior.log_prob(own) - density, -torch.inf)
-        if int(torch.isfinite(weight).sum()) < count:
-            raise BudgetExhausted(f"the truncated prior of round {state['round'] + 1} is too small to draw {count} theta from")
-        chosen = torch.multinomial((weight - weight.max()).exp(), count, replacement=False, generator=generator)
-        return own[chosen].numpy()
+        log_weight = torch.where(density >= threshold, self.prior.log_prob(own) - density, -torch.inf)
+        if not torch.isfinite(log_weight).any():
+            raise BudgetExhausted(f"the truncated prior of round {state['round'] + 1} is too small to draw theta from")
+        weight = (log_weight - log_weight.max()).exp()
+        accepted = own[torch.rand(len(own), dtype=torch.float64, generator=generator) < weight]
+        if len(accepted) >= count:
+            return accepted[:count].numpy()
+        chosen = own[torch.multinomial(weight, count, replacement=True, generator=generator)]
+        share = len(chosen.unique(dim=0)) / count
+        self.warn(
+            f"round {state['round'] + 1} looks where the prior hardly goes: {share:.0%} of its theta are different ones; take fewer "
+            "rounds, or a larger ``truncated``"
+        )
+        return chosen.numpy()
 
 
 def _joined(state: State, new: Simulations) -> State:

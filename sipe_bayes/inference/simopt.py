@@ -18,9 +18,10 @@ or until the Gaussian is narrower than 1e-4 in every parameter.
 Deviations. Draws of the last iteration's updates (72) take part in each update, q_i being the present Gaussian against the
 mixture of those that they came from: six draws alone say little in more than two dimensions. The new Gaussian takes what
 the weights p change in the mean and covariance of the draws against the weights q, instead of their plain moments under
-p: those also hold the noise of q's own weights and what the cube cuts off, and collapse far from the optimum. The change
-of covariance counts the less the fewer the effective draws are; no variance shrinks below a quarter in an update or
-below 1e-10 at all; the mean stays in the cube, to which draws are restricted; and the step is cut back until the
+p: those also hold the noise of q's own weights and what the cube cuts off, and collapse far from the optimum. The covariance
+is damped: with n_eff effective draws its change counts by n_eff / (n_eff + damping (N + 1)), ``damping`` = 1 being the weight
+of as many draws as a Gaussian's scatter takes, and no variance shrinks by more than ``least_factor``, a quarter, in an update or
+below 1e-10 at all (neither paper gives a rule or a number); the mean stays in the cube, to which draws are restricted; and the step is cut back until the
 Gaussians' own KL is within epsilon. The earlier Gaussians' densities are those before the cube cuts them: their
 masses within it, which differ, are taken as equal. Diverged simulations have weight zero. "Covariance initialisation 0.2" is read as a
 variance, and epsilon is chosen here. Policy training is not part of it: other trajectories may be given at each step.
@@ -38,6 +39,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.special import logsumexp
 
+from sipe_bayes.checks import at_least, positive, share, whole
 from sipe_bayes.inference.gaussian_search import Search, draw_in_cube, gaussian_kl, log_normal
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import GaussianMixture, Particles
@@ -46,15 +48,15 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-10
-_CONVERGED_SD = 1e-4
-_LEAST_FACTOR = 0.25  # by which an update narrows or widens a variance at most
 
 
 class SimOpt(Search):
     """The last iteration's weighted draws as Particles; ``proposal`` is the Gaussian that they fit.
 
     updates: REPS updates in an iteration. particles: simulated in each. initial_variance: of the first Gaussian, whose mean
-    is drawn uniformly from [0, initial_mean]^N. epsilon: bound on the KL of an update, in nats. reward: see ``Search``.
+    is drawn uniformly from [0, initial_mean]^N. epsilon: bound on the KL of an update, in nats. damping: of the covariance, 0 or
+    more; the more, the slower it follows few draws. least_factor: by which an update narrows, or its inverse widens, a
+    variance at most. converged_sd: of every parameter, in theta, where the search ends. reward: see ``Search``.
     """
 
     name: ClassVar[str] = "simopt"
@@ -69,24 +71,27 @@ class SimOpt(Search):
         initial_mean: float = 0.5,
         initial_variance: float = 0.2,
         epsilon: float = 0.5,
+        damping: float = 1.0,
+        least_factor: float = 0.25,
+        converged_sd: float = 1e-4,
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        for name, value, least in (("updates", updates, 1), ("particles", particles, 2)):
-            if value < least:
-                raise ValueError(f"{name}: expected at least {least}, got {value}")
-        if not 0 < initial_mean <= 1:
+        self.updates, self.particles = whole("updates", updates), whole("particles", particles, 2)
+        if positive("initial_mean", initial_mean) > 1:
             raise ValueError(f"initial_mean: expected a number in (0, 1], got {initial_mean}")
-        for name, number in (("initial_variance", initial_variance), ("epsilon", epsilon)):
-            if not number > 0:
-                raise ValueError(f"{name}: expected a positive number, got {number}")
-        self.updates, self.particles = updates, particles
-        self.initial_mean, self.initial_variance, self.epsilon = initial_mean, initial_variance, epsilon
+        self.initial_mean, self.initial_variance = initial_mean, positive("initial_variance", initial_variance)
+        self.epsilon, self.damping = positive("epsilon", epsilon), at_least("damping", damping, 0)
+        self.least_factor, self.converged_sd = (
+            share("least_factor", least_factor),
+            positive("converged_sd", converged_sd),
+        )
         self.proposal: GaussianMixture | None = None
 
     def settings(self) -> dict[str, Any]:
         own = ("updates", "particles", "initial_mean", "initial_variance", "epsilon")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
+        ends = ("damping", "least_factor", "converged_sd")
+        return {**super().settings(), **{name: getattr(self, name) for name in own + ends}}
 
     def start(self, trajectories: Trajectories) -> State:
         n = len(self.space)
@@ -110,7 +115,7 @@ class SimOpt(Search):
         state = self.renewed(state, trajectories)
         for _ in range(self.updates):
             count = self.affordable(self.particles, trajectories)
-            converged = bool((np.diag(state["covariances"][-1]) < _CONVERGED_SD**2).all())
+            converged = bool((np.diag(state["covariances"][-1]) < self.converged_sd**2).all())
             if not count or converged:
                 return {**state, "done": True}
             state = self._update(state, trajectories, count)
@@ -127,7 +132,8 @@ class SimOpt(Search):
             temperature = reps_temperature(state["pool_reward"], log_base, self.epsilon)
             weights = reps_weights(state["pool_reward"], log_base, temperature)
             base = np.where(np.isfinite(state["pool_reward"]), np.exp(log_base), 0.0)
-            mean, covariance = fitted(state["pool_theta"], weights, base / base.sum(), mean, covariance, self.epsilon)
+            old = (mean, covariance, self.epsilon, self.damping, self.least_factor)
+            mean, covariance = fitted(state["pool_theta"], weights, base / base.sum(), *old)
         return {
             **state,
             "means": np.concatenate([state["means"], mean[None]]),
@@ -197,6 +203,8 @@ def fitted(
     mean: FloatArray,
     covariance: FloatArray,
     epsilon: float,
+    damping: float = 1.0,
+    least_factor: float = 0.25,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (N,) and covariance (N, N) after what ``weights`` (n,) of theta (n, N) change against the ``base`` weights (n,),
     which are the last Gaussian's; within a KL of epsilon from it."""
@@ -206,8 +214,8 @@ def fitted(
     shift = (weights - base) @ white
     change = white.T @ ((weights - base)[:, None] * white)
     effective = 1 / (weights**2).sum()
-    values, vectors = np.linalg.eigh(effective / (n + 1 + effective) * change)
-    scaled = (vectors * np.clip(1 + values, _LEAST_FACTOR, 1 / _LEAST_FACTOR)) @ vectors.T
+    values, vectors = np.linalg.eigh(effective / (damping * (n + 1) + effective) * change)
+    scaled = (vectors * np.clip(1 + values, least_factor, 1 / least_factor)) @ vectors.T
     new_mean = np.clip(mean + factor @ shift, 0.0, 1.0)
     new = factor @ scaled @ factor.T
     new = (new + new.T) / 2 + _LEAST_VARIANCE * np.eye(n)

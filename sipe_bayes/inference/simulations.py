@@ -68,7 +68,10 @@ class Cache:
         plain = (self.simulator.checksum(), self.simulator.space.to_dict(), repr(self.prior), prior, self.seed)
         digest.update(repr((*plain, self.trajectories.names)).encode())
         arrays = (self.trajectories.actions, self.trajectories.dt, self.trajectories.length, self.starts)
-        for array in (*arrays, np.nan_to_num(self.trajectories.observations[:, 0])):  # holds the goals, if there are any
+        for array in (
+            *arrays,
+            np.nan_to_num(self.trajectories.observations[:, 0]),
+        ):  # holds the goals, if there are any
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:24]
 
@@ -120,9 +123,7 @@ class Cache:
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             with temporary.open("wb") as file:
-                np.savez(
-                    file, theta=simulations.theta, observations=simulations.observations, valid=simulations.valid
-                )
+                np.savez(file, theta=simulations.theta, observations=simulations.observations, valid=simulations.valid)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -138,8 +139,9 @@ class Cache:
             return None
 
 
-def describe_invalid(simulations: Simulations, space: ParameterSpace) -> str | None:
-    """A sentence on how many simulations diverged and where in the prior they lie; None if none did."""
+def describe_invalid(simulations: Simulations, space: ParameterSpace, failure: str = "diverged") -> str | None:
+    """A sentence on how many simulations diverged, or what else their ``failure`` was, and where in the prior they lie; None if none
+    did."""
     bad = ~simulations.valid
     if not bad.any():
         return None
@@ -149,4 +151,4 @@ def describe_invalid(simulations: Simulations, space: ParameterSpace) -> str | N
         if len(inside) and scipy.stats.mannwhitneyu(inside, outside).pvalue < _SHIFTED:
             where.append(f"{'high' if np.median(outside) > np.median(inside) else 'low'} {name}")
     place = f", mostly at {' and '.join(where)}" if where else ", all over the prior"
-    return f"{int(bad.sum())} of {len(bad)} simulations diverged{place}; the others were used"
+    return f"{int(bad.sum())} of {len(bad)} simulations {failure}{place}; the others were used"

@@ -38,11 +38,7 @@ def load_state(path: Path, fingerprint: str) -> State:
             state: State = {k: file.get_tensor(k) for k in file.keys() if k != "_"}  # noqa: SIM118
         state.update(json.loads(metadata["plain"]))
     except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, OSError) as error:
-        raise CheckpointError(
-            f"checkpoint {path}: cannot be read ({error}); delete it to start again"
-        ) from None
+        raise CheckpointError(f"checkpoint {path}: cannot be read ({error}); delete it to start again") from None
     if metadata["fingerprint"] != fingerprint:
-        raise CheckpointError(
-            f"checkpoint {path}: belongs to another run; choose another folder or delete it"
-        )
+        raise CheckpointError(f"checkpoint {path}: belongs to another run; choose another folder or delete it")
     return state

@@ -27,7 +27,7 @@ HIDDEN = 128
 
 
 class Discriminator(nn.Module):
-    """Logit of "recorded" for features (..., F): two hidden layers of 128 tanh units, features standardised."""
+    """Logit of "recorded" for features (..., F): two layers of ``hidden`` tanh units, features standardised."""
 
     def __init__(self, features: int, seed: int = 0, hidden: int = HIDDEN) -> None:
         super().__init__()

@@ -41,6 +41,28 @@ class Trained:
     converged: bool
 
 
+class EarlyStopping:
+    """Keeps a network's weights where its held-out loss was least. A look counts as better when it is lower by ``absolute`` and by
+    a share ``relative``; after ``patience`` looks that are not, it is time to stop."""
+
+    def __init__(self, network: nn.Module, patience: int, absolute: float = 0.0, relative: float = 0.0) -> None:
+        self.network, self.patience, self.absolute, self.relative = network, patience, absolute, relative
+        self.best, self.waited = np.inf, 0
+        self._weights = _copy(network)
+
+    def stops(self, loss: float) -> bool:
+        """Take note of a held-out loss; whether to stop."""
+        if loss < self.best * (1 - self.relative) - self.absolute:
+            self.best, self.waited, self._weights = loss, 0, _copy(self.network)
+        else:
+            self.waited += 1
+        return self.waited >= self.patience
+
+    def restore(self) -> None:
+        """Put the best weights back into the network."""
+        self.network.load_state_dict(self._weights)
+
+
 def check_device(device: str) -> str:
     """``device`` if torch has it here; raises ValueError otherwise."""
     try:
@@ -62,8 +84,8 @@ def train(network: nn.Module, loss: Loss, rows: int, settings: Training, generat
     parameters = [p for p in network.parameters() if p.requires_grad]
     optimiser = torch.optim.Adam(parameters, settings.learning_rate, weight_decay=settings.weight_decay, foreach=True)
     inside, outside = split(rows, settings.held_out, generator)
-    best, best_weights, waited, steps = np.inf, _copy(network), 0, 0
-    for epoch in range(1, settings.epochs + 1):
+    stopping, steps = EarlyStopping(network, settings.patience, absolute=1e-4), 0
+    for epoch in range(1, settings.epochs + 1):  # noqa: B007 (returned)
         shuffled = inside[torch.randperm(len(inside), generator=generator)]
         for chosen in shuffled.split(settings.batch):
             optimiser.zero_grad(set_to_none=True)
@@ -73,14 +95,10 @@ def train(network: nn.Module, loss: Loss, rows: int, settings: Training, generat
             steps += 1
         with torch.no_grad():
             now = float(torch.cat([loss(part) for part in outside.split(2000)]).mean())
-        if now < best - 1e-4:
-            best, best_weights, waited = now, _copy(network), 0
-        else:
-            waited += 1
-        if waited >= settings.patience:
+        if stopping.stops(now):
             break
-    network.load_state_dict(best_weights)
-    return Trained(best, epoch, steps, waited >= settings.patience)
+    stopping.restore()
+    return Trained(stopping.best, epoch, steps, stopping.waited >= settings.patience)
 
 
 def _copy(network: nn.Module) -> dict[str, Tensor]:

@@ -16,6 +16,7 @@ from pyro.distributions import TorchDistribution
 from torch import Generator, Tensor
 from torch.distributions import constraints
 
+from sipe_bayes.checks import whole
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior.storage import write_pair
 
@@ -165,7 +166,10 @@ class Posterior(TorchDistribution):
 
     def sample(self, sample_shape: Any = (), generator: Generator | None = None) -> Tensor:
         """Exact draws (*sample_shape, *batch_shape, N); without a generator, from torch's global one."""
-        shape = torch.Size(sample_shape) + self.batch_shape
+        try:
+            shape = torch.Size(whole("sample_shape", size, 0) for size in sample_shape) + self.batch_shape
+        except TypeError:
+            raise ValueError(f"sample_shape: expected sizes such as (1000,), got {sample_shape!r}") from None
         with torch.no_grad():
             return self._sample(shape.numel(), generator).reshape(*shape, len(self.space))
 
@@ -219,7 +223,10 @@ class Posterior(TorchDistribution):
 
     def quantile(self, q: Any) -> Tensor:
         """Quantiles of each parameter's marginal: (N,) for a number q, (Q, N) for a vector (Q,)."""
-        levels = torch.as_tensor(q, dtype=torch.float64)
+        try:
+            levels = torch.as_tensor(q, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(f"q: expected a number or a vector of numbers in [0, 1], got {q!r}") from None
         if levels.ndim > 1 or not ((levels >= 0) & (levels <= 1)).all():
             raise ValueError(f"q: expected a number or a vector of numbers in [0, 1], got {q!r}")
         with torch.no_grad():
@@ -243,6 +250,7 @@ class Posterior(TorchDistribution):
 
     def values(self, n: int, generator: Generator | None = None) -> NDArray[Any]:
         """Draws (n, N) in physical units."""
+        n = whole("n", n, 0)
         with torch.no_grad():
             return self.space.values(self._sample(n, generator).numpy())
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import arm
+import ddpg
 import envs
 import fits
 import mdn
@@ -217,7 +218,7 @@ def chain() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    tables = ("engine", "rival", "stages", "chain", "envs", "memory", "mdn", "fits")
+    tables = ("engine", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg")
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
     given = parser.parse_args()
@@ -237,6 +238,8 @@ def main() -> None:
             mdn.table(given.pairs)
         elif name == "fits":
             fits.table()
+        elif name == "ddpg":
+            ddpg.table(max(given.pairs, 7), side_by_side)
         elif name == "envs":
             envs.table(max(given.pairs, 7), side_by_side)
             envs.against_parsing(max(given.pairs, 7), side_by_side)

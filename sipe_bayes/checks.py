@@ -1,0 +1,43 @@
+"""Numbers that a user gives, checked in one way: a ValueError of one line names the argument, what was expected, what came."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+
+def whole(name: str, value: Any, least: int = 1, unit: str = "") -> int:
+    """``value`` as an int of at least ``least``; 1e3 is whole, True and "3" are not."""
+    plain = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
+    if isinstance(value, bool) or not plain:
+        raise ValueError(f"{name}: expected a whole number, got {_shown(value)}; give one, such as {max(least, 1)}")
+    if value < least:
+        raise ValueError(f"{name}: expected at least {least}{unit and ' '}{unit}, got {value}")
+    return int(value)
+
+
+def at_least(name: str, value: Any, least: float) -> float:
+    """``value`` as a finite float of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < math.inf:
+        raise ValueError(f"{name}: expected at least {least:g}, got {_shown(value)}")
+    return float(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """``value`` as a finite float above zero."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < math.inf:
+        raise ValueError(f"{name}: expected a positive number, got {_shown(value)}")
+    return float(value)
+
+
+def share(name: str, value: Any) -> float:
+    """``value`` as a float above zero and below one."""
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < 1:
+        raise ValueError(f"{name}: expected a share above 0 and below 1, got {_shown(value)}")
+    return float(value)
+
+
+def _shown(value: Any) -> str:
+    """Short: a number or text as it is, of anything else the type."""
+    return repr(value) if isinstance(value, Real | str | None) else f"a {type(value).__name__}"
