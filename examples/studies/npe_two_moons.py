@@ -1,6 +1,6 @@
 """Is `npe` as good as the sbi it is built on? Two moons, against exact posterior draws and sbi called directly.
 
-    python examples/studies/npe_two_moons.py                                    # all cells: about three hours
+    python examples/studies/npe_two_moons.py                                    # all cells: about an hour and a half on one core
     python examples/studies/npe_two_moons.py --observations 2 --seeds 1 --budget 1000 --draws 500 --rounds 1
 
 Two moons (J.-M. Lueckmann et al. 2021, "Benchmarking Simulation-Based Inference", https://arxiv.org/abs/2101.04653, task T.8):
@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="of npe and sbi; npe rounds takes one")
     parser.add_argument("--budget", type=int, default=10_000, help="simulations")
     parser.add_argument("--draws", type=int, default=2000, help="exact and learned, for each C2ST")
-    parser.add_argument("--rounds", type=int, default=4, help="of the sequential cells; 1 leaves them out")
+    parser.add_argument("--rounds", type=int, default=2, help="of the sequential cells; 1 leaves them out")
     parser.add_argument("--density", default="nsf", help="sbi's own density estimator")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "npe_two_moons.json")
     given = parser.parse_args()

@@ -53,7 +53,8 @@ class NPE(Rounds):
     outputs. embedding_features: numbers it summarises a log in. rounds: more than one conditions on the log in hand and
     is not amortised. transforms, hidden, bins: layers of the spline flow, units in each of its two hidden layers, bins of a
     spline. batch_size (None: a twentieth of the simulations, 200 to 500), learning_rate, patience (epochs without a better
-    validation loss), max_epochs, held_out (share of the simulations that validates): of the training.
+    validation loss; None: a tenth of batch_size, at least 20), max_epochs, held_out (share of the simulations that
+    validates): of the training.
     device: "cpu" or "cuda", for the training alone.
     """
 
@@ -66,12 +67,12 @@ class NPE(Rounds):
         *,
         embedding: str = "transitions",
         embedding_features: int = 32,
-        transforms: int = 3,
+        transforms: int = 5,
         hidden: int = 64,
         bins: int = 8,
         batch_size: int | None = None,
         learning_rate: float = 1e-3,
-        patience: int = 40,
+        patience: int | None = None,
         max_epochs: int = 1000,
         held_out: float = 0.1,
         device: str = "cpu",
@@ -88,7 +89,7 @@ class NPE(Rounds):
             "hidden": hidden,
             "bins": bins,
             "batch_size": 1 if batch_size is None else batch_size,
-            "patience": patience,
+            "patience": 1 if patience is None else patience,
             "max_epochs": max_epochs,
         }
         for name, value in counts.items():
@@ -101,7 +102,7 @@ class NPE(Rounds):
             raise ValueError(f"held_out: expected a share between 0 and 1, got {held_out}; try 0.1")
         self.batch_size, self.learning_rate = batch_size, float(learning_rate)
         self.held_out = float(held_out)
-        self.patience, self.max_epochs, self.device = int(patience), int(max_epochs), check_device(device)
+        self.patience, self.max_epochs, self.device = patience, int(max_epochs), check_device(device)
 
     def settings(self) -> dict[str, Any]:
         return {
@@ -190,7 +191,7 @@ class NPE(Rounds):
             else batch,
             learning_rate=self.learning_rate,
             validation_fraction=self.held_out,
-            stop_after_epochs=self.patience,
+            stop_after_epochs=max(20, batch // 10) if self.patience is None else self.patience,
             max_num_epochs=self.max_epochs,
         )
         return net.to("cpu").eval(), trainer.summary
