@@ -32,6 +32,7 @@ _PUBLIC = {
     "get_estimator": "sipe_bayes.inference",
     "show_results": "sipe_bayes.show",
     "load_config": "sipe_bayes.config",
+    "train_in_the_loop": "sipe_bayes.rl.policy_in_the_loop",
     "prepare": "sipe_bayes.calibration",
     "calibrate": "sipe_bayes.calibration",
 }

@@ -1,0 +1,281 @@
+"""The iterations of policy in the loop, as ``sipe_bayes.rl.policy_in_the_loop`` describes them, in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import deque
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.checks import whole
+from sipe_bayes.demonstration import default_steps
+from sipe_bayes.envs.task import Task
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.gaussian_search import Search
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.rl.evaluation import evaluate
+from sipe_bayes.rl.policy import Policy
+from sipe_bayes.rl.settings import Settings
+from sipe_bayes.rl.train import Report
+from sipe_bayes.rl.trainer import Trainer
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+"""Of the history; ``train_in_the_loop`` says what is in it."""
+
+_EVALUATION_SEED = 3_000_000  # of the history's starts: other ones than a card's or a curve's
+_DRAWS = 100  # times that theta are drawn anew
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a run goes; see ``train_in_the_loop``. Raises ValueError for numbers out of range."""
+
+    steps: int
+    updates: int
+    trajectories: int
+    trajectory_steps: int | None
+    evaluation_episodes: int
+    settings: Settings
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "updates", "trajectories", "evaluation_episodes"):
+            whole(name, getattr(self, name))
+
+    def horizon(self, task: Task) -> int:
+        """Control steps of a trajectory; raises ValueError where an update has no room for an episode that begins in it."""
+        steps = (
+            default_steps(task) if self.trajectory_steps is None else whole("trajectory_steps", self.trajectory_steps)
+        )
+        if steps > task.episode_steps:
+            raise ValueError(f"trajectory_steps: expected at most an episode's {task.episode_steps}, got {steps}")
+        least = (task.episode_steps + steps + 1) * self.settings.lanes
+        if self.steps // self.updates < least:
+            raise ValueError(
+                f"steps: {self.steps} in {self.updates} updates are too few for an episode to begin in each, expected {least} for "
+                "each; raise steps, or take fewer updates"
+            )
+        return steps
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """What a run came to. history: a row for each update (see ``train_in_the_loop``). converged: whether the last policy solves
+    simulators drawn from the last estimate; solved_reference: whether it solves the reference. warnings: the last estimate's,
+    and what failed on the way."""
+
+    policy: Policy
+    posterior: Posterior
+    history: tuple[Row, ...]
+    converged: bool
+    solved_reference: bool
+    warnings: tuple[str, ...]
+
+
+@dataclass
+class _Begun:
+    """The beginning of an episode: state (S,), goal (G,) or None, and actions (A,) so far."""
+
+    state: FloatArray
+    goal: FloatArray | None
+    actions: list[FloatArray] = field(default_factory=list)
+
+
+class _Recorder:
+    """Advances a trainer and keeps the first ``steps`` actions of its ``count`` latest episodes that came so far or ended."""
+
+    def __init__(self, trainer: Trainer, count: int, steps: int) -> None:
+        self._trainer, self._steps = trainer, steps
+        self._running: dict[int, _Begun] = {}
+        self.episodes: deque[_Begun] = deque(maxlen=count)
+
+    def advance(self) -> None:
+        lanes, replay = self._trainer.episodes, self._trainer.replay
+        for lane in np.flatnonzero(lanes.elapsed == 0).tolist():
+            goal = None if lanes.goals is None else lanes.goals[lane].copy()
+            self._running[lane] = _Begun(lanes.states[lane].copy(), goal)
+        self._trainer.advance()
+        row = (replay.head - 1) % replay.rows
+        for lane, begun in list(self._running.items()):
+            begun.actions.append(replay.actions[row, lane].astype(float))
+            if len(begun.actions) == self._steps or replay.ends[row, lane] >= 0:
+                self.episodes.append(self._running.pop(lane))
+
+
+class LoopRun:
+    """The state of a run: the trainer, the estimator, what theta are drawn from, and the history."""
+
+    def __init__(self, estimator: Estimator, reference: str | FloatArray, plan: Plan, threads: int) -> None:
+        self.task = task = _task(estimator)
+        self.truth = task.theta(reference) if isinstance(reference, str) else _theta(task, reference)
+        self.plan, self.horizon = plan, plan.horizon(task)
+        self.estimator, self.budget = estimator, estimator.budget
+        described = {
+            "task": task.name,
+            "estimator": estimator.settings(),
+            "reference": self.truth.tolist(),
+            **asdict(plan),
+        }
+        self.fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode()).hexdigest()
+        self.simulator = Simulator(task, threads)  # of the reference and of evaluations
+        self.posterior: Posterior = estimator.prior
+        self.source = self.posterior  # what theta are drawn from
+        self.spent = self.reference_rollouts = self.redrawn = 0
+        self.idle = False  # a search that is over
+        self.history: list[Row] = []
+        self.trainer = Trainer(task, plan.settings, estimator.seed, self.draw, threads=threads)
+
+    def iterate(self, report: Report | None) -> None:
+        """Train, estimate, and add a row to the history."""
+        recorder = _Recorder(self.trainer, self.plan.trajectories, self.horizon)
+        until = self.plan.steps * (len(self.history) + 1) // self.plan.updates
+        while self.trainer.steps < until:
+            before = self.trainer.steps
+            recorder.advance()
+            if report is not None and self.trainer.steps // 100 > before // 100:
+                report(f"{self.task.name}: update {len(self.history)}", self.trainer.steps, self.plan.steps)
+        allowed = self.budget * (len(self.history) + 1) // self.plan.updates - self.spent
+        failure = None
+        if allowed > 0 and not self.idle:
+            failure = self._estimate(list(recorder.episodes), allowed)
+        self.history.append(self._row(failure))
+
+    def result(self) -> LoopResult:
+        last = self.history[-1]
+        failures = [f"update {row['update']}: {row['failure']}" for row in self.history if row["failure"]]
+        return LoopResult(
+            policy=self.trainer.policy(),
+            posterior=self.posterior,
+            history=tuple(self.history),
+            converged=solves(self.task, last["simulation_return"], last["simulation_success"]),
+            solved_reference=solves(self.task, last["reference_return"], last["reference_success"]),
+            warnings=(*dict.fromkeys(self.estimator.warnings), *failures),
+        )
+
+    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """theta (count, N) of the present estimate that a model can have; others are drawn anew and counted."""
+        found = np.empty((0, len(self.task.space)))
+        for _ in range(_DRAWS):
+            generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+            theta = self.source.sample((count - len(found),), generator=generator).numpy()
+            possible = np.array([self._possible(row) for row in theta])
+            self.redrawn += int((~possible).sum())
+            found = np.concatenate([found, theta[possible]])
+            if len(found) == count:
+                return found
+        raise ValueError(f"theta: {_DRAWS} draws of {self.source!r} gave no model; narrow the parameters' bounds")
+
+    def _possible(self, theta: FloatArray) -> bool:
+        try:
+            self.simulator.check_physical(self.simulator.check_theta(theta, allow_outside=False))
+        except ValueError:
+            return False
+        return True
+
+    def _estimate(self, episodes: list[_Begun], allowed: int) -> str | None:
+        """Update the estimate with ``allowed`` rollouts; returns why there is none."""
+        recorded = self._replayed(episodes)
+        try:
+            if not recorded:
+                raise ValueError("every trajectory of the reference diverged at once")
+            given = Trajectories.stack(recorded)
+            self._searched(given, allowed) if isinstance(self.estimator, Search) else self._fitted(given, allowed)
+        except ValueError as error:
+            if not self.history:
+                raise ValueError(
+                    f"{error} (the first of {self.plan.updates} updates, with {allowed} rollouts)"
+                ) from None
+            return str(error)
+        return None
+
+    def _searched(self, given: Trajectories, allowed: int) -> None:
+        """Steps of a search, until it has spent ``allowed`` more rollouts or is over."""
+        estimator, until = self.estimator, self.spent + allowed
+        estimator.warnings = []  # those of earlier estimates are over
+        while self.spent < until and not self.idle:
+            estimator.update_parameter_estimate(given)
+            self.idle = estimator.rollouts == self.spent
+            self.spent = estimator.rollouts
+        self.posterior = estimator.get_parameter_estimate(given)
+        proposal = getattr(estimator, "proposal", None)
+        self.source = self.posterior if proposal is None else proposal
+
+    def _fitted(self, given: Trajectories, allowed: int) -> None:
+        """A new fit with a budget of ``allowed`` rollouts; what it leaves is for the next one."""
+        self.estimator.budget = allowed
+        try:
+            self.posterior = self.source = self.estimator.fit(given)
+        finally:
+            self.estimator.budget = self.budget
+            self.spent += self.estimator.rollouts
+
+    def _replayed(self, episodes: list[_Begun]) -> list[Trajectory]:
+        """What the reference does from the episodes' starting states with their actions, as far as it is valid."""
+        found = []
+        for begun in episodes:
+            actions = np.stack(begun.actions)[None]
+            made = self.simulator.rollout(self.truth, actions, begun.state, allow_outside=True, goals=begun.goal)
+            valid = int(made.valid[0].sum()) - 1
+            if valid > 0:
+                found.append(made[0].slice(0, valid))
+        self.reference_rollouts += len(episodes)
+        return found
+
+    def _row(self, failure: str | None) -> Row:
+        policy, count = self.trainer.policy(), self.plan.evaluation_episodes
+        rng = np.random.default_rng([self.estimator.seed, 1 + len(self.history)])
+        inside = evaluate(policy, self.simulator, count, _EVALUATION_SEED, theta=self.draw(rng, count))
+        outside = evaluate(policy, self.simulator, count, _EVALUATION_SEED, theta=self.truth)
+        mean, sd = self.posterior.mean.numpy(), self.posterior.stddev.numpy()
+        accuracy = 1 - np.abs(mean - self.truth)
+        return {
+            "update": len(self.history) + 1,
+            "step": self.trainer.steps,
+            "rollouts": self.spent,
+            "reference_rollouts": self.reference_rollouts,
+            "accuracy": float(accuracy.mean()),
+            "least_accuracy": float(accuracy.min()),
+            "simulation_return": inside["mean"],
+            "simulation_success": inside["success_rate"],
+            "reference_return": outside["mean"],
+            "reference_success": outside["success_rate"],
+            "redrawn": self.redrawn,
+            "diverged": self.trainer.episodes.simulator.diverged,
+            "failure": failure,
+            "mean": mean.tolist(),
+            "sd": sd.tolist(),
+        }
+
+
+def solves(task: Task, mean_return: float, success_rate: float | None) -> bool:
+    """Whether a policy of this mean return and share of successes (None where only the return counts) solves the task."""
+    measured = mean_return if task.solved.measure == "return" else success_rate
+    return measured is not None and measured >= task.solved.threshold
+
+
+def _task(estimator: Estimator) -> Task:
+    """The task of a fresh estimator; raises ValueError for anything else."""
+    task = estimator.simulator.environment if isinstance(estimator, Estimator) else None
+    if not isinstance(task, Task):
+        raise ValueError(
+            f"estimator: expected one on a task of `sipe envs`, got {estimator!r}; make sipe.get_estimator(task, name)"
+        )
+    if estimator._state is not None or estimator.checkpoint is not None:
+        raise ValueError(
+            "estimator: expected a fresh one without a checkpoint of its own; give a folder to the run instead"
+        )
+    return task
+
+
+def _theta(task: Task, reference: Any) -> FloatArray:
+    theta = task.space.check_shape(reference)
+    if theta.ndim != 1 or not np.isfinite(theta).all():
+        raise ValueError(f"reference: expected a variant's name or {len(task.space)} finite numbers, got {reference!r}")
+    return theta

@@ -1,0 +1,184 @@
+"""Policy in the loop: an agent is trained in the simulators that an estimator believes in, and its actions teach the estimator.
+
+B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", sections 3.2 and 3.3
+(https://arxiv.org/abs/2011.08985). A run of ``steps`` control steps has ``updates`` iterations; in each
+
+1. the agent (``sipe_bayes.rl.ddpg``) acts and learns for ``steps / updates`` control steps. Every episode has a theta of its own,
+   drawn from the prior at first, then from the estimator's ``proposal`` where it has one (simopt's Gaussian), else from its
+   posterior. The transitions fill the replay buffer;
+2. the actions of the ``trajectories`` latest of these episodes, the noise of exploration included, are replayed from the same
+   starting states in the reference environment, whose theta is hidden from the estimator;
+3. the estimator gets the reference's trajectories, and spends its budget up to the share of the training that is done.
+
+What a method does with other trajectories each time follows from what its state holds:
+
+- The searches (simopt, adr, cem, also with learned rewards) keep a distribution over theta and begin a new pool of simulations:
+  they take as many steps as their share of the budget wants.
+- Everything else conditions on simulations of the actions in hand (npe, bayessim, abc, regression, maml, bayesopt) or on their
+  residuals (laplace, mcmc). Such a state says nothing of another experiment, so these are fitted anew to the present
+  trajectories with what is left of the budget so far. No trajectory counts twice, and an estimate knows the latest ones only. The
+  trajectories hold the reference's states, noise-free: ``Segments(dt, noise="white", starts="recorded")`` spares laplace and mcmc
+  the search for windows' starts.
+
+Two budgets: the estimator's counts its simulations as always; ``reference_rollouts`` counts the trajectories taken from the
+reference. Training, and the evaluations of the history, which nothing is chosen by, belong to neither.
+
+Convergence, the paper's: a seed counts only if its policy solves the environment (``Task.solved``). The paper does not say which of
+them. Here it is the one that the policy was trained in, simulators drawn from the last estimate: to ask for the reference would count
+a seed because its estimate is good, and with it its accuracy. What the last policy does in the reference stands beside it.
+
+A theta that is outside the cube or unphysical is drawn anew and counted (``redrawn``). One whose simulation diverges ends its episode,
+the next has another theta, and that is counted too (``diverged``).
+
+Deviations. The reference replays the simulated episode's actions, where the paper lets the policy choose its own there ("control for
+starting states" alone): the methods that compare states need equal actions. Of an episode its first ``trajectory_steps`` are used,
+not the whole. How often the estimator is updated, and the pace of its budget, are not in the paper.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.gaussian_search import Search
+from sipe_bayes.inference.state import load_state, save_state
+from sipe_bayes.output import to_json, write_text
+from sipe_bayes.posterior import load_posterior
+from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
+from sipe_bayes.rl.settings import Settings
+from sipe_bayes.rl.train import Report
+
+CHECKPOINT = "checkpoint/state.safetensors"
+
+
+def train_in_the_loop(
+    estimator: Estimator,
+    reference: str | FloatArray = "default",
+    steps: int = 100_000,
+    *,
+    updates: int = 10,
+    trajectories: int = 1,
+    trajectory_steps: int | None = None,
+    settings: Settings | None = None,
+    evaluation_episodes: int = 10,
+    folder: str | Path | None = None,
+    resume: bool = False,
+    threads: int = 1,
+    report: Report | None = None,
+) -> LoopResult:
+    """Train a policy for ``steps`` control steps while ``estimator`` runs; see the module.
+
+    estimator: a fresh one on a simulator of a task, such as ``sipe.get_estimator("Pendulum", "simopt", budget=1000)``; it brings
+    prior, budget and seed, and is the run's own from then on. reference: a variant's name or theta (N,), which may lie outside
+    [0, 1]. updates: iterations. trajectories: taken from the reference for each; trajectory_steps: of each, default an
+    episode or its first 250. evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
+    folder: where ``history.csv``, ``result.json``, ``policy.safetensors``, ``posterior`` and a checkpoint, written at each update, are
+    kept; resume: go on from there, to the result of an undisturbed run.
+
+    A row of the history: update, step, rollouts (of the estimator so far), reference_rollouts, mean and sd (N,) of the estimate,
+    accuracy and least_accuracy (1 - |mean - truth|, mean and minimum over parameters: reported, never used), return and success
+    in simulation and reference (success None where only the return counts), redrawn, diverged, and failure: why an update gave
+    no estimate, in which case the one before stays. A first update that fails raises its ValueError.
+
+    Raises ValueError for arguments out of range, a folder that holds another run or, without ``resume``, any.
+    """
+    plan = Plan(steps, updates, trajectories, trajectory_steps, evaluation_episodes, settings or Settings())
+    run = LoopRun(estimator, reference, plan, threads)
+    kept = None if folder is None else _Folder(Path(folder), run, resume)
+    while len(run.history) < updates:
+        run.iterate(report)
+        if kept is not None:
+            kept.save(run)
+    found = run.result()
+    if kept is not None:
+        kept.finish(run, found)
+    return found
+
+
+class _Folder:
+    """What a run keeps on disk. The checkpoint names its replay buffer and posteriors, which are written before it, and those of the
+    one before go after it: an interruption leaves a whole set."""
+
+    _COUNTS = ("spent", "reference_rollouts", "redrawn", "idle")
+
+    def __init__(self, folder: Path, run: LoopRun, resume: bool) -> None:
+        self._folder, self._kept = folder, (folder / CHECKPOINT).parent
+        there = (folder / CHECKPOINT).is_file()
+        if there and not resume:
+            raise ValueError(
+                f"folder {folder}: holds a run already; pass resume=True to go on, or choose another folder"
+            )
+        self._kept.mkdir(parents=True, exist_ok=True)
+        if there:
+            self._load(run)
+
+    def save(self, run: LoopRun) -> None:
+        number = len(run.history)
+        run.trainer.replay.save(self._kept / f"replay-{number}.npz")
+        run.posterior.save(self._kept / f"posterior-{number}")
+        run.source.save(self._kept / f"proposal-{number}")
+        searched = run.estimator._state if isinstance(run.estimator, Search) else None
+        counts = {name: getattr(run, name) for name in self._COUNTS}
+        state = {
+            **{f"trainer.{k}": v for k, v in run.trainer.state().items()},
+            **{f"estimator.{k}": v for k, v in (searched or {}).items()},
+            **counts,
+            "diverged": run.trainer.episodes.simulator.diverged,
+            "history": json.dumps(run.history),
+            "warnings": list(run.estimator.warnings),
+        }
+        save_state(self._folder / CHECKPOINT, state, run.fingerprint)
+        for path in self._kept.iterdir():  # also what an interruption left
+            if path.name != "state.safetensors" and not path.stem.endswith(f"-{number}"):
+                path.unlink()
+        write_text(self._folder / "history.csv", _table(run.history, run.task.space.names))
+
+    def finish(self, run: LoopRun, found: LoopResult) -> None:
+        found.policy.save(self._folder / "policy.safetensors")
+        found.posterior.save(self._folder / "posterior")
+        said = {
+            "task": run.task.name,
+            "estimator": run.estimator.name,
+            "seed": run.estimator.seed,
+            "budget": run.budget,
+            "reference": run.truth.tolist(),
+            "converged": found.converged,
+            "solved_reference": found.solved_reference,
+            "solved_at": {"measure": run.task.solved.measure, "threshold": run.task.solved.threshold},
+            "warnings": list(found.warnings),
+            "history": list(found.history),
+        }
+        write_text(self._folder / "result.json", to_json(said, indent=1))
+
+    def _load(self, run: LoopRun) -> None:
+        state = load_state(self._folder / CHECKPOINT, run.fingerprint)
+        run.history = json.loads(state["history"])
+        number = len(run.history)
+        run.trainer.replay.load(self._kept / f"replay-{number}.npz")
+        run.trainer.restore(_part(state, "trainer."))
+        run.trainer.episodes.simulator.diverged = int(state["diverged"])
+        run.posterior = load_posterior(self._kept / f"posterior-{number}")
+        run.source = load_posterior(self._kept / f"proposal-{number}")
+        for name in self._COUNTS:
+            setattr(run, name, state[name])
+        run.estimator.warnings = list(state["warnings"])
+        if isinstance(run.estimator, Search):
+            run.estimator._state, run.estimator.rollouts = _part(state, "estimator."), run.spent
+
+
+def _part(state: dict[str, Any], prefix: str) -> dict[str, Any]:
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+
+
+def _table(history: list[Row], names: tuple[str, ...]) -> str:
+    """The history as CSV, with a column for each parameter's mean and sd."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    plain = [key for key in history[0] if key not in ("mean", "sd")]
+    writer.writerow([*plain, *(f"{kind}_{name}" for kind in ("mean", "sd") for name in names)])
+    writer.writerows([*(row[key] for key in plain), *row["mean"], *row["sd"]] for row in history)
+    return text.getvalue()
