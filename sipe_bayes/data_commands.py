@@ -113,6 +113,30 @@ def export(
     print(f"{len(found)} episodes of {found.actions.shape[1]} steps in {written}")
 
 
+@app.command()
+def demonstrate(
+    task: Annotated[str, typer.Argument(help="FetchPush, FetchSlide, FetchPickAndPlace, Door or Relocate.")],
+    out: Annotated[Path, typer.Option(help="An npz file; a JSON file beside it says how it was made.")],
+    count: Annotated[int, typer.Option(help="Episodes that succeed.")] = 100,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same demonstrations.")] = 0,
+    threads: Annotated[int, typer.Option(help="Native threads.")] = 1,
+) -> None:
+    """Make demonstrations for `sipe train --demonstrations`, by a scripted controller, or by a plan.
+
+    A plan (Door, Relocate) is searched for minutes. It is kept beside OUT, and the same command goes on with it."""
+    from sipe_bayes.cli import Progress
+    from sipe_bayes.rl.demonstrate import make
+
+    with _refusing():
+        _at_least(1, count=count, threads=threads)
+        _at_least(0, seed=seed)
+        if out.suffix != ".npz":
+            raise ValueError(f"--out {out}: expected a name that ends in .npz; call it {out.stem}.npz")
+        with Progress(unit="iterations") as progress:
+            facts = make(task, count, seed, out, _command(), threads, progress.update)
+    print(f"{count} of {facts['attempts']} attempts kept, mean return {facts['return_mean']:.1f}: {out}")
+
+
 def _names(*given: list[str] | None) -> Any:
     """The sets of the tasks, variants, splits and types given; raises ValueError for an unknown one."""
     from sipe_bayes import trajectory_sets

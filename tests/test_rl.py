@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import sipe_bayes as sipe
 from sipe_bayes.cli import app
 from sipe_bayes.rl.ddpg import Agent
-from sipe_bayes.rl.evaluation import check_agents, evaluate, write_card
+from sipe_bayes.rl.evaluation import check_agents, evaluate, install, write_card
 from sipe_bayes.rl.normaliser import Normaliser
 from sipe_bayes.rl.policy import Policy, PolicyError, load_policy
 from sipe_bayes.rl.replay import Batch
@@ -356,6 +356,22 @@ def test_cards_are_checked(tmp_path: Path) -> None:
         list(check_agents(tmp_path))
     with pytest.raises(FileNotFoundError, match="no agents"):
         list(check_agents(tmp_path / "nowhere"))
+
+
+def test_a_pair_is_installed_with_its_cards(tmp_path: Path) -> None:
+    made, there = tmp_path / "run", tmp_path / "agents"
+    for seed, name in enumerate(("expert", "suboptimal")):
+        policy(seed).save(made / f"{name}.safetensors")
+        with pytest.raises(FileNotFoundError, match=r"expert|suboptimal"):
+            install(made, there)  # the card, or the other agent, is missing
+        assert not there.exists()
+        (made / f"{name}.json").write_text(name)
+    paths = install(made, there)
+    assert paths == [there / "Pendulum-expert.safetensors", there / "Pendulum-suboptimal.safetensors"]
+    assert len(list(there.iterdir())) == 4
+    for seed, (path, name) in enumerate(zip(paths, ("expert", "suboptimal"), strict=True)):
+        assert path.with_suffix(".json").read_text() == name
+        np.testing.assert_array_equal(load_policy(path).layers[0][0], policy(seed).layers[0][0])
 
 
 def test_settings_out_of_range_are_refused() -> None:

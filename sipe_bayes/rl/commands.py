@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -34,14 +34,21 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
     hints = get_type_hints(Settings)
     own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.kind != p.VAR_KEYWORD]
     for f in fields(Settings):
-        if f.metadata and f.default is not MISSING:
-            option = typer.Option(f.default, help=f.metadata["help"])
-            own.append(
-                inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=hints[f.name])
-            )
+        default, hint, more = f.default, hints[f.name], dict[str, Any]()
+        if isinstance(default, tuple):
+            default, hint, more = ",".join(map(str, default)), Any, {"parser": _sizes, "metavar": "N,N"}
+        option = typer.Option(default, help=f.metadata["help"], **more)
+        own.append(inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=hint))
     command.__signature__ = inspect.Signature(own)  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in own}
     return command
+
+
+def _sizes(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(size) for size in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"expected layers' sizes such as 400,300, got {text!r}") from None
 
 
 @_with_settings
@@ -54,7 +61,8 @@ def train(
         bool, typer.Option("--resume", help="Go on from the folder's checkpoint, if it has one.")
     ] = False,
     demonstrations: Annotated[
-        Path | None, typer.Option(help="npz of trajectories with rewards, for --demonstration-share.")
+        Path | None,
+        typer.Option(help="npz of `sipe data demonstrate`, or others with rewards, for --demonstration-share."),
     ] = None,
     evaluate_every: Annotated[int, typer.Option(help="Steps between the points of the learning curve.")] = 5_000,
     evaluation_episodes: Annotated[int, typer.Option(help="Episodes of each point.")] = 10,
@@ -87,18 +95,25 @@ def train(
                 threads=threads,
                 report=progress.update,
             )
-        for name, card in _write_cards(folder, task, seed, steps, chosen, episodes).items():
+        for name, card in _write_cards(folder, task, seed, steps, chosen, episodes, demonstrations).items():
             print(f"{name}: {_earned(card['evaluation'])}, {folder / name}.safetensors")
 
 
 def agents(
     folder: Annotated[Path | None, typer.Argument(help="Of agents and their cards; default the shipped ones.")] = None,
     episodes: Annotated[int, typer.Option(help="Of each agent.")] = 100,
+    install: Annotated[bool, typer.Option("--install", help="First ship FOLDER's pair, made by `sipe train`.")] = False,
 ) -> None:
     """Evaluate each agent anew and compare with its card; exit code 1 where one is beyond two standard errors."""
     with _refusing():
+        from sipe_bayes.rl import evaluation
         from sipe_bayes.rl.evaluation import AGENTS, check_agents
 
+        if install:
+            if folder is None:
+                raise ValueError("--install: expected the output folder of a run, got none; give FOLDER")
+            for path in evaluation.install(folder):
+                print(f"installed {path}")
         differing = 0
         for row in check_agents(folder or AGENTS, episodes):
             verdict = "within two standard errors" if row["agrees"] else "BEYOND two standard errors"
@@ -114,11 +129,12 @@ def _earned(found: dict[str, Any]) -> str:
 
 
 def _write_cards(
-    folder: Path, task: str, seed: int, steps: int, settings: Settings, episodes: int
+    folder: Path, task: str, seed: int, steps: int, settings: Settings, episodes: int, demonstrations: Path | None
 ) -> dict[str, dict[str, Any]]:
     from importlib.metadata import version
 
     from sipe_bayes.envs.registry import make_task
+    from sipe_bayes.rl.demonstrate import facts_of
     from sipe_bayes.rl.evaluation import write_card
     from sipe_bayes.rl.train import choose, read_curve
 
@@ -131,6 +147,7 @@ def _write_cards(
         "wall_seconds": rows[-1][4],
         "deviations": settings.deviations(),
         "settings": settings.to_dict(),
+        "demonstrations": None if demonstrations is None else facts_of(demonstrations),
         "versions": {"python": platform.python_version(), **packages},
     }
     made, cards = make_task(task), {}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,25 @@ def write_card(path: Path, task: Task, facts: dict[str, Any], episodes: int = EP
     }
     write_text(path.with_suffix(".json"), to_json(card, indent=2))
     return card
+
+
+def install(folder: Path, into: Path = AGENTS) -> list[Path]:
+    """Copy the pair of agents that a run left in ``folder``, with their cards, to where a task's agents are looked for; returns
+    the agents' files."""
+    pairs = []
+    for name in ("expert", "suboptimal"):
+        path = folder / f"{name}.safetensors"
+        policy = load_policy(path)
+        if not path.with_suffix(".json").is_file():
+            raise FileNotFoundError(f"{path}: has no card {name}.json; let `sipe train --resume` finish")
+        pairs.append((path, into / f"{policy.task}-{name}.safetensors"))
+    into.mkdir(parents=True, exist_ok=True)
+    for path, there in pairs:
+        for suffix in (".json", ".safetensors"):  # an agent never without its card
+            temporary = there.with_name(f".{there.stem}{suffix}.tmp")
+            shutil.copyfile(path.with_suffix(suffix), temporary)
+            temporary.replace(there.with_suffix(suffix))
+    return [there for _, there in pairs]
 
 
 def check_agents(folder: Path = AGENTS, episodes: int = EPISODES) -> Iterator[dict[str, Any]]:

@@ -19,7 +19,9 @@ class Settings:
     discount: float = _setting(0.99, "Of a reward one control step later.", high=1)
     tau: float = _setting(0.005, "How far the targets follow their networks in an update.", high=1)
     batch: int = _setting(256, "Transitions of an update.", 1)
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] = field(
+        default=(256, 256), metadata={"help": "Units of each hidden layer, of actor and critic."}
+    )
     learning_rate: float = _setting(3e-4, "Of Adam, for actor and critic.")
     exploration: float = _setting(0.1, "Sd of the noise on actions, in half ranges.")
     start_steps: int = _setting(25_000, "Steps with uniformly random actions, before any update.")
