@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sipe_bayes import data_commands
+from sipe_bayes.benchmark import commands as benchmark_commands
 from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.rl import commands as rl_commands
 
@@ -23,6 +24,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(data_commands.app)
+app.add_typer(benchmark_commands.app)
+app.command()(benchmark_commands.simulate)
 app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 

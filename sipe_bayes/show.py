@@ -1,9 +1,11 @@
-"""``sipe.show_results``: what was estimated, as a table and a figure."""
+"""``sipe.show_results``: what was estimated, as a table and a figure: one posterior by its marginals, several environments by the
+SiPE plot."""
 
 from __future__ import annotations
 
 import os
 import uuid
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,30 +15,93 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior import Dirac, Posterior
 from sipe_bayes.posterior import prior as default_prior
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Estimates = Mapping[str, Posterior] | Mapping[str, Mapping[str, Posterior | Sequence[Posterior]]]
+
 _DRAWS = 4000
 
 
 def show_results(
-    posterior: Posterior, truth: Any = None, path: str | Path | None = None, console: Console | None = None
+    posterior: Posterior | Estimates,
+    truth: Any = None,
+    path: str | Path | None = None,
+    console: Console | None = None,
 ) -> Figure:
-    """Print each parameter's mean, sd and 90 % interval in its unit and how far it contracted from the prior; return the figure
-    of its marginals.
+    """One posterior: print each parameter's mean, sd and 90 % interval in its unit and how far it contracted from the prior;
+    return the figure of its marginals. truth: (N,) in theta, if it is known.
 
-    truth: (N,) in theta, if it is known. path: where to save the figure, as PNG. Raises ValueError for another shape."""
-    from sipe_bayes.diagnostics.posterior_plots import marginals
+    Estimates of several environments: print accuracy and CRPS skill, return the SiPE plot. They are given as environment ->
+    posterior, or as estimator -> environment -> a posterior or those of several seeds; truth: environment -> (N,) in theta.
 
-    known = None if truth is None else posterior.space.check_shape(truth)
-    figure = marginals(posterior, truth=known)
-    (console or Console()).print(results_table(posterior, known))
+    path: where to save the figure, as PNG. Raises ValueError for a truth that is missing or has another shape."""
+    if isinstance(posterior, Mapping):
+        figure, table = _several(posterior, truth)
+    else:
+        from sipe_bayes.diagnostics.posterior_plots import marginals
+
+        known = None if truth is None else posterior.space.check_shape(truth)
+        figure, table = marginals(posterior, truth=known), results_table(posterior, known)
+    (console or Console()).print(table)
     if path is not None:
         _save(figure, Path(path))
     return figure
+
+
+def _several(estimates: Estimates, truth: Any) -> tuple[Figure, Table]:
+    """The SiPE plot and the table of several environments' estimates, the prior mean among them."""
+    from sipe_bayes.diagnostics.scores import score
+    from sipe_bayes.diagnostics.sipe_plot import BASELINE, estimators, sipe_plot
+
+    nested = {name: value for name, value in estimates.items() if isinstance(value, Mapping)}
+    if nested and len(nested) < len(estimates):
+        odd = next(name for name in estimates if name not in nested)
+        raise ValueError(
+            f"estimates[{odd!r}]: expected environment -> posterior as of {next(iter(nested))!r}, got a posterior"
+        )
+    by_estimator: Mapping[str, Any] = nested or {"estimate": estimates}
+    runs = {
+        estimator: {name: [found] if isinstance(found, Posterior) else list(found) for name, found in of.items()}
+        for estimator, of in by_estimator.items()
+    }
+    scores: dict[str, dict[str, list[Any]]] = {}
+    for estimator, of in runs.items():
+        for name, posteriors in of.items():
+            known = _truth_of(name, truth)
+            scores.setdefault(estimator, {})[name] = [score(posterior, known) for posterior in posteriors]
+            if posteriors:
+                center = Dirac(default_prior(posteriors[0].space).mean, posteriors[0].space)
+                scores.setdefault(BASELINE, {})[name] = [score(center, known)]
+    figure = sipe_plot(scores)
+    return figure, _sipe_table({name: scores[name] for name in [*estimators(scores), BASELINE]})
+
+
+def _truth_of(environment: str, truth: Any) -> Any:
+    if not isinstance(truth, Mapping) or environment not in truth:
+        got = ", ".join(truth) if isinstance(truth, Mapping) else type(truth).__name__
+        raise ValueError(
+            f"truth: the SiPE plot needs environment -> theta, with {environment}, got {got}; "
+            f"sipe.make_task({environment!r}).theta(variant) has it"
+        )
+    return truth[environment]
+
+
+def _sipe_table(scores: Mapping[str, Mapping[str, Sequence[Any]]]) -> Table:
+    from sipe_bayes.diagnostics.sipe_plot import MODES, over_seeds
+
+    table = Table(box=box.SIMPLE, header_style="bold", padding=(0, 1, 0, 0))
+    for k, name in enumerate(("estimator", "environment", "accuracy", "min", "max", "CRPS skill")):
+        table.add_column(name, justify="left" if k < 2 else "right", no_wrap=k >= 2, overflow="fold")
+    for estimator, of in scores.items():
+        for environment in of:
+            accuracy = [over_seeds(of, [environment], "accuracy", mode)[0] for mode in MODES]
+            skill = over_seeds(of, [environment], "CRPS skill", "mean")[0]
+            table.add_row(estimator.replace("_", " "), environment, *(f"{value:.3f}" for value in (*accuracy, skill)))
+    return table
 
 
 def results_table(posterior: Posterior, truth: Any = None) -> Table:

@@ -1,0 +1,1 @@
+"""The benchmark: cells, their records, what runs them and what reads them."""

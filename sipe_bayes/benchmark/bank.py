@@ -1,0 +1,134 @@
+"""The simulations of the prior that estimators of one cell group share: filled in shards, anywhere, and verified.
+
+A bank is a folder of ``inference.simulations.Cache``: its name is a hash of model, parameters, prior, seed, actions and starts, and row i
+follows from the seed and i alone. So shards made on different machines are the parts of one bank: merging is copying their files into
+one folder, and a lost file is made again bit for bit. ``shard-*.json`` beside the blocks says what a shard cost.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from sipe_bayes.benchmark.log import recorded
+from sipe_bayes.benchmark.work import Done, Unit
+from sipe_bayes.checks import whole
+from sipe_bayes.envs.registry import make_task
+from sipe_bayes.envs.task import Variant
+from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations
+from sipe_bayes.likelihood import first_states
+from sipe_bayes.output import to_json
+from sipe_bayes.posterior import prior
+from sipe_bayes.simulator import Simulator
+
+FOLDER = "simulations"
+SHARD = 4  # blocks
+
+
+@dataclass(frozen=True)
+class Bank:
+    """Which simulations: those that replay the trajectory of a task's variant, of ``benchmark.log.recorded``."""
+
+    task: str
+    variant: Variant
+    seed: int
+    steps: int
+
+    @property
+    def id(self) -> str:
+        return f"{self.task}/{self.variant}/seed{self.seed}/{self.steps}"
+
+
+class _Blocks(Cache):
+    """A cache whose blocks are made in any order."""
+
+    def block(self, number: int, rows: int) -> Simulations:
+        """The first ``rows`` of a block, read or made."""
+        self._blocks = [self._none()] * number
+        self._blocks.append(self._read(number) or self._none())
+        made = self._blocks[number]
+        return made if len(made) >= rows else self._extended(number, rows)
+
+    def path(self, number: int) -> str:
+        return f"{FOLDER}/{self.key}/block-{number:06d}.npz"
+
+    def drawn(self, number: int) -> np.ndarray:
+        """theta (BLOCK, N) that a block has to hold."""
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+        return np.asarray(self.prior.sample((BLOCK,), generator=torch.Generator().manual_seed(seed)).numpy())
+
+
+@lru_cache(maxsize=2)
+def _opened(bank: Bank, folder: Path) -> _Blocks:
+    log = recorded(bank.task, bank.variant, bank.seed, bank.steps)
+    simulator = Simulator(make_task(bank.task), num_threads=1)
+    starts = first_states(simulator, log.trajectories)
+    return _Blocks(simulator, prior(simulator.space), log.trajectories, starts, bank.seed, folder)
+
+
+def shards(bank: Bank, budget: int, folder: Path) -> list[Unit]:
+    """What is to be simulated of the first ``budget`` rows, those left out that ``folder``/simulations has."""
+    rows = [min(BLOCK, budget - start) for start in range(0, whole("budget", budget), BLOCK)]
+    blocks = _opened(bank, folder / FOLDER)
+    assert blocks.folder is not None
+    lacking = [k for k, count in enumerate(rows) if _rows(blocks.folder / f"block-{k:06d}.npz") < count]
+    return [
+        Unit(f"simulations/{bank.id}/{part[0]}", _simulate, {"bank": bank, "blocks": [(k, rows[k]) for k in part]})
+        for part in (lacking[i : i + SHARD] for i in range(0, len(lacking), SHARD))
+    ]
+
+
+def _rows(path: Path) -> int:
+    """Rows of a block's file, 0 where it is missing or broken."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return len(data["valid"])
+    except Exception:  # whatever a broken file raises: it is made again
+        return 0
+
+
+def _simulate(bank: Bank, blocks: list[tuple[int, int]]) -> Done:
+    """A shard, simulated in a folder of its own: the machine need not see that of the results."""
+    began, cpu = time.perf_counter(), time.process_time()
+    with TemporaryDirectory() as made_in:
+        made = _opened.__wrapped__(bank, Path(made_in))
+        assert made.folder is not None
+        invalid = sum(int((~made.block(k, rows).valid).sum()) for k, rows in blocks)
+        files = [(made.path(k), (made.folder / f"block-{k:06d}.npz").read_bytes()) for k, _ in blocks]
+    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+    rows = sum(count for _, count in blocks)
+    cost = {"bank": bank.id, "rows": rows, "seconds": seconds, "cpu_seconds": cpu, "invalid": invalid}
+    files.append((f"{FOLDER}/{made.key}/shard-{blocks[0][0]:06d}.json", to_json(cost).encode()))
+    return Done(tuple(files), f"{rows} simulations, {seconds:.1f} s", cpu)
+
+
+def cost(folder: Path, key: str) -> float:
+    """CPU seconds that the bank ``key`` took, as far as its shards are in ``folder``."""
+    return float(
+        sum(json.loads(p.read_text(encoding="utf-8"))["cpu_seconds"] for p in (folder / key).glob("shard-*.json"))
+    )
+
+
+def verify(bank: Bank, budget: int, folder: Path, again: int = 1) -> list[str]:
+    """What is wrong with the first ``budget`` rows in ``folder``/simulations: blocks that are missing, broken or hold other theta than
+    the seed gives, and of the first ``again`` rows of each block those that come out otherwise when they are simulated again."""
+    blocks, wrong = _opened(bank, folder / FOLDER), []
+    for number, start in enumerate(range(0, budget, BLOCK)):
+        found = blocks._read(number)
+        name, want = blocks.path(number), min(BLOCK, budget - start)
+        if found is None or len(found) < want:
+            wrong.append(f"{name}: holds {0 if found is None else len(found)} of {want} simulations; simulate again")
+        elif not np.array_equal(found.theta, blocks.drawn(number)[: len(found)]):
+            wrong.append(f"{name}: its theta are not those of seed {bank.seed}; delete it and simulate again")
+        else:
+            made = blocks.simulate(found.theta[:again])
+            if not np.array_equal(made.observations, found.observations[:again], equal_nan=True):
+                wrong.append(f"{name}: comes out otherwise here; delete it, or simulate on one kind of processor")
+    return wrong

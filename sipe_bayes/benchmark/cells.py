@@ -1,0 +1,254 @@
+"""Cells: what the benchmark measures, one estimate each, and the suites made of them.
+
+The benchmark of B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators"
+(https://arxiv.org/abs/2011.08985): an estimator gets trajectories of an environment whose theta is hidden. Its settings:
+
+- direct: one recorded trajectory; the estimator compares states;
+- learned_reward: as direct, but a discriminator's reward takes the place of the difference of states;
+- policy, policy_learned_reward: the trajectories come from an agent that is trained meanwhile (``rl.policy_in_the_loop``);
+- gradient_steps: MAML with 0 to 10 of them at test time;
+- sweep: the grid of the paper's search over hyper-parameters, tuned by mean accuracy on validation trajectories of FetchPush and Relocate;
+- rollouts: direct with other budgets, for accuracy against rollouts.
+
+Tasks and estimators come from their registries, and which settings an estimator has follows from its arguments: a new method is
+its file and one line. The prior and its mean are cells as well: no table stands without them.
+
+Deviations. The paper sweeps and runs its ablation on unnamed variants; here they are the in-distribution one, as the default model
+lies at the centre of the range, where knowing nothing is a perfect guess. Its five environments with a policy are not all named;
+here they are one of each kind. Its search is taken as a full grid, without the combinations in which a value has no effect.
+"""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import inspect
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+from sipe_bayes.acting import Split
+from sipe_bayes.demonstration import default_steps
+from sipe_bayes.envs.registry import TASKS, make_task
+from sipe_bayes.envs.task import VARIANTS, Variant
+from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
+from sipe_bayes.trajectory_sets import TASKS as NINE
+
+BASELINES = ("prior", "prior_mean")
+PAPER = ("regression", "bayesopt", "maml", "simopt", "adr", "bayessim")
+_BESIDE = ("laplace", "npe")  # measured beside the paper's
+_WITH_POLICY = ("FetchPush", "Relocate", "Door", "HalfCheetahLinks", "HumanoidLinks")
+_TUNED_ON = ("FetchPush", "Relocate")
+_SEEDS = range(3)
+_GRADIENT_STEPS = range(11)
+_BUDGETS = (100, 300, 1000, 3000)
+_GRIDS: dict[str, tuple[dict[str, Sequence[Any]], ...]] = {  # the paper's appendix
+    "regression": ({"batch": (320, 160, 80, 40), "learning_rate": (0.001, 0.01, 0.05, 0.005)},),
+    "bayesopt": (
+        {"acquisition": ("upper_confidence_bound",), "kappa": (2.5, 5.0, 10.0, 1.0, 0.5)},
+        {"acquisition": ("expected_improvement",), "xi": (0.0, 0.5, 1.0)},
+    ),
+    "maml": ({"hidden": (40, 60, 100), "learning_rate": (0.001, 0.005, 0.0001)},),
+    "simopt": (
+        {
+            "updates": (4, 8, 12),
+            "particles": (4, 6, 8),
+            "initial_mean": (1.0, 0.5),
+            "initial_variance": (0.05, 0.1, 0.2),
+        },
+    ),
+    "adr": (
+        {"particles": (4, 6, 8, 10)},
+        {"particles": (4, 6, 8, 10), "reward": ("learned",), "learning_rate": (0.001, 0.005)},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One estimate. variant: of the environment whose theta is hidden; seed: of the estimator and the trajectory; values: what is set of
+    the estimator; budget: rollouts; steps: control steps of the trajectory, None for an episode or its first 250; training:
+    control steps of the agent's training, of the settings with a policy."""
+
+    task: str
+    estimator: str
+    setting: str = "direct"
+    variant: Variant = "in_distribution"
+    seed: int = 0
+    values: tuple[tuple[str, Any], ...] = ()
+    budget: int = 1000
+    steps: int | None = None
+    training: int = 100_000
+
+    @property
+    def id(self) -> str:
+        """Such as ``HalfCheetahLinks/bayessim/direct/in_distribution/seed0``."""
+        return f"{self.task}/{self.estimator}/{self._labelled}/{self.variant}/seed{self.seed}"
+
+    @property
+    def _labelled(self) -> str:
+        if self.setting == "gradient_steps":
+            return f"gradient_steps={dict(self.values)['gradient_steps']}"
+        if self.setting == "rollouts":
+            return f"rollouts={self.budget}"
+        return ",".join([self.setting, *(f"{name}={value}" for name, value in self.values)])
+
+    @property
+    def horizon(self) -> int:
+        """Control steps of the trajectory."""
+        task = make_task(self.task)
+        return default_steps(task) if self.steps is None else min(self.steps, task.episode_steps)
+
+    @property
+    def with_policy(self) -> bool:
+        return self.setting.startswith("policy")
+
+    @property
+    def split(self) -> Split:
+        """Of the trajectories: what is tuned never sees those that the results come from."""
+        return "validation" if self.setting == "sweep" else "reference"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments of the estimator."""
+        learned = {"reward": "learned"} if self.setting.endswith("learned_reward") else {}
+        return {**learned, **dict(self.values)}
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Cells under one name."""
+
+    about: str
+    cells: Callable[[], Iterator[Cell]]
+
+
+@cache
+def has(estimator: str, argument: str) -> bool:
+    """Whether an estimator takes an argument."""
+    classes = estimator_class(estimator).__mro__[:-1]
+    return any(argument in inspect.signature(c).parameters for c in classes)
+
+
+def direct(
+    tasks: Iterable[str], estimators: Iterable[str], variants: Iterable[Variant], seeds: Iterable[int] = _SEEDS
+) -> Iterator[Cell]:
+    for task, variant, seed, estimator in itertools.product(tasks, variants, seeds, list(estimators)):
+        yield Cell(task, estimator, "direct", variant, seed)
+
+
+def learned(tasks: Iterable[str], estimators: Iterable[str], setting: str = "learned_reward") -> Iterator[Cell]:
+    chosen = [name for name in estimators if has(name, "reward")]
+    for task, seed, estimator in itertools.product(tasks, _SEEDS, chosen):
+        yield Cell(task, estimator, setting, seed=seed)
+
+
+def gradient_steps(tasks: Iterable[str]) -> Iterator[Cell]:
+    chosen = [name for name in ESTIMATORS if has(name, "gradient_steps")]
+    for task, seed, estimator, steps in itertools.product(tasks, _SEEDS, chosen, _GRADIENT_STEPS):
+        yield Cell(task, estimator, "gradient_steps", seed=seed, values=(("gradient_steps", steps),))
+
+
+def policy(tasks: Iterable[str], estimators: Iterable[str]) -> Iterator[Cell]:
+    for task, seed, estimator in itertools.product(tasks, _SEEDS, list(estimators)):
+        yield Cell(task, estimator, "policy", seed=seed)
+
+
+def sweep() -> Iterator[Cell]:
+    for task, seed, (estimator, grids) in itertools.product(_TUNED_ON, _SEEDS, _GRIDS.items()):
+        for grid in grids:
+            for values in itertools.product(*grid.values()):
+                yield Cell(task, estimator, "sweep", seed=seed, values=tuple(zip(grid, values, strict=True)))
+
+
+def rollouts() -> Iterator[Cell]:
+    for task, seed, estimator, budget in itertools.product(
+        ("FetchPush", "HalfCheetahLinks"), _SEEDS, ESTIMATORS, _BUDGETS
+    ):
+        yield Cell(task, estimator, "rollouts", seed=seed, budget=budget)
+
+
+def _quick() -> Iterator[Cell]:
+    chosen = (*BASELINES, "laplace", "npe", "bayessim", "regression", "simopt", "adr")
+    for cell in direct(("FetchPush", "Door", "HalfCheetahLinks"), chosen, ("in_distribution",), (0,)):
+        yield replace(cell, budget=200, steps=50)
+
+
+def _direct_suite() -> Iterator[Cell]:
+    return direct(NINE, (*BASELINES, *PAPER, *_BESIDE), VARIANTS)
+
+
+def _paper() -> Iterator[Cell]:
+    yield from _direct_suite()
+    yield from learned(NINE, ("simopt", "adr"))
+    yield from gradient_steps(NINE)
+    yield from _policy_suite()
+
+
+def _policy_suite() -> Iterator[Cell]:
+    yield from policy(_WITH_POLICY, ("regression", "bayesopt", "maml", "simopt", "adr"))
+    yield from learned(_WITH_POLICY, ("simopt", "adr"), "policy_learned_reward")
+
+
+def _all() -> Iterator[Cell]:
+    yield from direct(TASKS, (*BASELINES, *ESTIMATORS), VARIANTS)
+    yield from learned(TASKS, ESTIMATORS)
+    yield from gradient_steps(TASKS)
+    yield from policy(TASKS, ESTIMATORS)
+    yield from learned(TASKS, ESTIMATORS, "policy_learned_reward")
+    yield from rollouts()
+    yield from sweep()
+
+
+SUITES = {
+    "quick": Suite("three environments, six estimators, one seed, 200 rollouts of 50 control steps", _quick),
+    "paper": Suite("direct, learned_reward, gradient_steps and policy", _paper),
+    "direct": Suite("nine environments, the paper's estimators, laplace and npe, three variants", _direct_suite),
+    "learned_reward": Suite("simopt and adr on nine environments", lambda: learned(NINE, ("simopt", "adr"))),
+    "gradient_steps": Suite("MAML with 0 to 10 steps at test time on nine environments", lambda: gradient_steps(NINE)),
+    "policy": Suite("five estimators on five environments, simopt and adr also with learned rewards", _policy_suite),
+    "rollouts": Suite("every estimator with 100 to 3,000 rollouts on two environments", rollouts),
+    "sweep": Suite("the hyper-parameters of the paper's appendix, on validation trajectories", sweep),
+    "all": Suite("every task and estimator there is, in every setting; to select from", _all),
+}
+
+
+def suite(name: str) -> list[Cell]:
+    """The cells of a suite; raises ValueError for an unknown one."""
+    if name not in SUITES:
+        raise ValueError(f"--suite {name}: expected one of {', '.join(SUITES)}")
+    return list(SUITES[name].cells())
+
+
+def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
+    """The cells of a suite whose id matches one of the patterns, all without any; raises ValueError for a pattern that matches none.
+
+    A pattern is a shell's (``half_cheetah*/adr/*``); capitals and underscores do not count, and it may stop at any ``/``."""
+    cells = suite(name)
+    if not patterns:
+        return cells
+    chosen = [{cell.id for cell in cells if matches(cell.id, pattern)} for pattern in patterns]
+    for pattern, found in zip(patterns, chosen, strict=True):
+        if not found:
+            raise ValueError(f"--select {pattern}: {_no_match(name, cells, pattern)}")
+    wanted = set().union(*chosen)
+    return [cell for cell in cells if cell.id in wanted]
+
+
+def matches(cell_id: str, pattern: str) -> bool:
+    plain, wanted = _plain(cell_id), _plain(pattern).rstrip("/")
+    return fnmatch.fnmatchcase(plain, wanted) or fnmatch.fnmatchcase(plain, wanted + "/*")
+
+
+def _plain(text: str) -> str:
+    return text.lower().replace("_", "")
+
+
+def _no_match(name: str, cells: list[Cell], pattern: str) -> str:
+    elsewhere = next((other for other in SUITES if any(matches(c.id, pattern) for c in suite(other))), None)
+    if elsewhere is not None:
+        return f"matches no cell of the suite {name}; take --suite {elsewhere}"
+    close = difflib.get_close_matches(pattern, [cell.id for cell in cells], 1, 0.0)
+    return f"matches no cell of any suite; the nearest is {close[0] if close else cells[0].id}"

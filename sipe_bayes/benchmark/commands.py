@@ -1,0 +1,172 @@
+"""The commands ``sipe benchmark ...`` and ``sipe simulate``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sipe_bayes.benchmark import report_commands
+
+if TYPE_CHECKING:
+    from sipe_bayes.benchmark.work import Executor
+
+app = typer.Typer(name="benchmark", help="Measure estimators on the benchmark's environments.", no_args_is_help=True)
+app.command()(report_commands.report)
+
+BAD_INPUT = 2
+_INTERRUPTED = 130
+Out = Annotated[Path, typer.Option(help="Folder of results; the same command goes on where it was interrupted.")]
+Jobs = Annotated[int | None, typer.Option(help="Processes of one thread each; default all cores.")]
+Where = Annotated[
+    str, typer.Option(help="pool: processes of this machine; ray: a cluster; inline: this process alone.")
+]
+Address = Annotated[str | None, typer.Option(help="HOST:PORT of a Ray cluster; default one on this machine.")]
+
+
+@contextmanager
+def _refusing(then: str = "") -> Iterator[None]:
+    """Input errors are one line on standard error and exit code 2; an interruption says what to do ``then``."""
+    try:
+        yield
+    except (ValueError, ImportError, OSError, RuntimeError) as error:
+        if type(error).__name__ == "LinAlgError":  # a ValueError to NumPy, but no input is at fault
+            raise
+        print(f"sipe: {' '.join(str(error).split())}", file=sys.stderr)
+        raise typer.Exit(BAD_INPUT) from None
+    except KeyboardInterrupt:
+        print(f"sipe: interrupted{then}", file=sys.stderr)
+        raise typer.Exit(_INTERRUPTED) from None
+
+
+@app.command()
+def run(
+    suite: Annotated[str, typer.Option(help="See `sipe benchmark cells`.")] = "paper",
+    select: Annotated[
+        list[str] | None, typer.Option(help="Only ids like this one, such as 'half_cheetah*/adr/*'; again for several.")
+    ] = None,
+    out: Out = Path("results"),
+    budget: Annotated[int | None, typer.Option(help="Rollouts of each cell; default the suite's.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Control steps of a trajectory; default the suite's.")] = None,
+    training: Annotated[int | None, typer.Option(help="Control steps of an agent's training.")] = None,
+    jobs: Jobs = None,
+    executor: Where = "pool",
+    address: Address = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")] = False,
+) -> None:
+    """Measure the cells of a suite that have no record yet; exit code 1 if one failed."""
+    with _refusing("; the same command goes on"):
+        from sipe_bayes.benchmark import run as runs
+        from sipe_bayes.benchmark.cells import select as chosen
+
+        _at_least_one(budget=budget, steps=steps, training=training, jobs=jobs)
+        cells = runs.changed(chosen(suite, select or ()), budget=budget, steps=steps, training=training)
+        failed = runs.run(cells, out, _executor(executor, jobs, address), _command(), retry_failed, _say)
+    if failed:
+        print(f"sipe: {failed} cells failed; `sipe benchmark status {out}` shows why", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+@app.command()
+def status(
+    folder: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("results"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """How far a run is, what failed, and what it took."""
+    with _refusing():
+        from sipe_bayes.benchmark.status import lines, summary
+        from sipe_bayes.output import to_json
+
+        found = summary(folder)
+    print(to_json(found) if as_json else "\n".join(lines(found)))
+
+
+@app.command()
+def cells(
+    suite: Annotated[str | None, typer.Argument(help="Without one, the suites.")] = None,
+    select: Annotated[list[str] | None, typer.Option(help="As of `sipe benchmark run`.")] = None,
+) -> None:
+    """The suites, or the ids of a suite's cells."""
+    with _refusing():
+        from sipe_bayes.benchmark.cells import SUITES
+        from sipe_bayes.benchmark.cells import select as chosen
+
+        if suite is not None:
+            found = [cell.id for cell in chosen(suite, select or ())]
+        else:
+            found = [f"{name}: {len(list(s.cells()))} cells; {s.about}" for name, s in SUITES.items()]
+    print("\n".join(found))
+
+
+def simulate(
+    environment: Annotated[str, typer.Argument(help="A task of `sipe envs`.")],
+    budget: Annotated[int, typer.Option(help="Simulations.")] = 1000,
+    out: Out = Path("results"),
+    variant: Annotated[str, typer.Option(help="Whose trajectory is replayed.")] = "in_distribution",
+    seed: Annotated[int, typer.Option(help="Of the simulations and the trajectory.")] = 0,
+    steps: Annotated[int | None, typer.Option(help="Control steps; default an episode, at most 250.")] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Check what is there; exit code 1 where it is wrong.")
+    ] = False,
+    jobs: Jobs = None,
+    executor: Where = "pool",
+    address: Address = None,
+) -> None:
+    """Simulate the prior for the estimators that learn from it, in shards, which `sipe benchmark run --out` finds."""
+    with _refusing("; the same command goes on"):
+        from sipe_bayes.benchmark import bank
+        from sipe_bayes.benchmark import run as runs
+        from sipe_bayes.benchmark.cells import Cell
+        from sipe_bayes.envs.task import VARIANTS
+
+        _at_least_one(budget=budget, steps=steps, jobs=jobs)
+        if variant not in VARIANTS:
+            raise ValueError(f"--variant {variant}: expected one of {', '.join(VARIANTS)}")
+        cell: Any = Cell(environment, "prior", variant=variant, seed=seed, steps=steps)
+        which = bank.Bank(environment, cell.variant, seed, cell.horizon)
+        if not verify:
+            runs.simulate(which, budget, out, _executor(executor, jobs, address), _command(), _say)
+        wrong = bank.verify(which, budget, out)
+    for line in wrong:
+        print(f"sipe: {line}", file=sys.stderr)
+    if wrong:
+        raise typer.Exit(1)
+    print(f"{which.id}: {budget} simulations in {out / bank.FOLDER}, verified")
+
+
+def _executor(name: str, jobs: int | None, address: str | None) -> Callable[[], Executor]:
+    """What makes the executor; raises ValueError for options that do not go together."""
+    import os
+
+    if address is not None and name != "ray":
+        raise ValueError(f"--address {address}: goes with --executor ray alone; add it, or leave the address out")
+    if jobs is not None and name != "pool":
+        raise ValueError(f"--jobs {jobs}: goes with --executor pool alone; leave it out")
+    if name == "ray":
+        from sipe_bayes.benchmark.ray_executor import RayExecutor
+
+        return lambda: RayExecutor(address)
+    from sipe_bayes.benchmark.pool import Inline, Pool
+
+    if name not in ("pool", "inline"):
+        raise ValueError(f"--executor {name}: expected pool, ray or inline")
+    return Inline if name == "inline" else lambda: Pool(jobs or os.cpu_count() or 1)
+
+
+def _at_least_one(**options: int | None) -> None:
+    for option, value in options.items():
+        if value is not None and value < 1:
+            raise ValueError(f"--{option} {value}: expected at least 1; raise it or leave it out")
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _command() -> str:
+    return shlex.join(["sipe", *sys.argv[1:]])

@@ -1,0 +1,77 @@
+"""The recorded trajectory that a cell of the benchmark is given, and which parameters it determines.
+
+A trajectory is what ``sipe.demonstrations`` gives: an expert's, or an excitation policy's where no expert is installed; noise-free,
+with recorded states. It depends on task, variant, seed, length and split alone, so every estimator gets the same one.
+
+A parameter counts as determined where the Fisher information of the trajectory's control steps at the truth, under noise of 0.1 % of
+each channel's spread, leaves less than half of the prior's sd, whatever the methods say.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.acting import Split
+from sipe_bayes.demonstration import demonstrations
+from sipe_bayes.envs.registry import make_task
+from sipe_bayes.envs.task import Variant
+from sipe_bayes.likelihood import Segments
+from sipe_bayes.posterior import prior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
+
+FloatArray = NDArray[np.float64]
+
+_NOISE = 1e-3  # of a channel's spread
+_DETERMINED = 0.5  # of the prior's sd
+
+
+@dataclass(frozen=True)
+class Log:
+    """truth (N,): theta; trajectories: one; determined (N,), None out of distribution; source: "expert" or "excitation"."""
+
+    truth: FloatArray
+    trajectories: Trajectories
+    determined: NDArray[np.bool_] | None
+    source: str
+
+    @property
+    def steps(self) -> int:
+        return self.trajectories.actions.shape[1]
+
+
+@lru_cache(maxsize=4)
+def recorded(task: str, variant: Variant, seed: int, steps: int, split: Split = "reference") -> Log:
+    """The log of a task's variant."""
+    made = make_task(task)
+    simulator = Simulator(made, num_threads=1)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UserWarning)
+        found = demonstrations(simulator, split=split, variant=variant, count=1, seed=seed, steps=steps)
+    source = "excitation" if any("excitation" in str(w.message) for w in said) else "expert"
+    truth = made.theta(variant)
+    inside = bool(((truth >= 0) & (truth <= 1)).all())
+    return Log(truth, found, determined(simulator, truth, found) if inside else None, source)
+
+
+def one_step(simulator: Simulator) -> Segments:
+    """Windows of one control step from recorded states."""
+    return Segments(simulator.dt, noise="white", starts="recorded")
+
+
+def determined(simulator: Simulator, truth: FloatArray, trajectories: Trajectories) -> NDArray[np.bool_]:
+    """Which parameters (N,) the trajectories determine; see the module's docstring."""
+    windows = one_step(simulator).bind(simulator, trajectories)
+    jacobian = windows.linearise(truth, windows.no_starts()).jacobian
+    spread = np.concatenate([t.observations for t in trajectories]).std(0)
+    sd = _NOISE * np.maximum(spread, _NOISE * np.median(spread[spread > 0]))
+    rows = (jacobian / sd[:, None]).reshape(-1, len(truth))
+    before = prior(simulator.space)
+    information = rows.T @ rows + np.diag(1 / before.variance.numpy())
+    left = np.sqrt(np.diag(np.linalg.inv(information)))
+    return np.asarray(left < _DETERMINED * before.stddev.numpy())

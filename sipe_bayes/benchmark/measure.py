@@ -1,0 +1,235 @@
+"""Measuring one cell: its log, its estimate, its scores, its record."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sipe_bayes.benchmark import bank
+from sipe_bayes.benchmark.cells import BASELINES, Cell
+from sipe_bayes.benchmark.log import Log, one_step, recorded
+from sipe_bayes.benchmark.records import RECORDS, Record, file_name
+from sipe_bayes.benchmark.work import Done
+from sipe_bayes.diagnostics.scores import score
+from sipe_bayes.envs.registry import make_task
+from sipe_bayes.inference.base import Estimator, digest
+from sipe_bayes.inference.prior_sampling import PriorSampling
+from sipe_bayes.inference.registry import estimator_class, get_estimator
+from sipe_bayes.posterior import Dirac, Posterior, prior
+from sipe_bayes.simulator import Simulator
+
+POLICIES = "policies"
+_PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "sbi", "botorch")
+_ALONG = (0.1, 0.25, 0.5)  # of the budget, where the history looks at an estimate
+_CANDIDATES = 0.1  # of the budget: starting points of the methods that search a likelihood
+
+
+@dataclass(frozen=True)
+class _Found:
+    """An estimate, what it cost and what was said; more: entries of the record."""
+
+    posterior: Posterior
+    seconds: float | None
+    cpu_seconds: float | None
+    rollouts: int
+    warnings: list[str]
+    history: list[dict[str, Any]]
+    more: dict[str, Any]
+
+
+def versions() -> dict[str, str]:
+    found = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = ""
+    return found
+
+
+def run(cell: Cell, folder: Path, command: str) -> Done:
+    """Measure a cell. folder: of the results; read for simulations, and a training's checkpoints are kept in it."""
+    began = time.process_time()
+    record = _blank(cell, command)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            record, netcdf = _measured(cell, record, folder)
+    except Exception:  # a failed cell must not stop the others
+        return _failed(record, traceback.format_exc(), time.process_time() - began)
+    files = ((f"{RECORDS}/{file_name(cell.id)}.nc", netcdf), _json(record))
+    line = f"accuracy {record.scores['mean_accuracy']:.3f}, CRPS {record.scores['mean_crps']:.3f}"
+    line += "" if record.seconds is None else f", {record.seconds:.1f} s"
+    return Done(files, line, time.process_time() - began)
+
+
+def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
+    """What a cell comes to whose process does not live to tell."""
+    return _failed(_blank(cell, command), why, 0.0)
+
+
+def _failed(record: Record, why: str, cpu: float) -> Done:
+    return Done((_json(replace(record, status="failed", traceback=why)),), why.strip().splitlines()[-1], cpu, True)
+
+
+def _json(record: Record) -> tuple[str, bytes]:
+    return f"{RECORDS}/{file_name(record.id)}.json", record.to_json().encode()
+
+
+def _blank(cell: Cell, command: str) -> Record:
+    return Record(
+        id=cell.id,
+        task=cell.task,
+        estimator=cell.estimator,
+        setting=cell.setting,
+        variant=cell.variant,
+        seed=cell.seed,
+        budget=cell.budget,
+        steps=cell.horizon,
+        status="done",
+        values=dict(cell.values),
+        versions=versions(),
+        command=command,
+    )
+
+
+def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, bytes]:
+    task = make_task(cell.task)
+    log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
+    simulator = Simulator(task, num_threads=1)
+    if cell.estimator in BASELINES:
+        found = _baseline(cell, simulator)
+    elif cell.with_policy:
+        found = _with_policy(cell, simulator, folder)
+    else:
+        found = _estimated(cell, simulator, log, folder)
+    posterior = found.posterior
+    scores = score(posterior, log.truth)
+    last = {"rollouts": found.rollouts, "mean_accuracy": scores.mean_accuracy, "mean_crps": scores.mean_crps}
+    rows = [row for row in found.history if row["rollouts"] < found.rollouts]
+    record = replace(
+        record,
+        seconds=found.seconds,
+        cpu_seconds=found.cpu_seconds,
+        rollouts=found.rollouts,
+        warnings=found.warnings,
+        names=list(simulator.space.names),
+        truth=log.truth.tolist(),
+        mean=posterior.mean.tolist(),
+        sd=posterior.stddev.tolist(),
+        scores=scores.to_dict(),
+        determined=None if log.determined is None or cell.with_policy else log.determined.tolist(),
+        history=[*rows, last],
+        log="policy" if cell.with_policy else log.source,
+        checksums={"model": simulator.checksum(), "log": digest(log.trajectories)},
+        **found.more,
+    )
+    return record, _netcdf(posterior, cell.seed)
+
+
+def _baseline(cell: Cell, simulator: Simulator) -> _Found:
+    space = simulator.space
+    posterior = prior(space) if cell.estimator == "prior" else Dirac(np.full(len(space), 0.5), space)
+    return _Found(posterior, 0.0, 0.0, 0, [], [], {})
+
+
+def _estimator(cell: Cell, simulator: Simulator, **settings: Any) -> Estimator:
+    if estimator_class(cell.estimator).searches:
+        settings.update(candidates=int(_CANDIDATES * cell.budget), likelihood=one_step(simulator))
+    return get_estimator(simulator, cell.estimator, budget=cell.budget, seed=cell.seed, **settings, **cell.settings)
+
+
+def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Found:
+    """Step by step; the looks at the estimate along the way cost the method nothing and change nothing."""
+    shares = issubclass(estimator_class(cell.estimator), PriorSampling)
+    simulations = folder / bank.FOLDER
+    estimator = _estimator(cell, simulator, **({"cache": simulations} if shares else {}))
+    clock, history = _Clock(), []
+    looks = [] if shares else [share * cell.budget for share in _ALONG]
+    while not _over(estimator):
+        clock.time(lambda: estimator.update_parameter_estimate(log.trajectories))
+        if looks and estimator.rollouts >= looks[0] and not _over(estimator):
+            looks = [share for share in looks if share > estimator.rollouts]
+            history += _look(estimator, log)
+    posterior = clock.time(lambda: estimator.get_parameter_estimate(log.trajectories))
+    more: dict[str, Any] = {}
+    if isinstance(estimator, PriorSampling):
+        key = estimator._simulations(log.trajectories).key
+        more["simulation_cpu_seconds"] = bank.cost(simulations, key)
+    said = list(estimator.warnings)
+    return _Found(posterior, clock.seconds, clock.cpu_seconds, estimator.rollouts, said, history, more)
+
+
+def _over(estimator: Estimator) -> bool:
+    return estimator._state is not None and bool(estimator._state["done"])
+
+
+def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
+    """A row of the history, if there is an estimate yet; the estimator stays as it is."""
+    said = list(estimator.warnings)
+    try:
+        scores = score(estimator.get_parameter_estimate(log.trajectories), log.truth)
+    except ValueError:  # too early
+        return []
+    finally:
+        estimator.warnings = said
+    return [{"rollouts": estimator.rollouts, "mean_accuracy": scores.mean_accuracy, "mean_crps": scores.mean_crps}]
+
+
+def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
+    from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, train_in_the_loop
+
+    own = folder / POLICIES / file_name(cell.id)
+    fresh, clock = not (own / CHECKPOINT).exists(), _Clock()
+    found = clock.time(
+        lambda: train_in_the_loop(
+            _estimator(cell, simulator),
+            cell.variant,
+            cell.training,
+            trajectory_steps=cell.horizon,
+            folder=own,
+            resume=True,
+        )
+    )
+    history: list[dict[str, Any]] = [
+        {"rollouts": row["rollouts"], "mean_accuracy": row["accuracy"], "mean_crps": None} for row in found.history
+    ]
+    seconds, cpu = (clock.seconds, clock.cpu_seconds) if fresh else (None, None)
+    more = {"converged": found.converged, "solved_reference": found.solved_reference}
+    return _Found(found.posterior, seconds, cpu, history[-1]["rollouts"], list(found.warnings), history, more)
+
+
+class _Clock:
+    """Seconds and CPU seconds spent in what is timed."""
+
+    def __init__(self) -> None:
+        self.seconds = self.cpu_seconds = 0.0
+
+    def time(self, call: Callable[[], Any]) -> Any:
+        began, cpu = time.perf_counter(), time.process_time()
+        try:
+            return call()
+        finally:
+            self.seconds += time.perf_counter() - began
+            self.cpu_seconds += time.process_time() - cpu
+
+
+def _netcdf(posterior: Posterior, seed: int) -> bytes:
+    """The bytes of the posterior's netCDF, the same for the same posterior."""
+    data = posterior.to_inference_data(generator=torch.Generator().manual_seed(seed))
+    for group in data.groups():
+        data[group].attrs.pop("created_at", None)
+    with tempfile.TemporaryDirectory() as made_in:
+        path = Path(made_in) / "posterior.nc"
+        data.to_netcdf(str(path), engine="h5netcdf")
+        return path.read_bytes()

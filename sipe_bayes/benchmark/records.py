@@ -1,0 +1,147 @@
+"""Records: what a cell of the benchmark came to.
+
+A folder of results holds ``records/ID.json`` for each finished cell, with ``/`` of its id as ``__``; beside it ``records/ID.nc``, the
+posterior (ArviZ, physical units); and ``plan.json``, every cell that was ever asked for, so that what is missing can be said.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from sipe_bayes.output import OutputError, to_json, write_text
+
+RECORDS = "records"
+PLAN = "plan.json"
+
+
+class RecordError(OutputError):
+    """A record that cannot be read."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Of one cell, N parameters; all parameters in theta, [0, 1] being the range.
+
+    id: ``TASK/ESTIMATOR/SETTING/VARIANT/seedK``; setting: direct, learned_reward, policy, policy_learned_reward, gradient_steps,
+    rollouts or sweep; values: what the cell sets of the estimator ({"gradient_steps": 3}). steps: control steps of the trajectory.
+    status: a failed cell has a traceback and neither mean nor scores. seconds and cpu_seconds: of the method, without the shared
+    simulations of the prior, whose CPU time is simulation_cpu_seconds; None for a run that went on after an interruption. rollouts:
+    counted by the estimator. scores: ``diagnostics.scores.Scores.to_dict``. determined: which parameters the log determines (the
+    rule: ``benchmark.log``); None out of distribution. history: rows of rollouts, mean_accuracy, mean_crps (None with a policy)
+    along the way, the last one the result. log: who acted, "expert" or "excitation", or "policy". converged: of a cell with a
+    policy, whether the last one solves simulators drawn from the estimate; solved_reference: whether it solves the reference.
+    """
+
+    id: str
+    task: str
+    estimator: str
+    setting: str
+    variant: str
+    seed: int
+    budget: int
+    steps: int
+    status: Literal["done", "failed"]
+    values: dict[str, Any] = field(default_factory=dict)
+    traceback: str | None = None
+    seconds: float | None = None
+    cpu_seconds: float | None = None
+    simulation_cpu_seconds: float = 0.0
+    rollouts: int = 0
+    warnings: list[str] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    truth: list[float] = field(default_factory=list)
+    mean: list[float] = field(default_factory=list)
+    sd: list[float] = field(default_factory=list)
+    scores: dict[str, Any] = field(default_factory=dict)
+    determined: list[bool] | None = None
+    history: list[dict[str, Any]] = field(default_factory=list)
+    log: str = ""
+    converged: bool | None = None
+    solved_reference: bool | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+    checksums: dict[str, str] = field(default_factory=dict)
+    command: str = ""
+
+    @property
+    def done(self) -> bool:
+        return self.status == "done"
+
+    def to_json(self) -> str:
+        return to_json(asdict(self), indent=1) + "\n"
+
+    def write(self, folder: Path) -> Path:
+        """Write ``records/ID.json`` in a folder of results, atomically."""
+        path = record_path(folder, self.id)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, self.to_json())
+        return path
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Raises RecordError for a file that is no record."""
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            known = {f.name for f in fields(cls)}
+            unknown = sorted(set(found) - known)
+            if unknown:
+                raise TypeError(f"unknown entry {unknown[0]!r}")
+            record = cls(**found)
+        except (OSError, ValueError, TypeError) as error:
+            raise RecordError(
+                f"{path}: cannot be read as a record ({error}); delete it, and the cell runs again"
+            ) from None
+        return record
+
+
+def file_name(cell_id: str) -> str:
+    """Of a cell's files, without the ending."""
+    return cell_id.replace("/", "__")
+
+
+def record_path(folder: Path, cell_id: str) -> Path:
+    return folder / RECORDS / f"{file_name(cell_id)}.json"
+
+
+def posterior_path(folder: Path, cell_id: str) -> Path:
+    return folder / RECORDS / f"{file_name(cell_id)}.nc"
+
+
+def load_all(folder: Path) -> list[Record]:
+    """All records of a folder of results, by id; raises RecordError where there is none, or one cannot be read."""
+    records = folder / RECORDS
+    found = sorted(path for path in records.glob("*.json") if not path.name.startswith(".")) if records.is_dir() else []
+    if not found:
+        raise RecordError(f"{folder}: holds no records; make some with `sipe benchmark run --out {folder}`")
+    return [Record.read(path) for path in found]
+
+
+def planned(folder: Path) -> list[str]:
+    """The ids of all cells that were ever asked for in this folder, in order."""
+    path = folder / PLAN
+    if not path.is_file():
+        return []
+    try:
+        return [str(cell) for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RecordError(f"{path}: cannot be read ({error}); delete it and run the suite again") from None
+
+
+def plan(folder: Path, cells: list[str]) -> None:
+    """Add cells to those that were asked for."""
+    every = list(dict.fromkeys([*planned(folder), *cells]))
+    write_text(folder / PLAN, to_json({"cells": every}, indent=0) + "\n")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file atomically; what could not be written leaves nothing behind."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

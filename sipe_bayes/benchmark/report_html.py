@@ -1,0 +1,47 @@
+"""The benchmark's results as one self-contained HTML page: offline, on a phone, in print; tables sort by a click.
+
+The script on the page does nothing but sort; without it every number is still there.
+"""
+
+from __future__ import annotations
+
+import base64
+
+import jinja2
+
+from sipe_bayes.benchmark.cells import BASELINES
+from sipe_bayes.benchmark.report_contents import Contents
+from sipe_bayes.benchmark.tables import Table
+from sipe_bayes.diagnostics.plots import png
+from sipe_bayes.diagnostics.sipe_plot import two_lines
+
+
+def render(contents: Contents) -> str:
+    """The page."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sipe_bayes.benchmark", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        two_lines=two_lines,
+        label=label,
+        most_seeds=most_seeds,
+        capitalize_first=lambda text: text[:1].upper() + text[1:],
+    )
+    pictures = [p for section in contents.sections for p in (*section.pictures, *section.in_depth)]
+    sources = {p.name: f"data:image/png;base64,{base64.b64encode(png(p.figure)).decode()}" for p in pictures}
+    return environment.get_template("report.html.j2").render(contents=contents, sources=sources, baselines=BASELINES)
+
+
+def label(estimator: str) -> str:
+    """An estimator's name for the eye: "prior mean" for prior_mean."""
+    return estimator.replace("_", " ") if estimator in BASELINES else estimator
+
+
+def most_seeds(table: Table) -> int:
+    """Of any estimator's entry; the baselines need no seeds."""
+    counts = [len(e.values) for name, row in table.rows for e in row if e is not None and name not in BASELINES]
+    return max(counts, default=0)

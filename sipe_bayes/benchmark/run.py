@@ -1,0 +1,199 @@
+"""Running cells: what is not there yet is measured, each result is written once, and the same command goes on after any interruption.
+
+First the simulations that several estimators share (``bank``), then the cells. Units of work return their files, and this process alone
+writes them, each under a temporary name and renamed, a record after its posterior: a record that exists is whole.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from sipe_bayes.benchmark import bank, measure
+from sipe_bayes.benchmark.bank import Bank
+from sipe_bayes.benchmark.cells import BASELINES, Cell
+from sipe_bayes.benchmark.records import Record, file_name, plan, record_path, write_bytes
+from sipe_bayes.benchmark.work import Done, Executor, Unit
+from sipe_bayes.output import OutputError, to_json, write_text
+
+LOG = "runs.json"
+_LOCK = ".lock"
+Report = Callable[[str], None]
+
+
+def run(
+    cells: Sequence[Cell],
+    folder: Path,
+    start: Callable[[], Executor],
+    command: str = "",
+    retry_failed: bool = False,
+    report: Report = print,
+) -> int:
+    """Measure the cells that have no record in ``folder`` yet; returns how many failed. start: makes the executor, once the folder
+    is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
+    budgets or lengths, or that another run is at work in, and OSError where it cannot be written."""
+    with _claimed(folder):
+        left = [cell for cell in cells if not _finished(cell, folder, retry_failed)]
+        plan(folder, [cell.id for cell in cells])
+        report(f"{len(cells)} cells, {len(cells) - len(left)} of them there already")
+        if not left:
+            return 0
+        units = _units(left, folder, command)
+        return _carried_out(units, folder, start, command, report)
+
+
+def simulate(
+    which: Bank, budget: int, folder: Path, start: Callable[[], Executor], command: str, report: Report
+) -> int:
+    """Fill the first ``budget`` rows of a bank; returns how many shards there were to make. Raises as ``run``."""
+    with _claimed(folder):
+        units = bank.shards(which, budget, folder)
+        if units:
+            _carried_out(units, folder, start, command, report)
+        return len(units)
+
+
+@contextmanager
+def _claimed(folder: Path) -> Iterator[None]:
+    """The folder, made if need be, for one run at a time."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / _LOCK).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(
+                f"--out {folder}: another run is at work in it; wait for it, or choose another folder"
+            ) from None
+        yield
+
+
+def _finished(cell: Cell, folder: Path, retry_failed: bool) -> bool:
+    path = record_path(folder, cell.id)
+    if not path.is_file():
+        return False
+    found = Record.read(path)
+    mine: dict[str, Any] = {"budget": cell.budget, "steps": cell.horizon, "versions": measure.versions()}
+    for name, value in mine.items():
+        there = getattr(found, name)
+        if there != value:
+            raise OutputError(
+                f"--out {folder}: holds {cell.id} with {name} {_differing(there, value)} and not {_differing(value, there)}; "
+                "choose another folder"
+            )
+    return found.done or not retry_failed
+
+
+def _differing(one: Any, other: Any) -> Any:
+    """Of two sets of versions, what differs in the first."""
+    if not isinstance(one, dict):
+        return one
+    return ", ".join(f"{k} {v}" for k, v in one.items() if other.get(k) != v) or "fewer packages"
+
+
+def _units(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:
+    """Shards of simulations first, and then the cells, which wait for theirs."""
+    banks: dict[Bank, int] = {}
+    for cell in cells:
+        which = _bank(cell)
+        if which is not None:
+            banks[which] = max(banks.get(which, 0), cell.budget)
+    made = {which: bank.shards(which, budget, folder) for which, budget in banks.items()}
+    units = [shard for shards in made.values() for shard in shards]
+    for cell in cells:
+        arguments = {"cell": cell, "folder": folder.resolve(), "command": command}
+        which = _bank(cell)
+        needs = frozenset(shard.name for shard in made[which]) if which is not None else frozenset()
+        units.append(Unit(cell.id, measure.run, arguments, needs, measure.died))
+    return units
+
+
+def _bank(cell: Cell) -> Bank | None:
+    """The simulations that a cell shares with others."""
+    from sipe_bayes.inference.prior_sampling import PriorSampling
+    from sipe_bayes.inference.registry import estimator_class
+
+    alone = cell.estimator in BASELINES or cell.with_policy or cell.split != "reference"
+    if alone or not issubclass(estimator_class(cell.estimator), PriorSampling):
+        return None
+    return Bank(cell.task, cell.variant, cell.seed, cell.horizon)
+
+
+def _carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor], command: str, report: Report) -> int:
+    """Submit what needs nothing more, write what comes back, until nothing is left; returns the number of failures."""
+    waiting, written, failed = {unit.name: unit for unit in units}, set[str](), 0
+    with start() as executor:
+        log = _Log(folder, command, executor.workers, sum(unit.name.startswith("simulations/") for unit in units))
+        flying = 0
+        while waiting or flying:
+            for unit in [u for u in waiting.values() if not (u.needs - written)]:
+                executor.submit(waiting.pop(unit.name))
+                flying += 1
+            unit, done = executor.next()
+            flying -= 1
+            _write(unit, done, folder)
+            written.add(unit.name)
+            failed += done.failed
+            log.add(unit, done)
+            mark = "failed: " if done.failed else ""
+            report(f"{len(written)}/{len(units)} {unit.name} {mark}{done.line}")
+    return failed
+
+
+def _write(unit: Unit, done: Done, folder: Path) -> None:
+    for name, data in done.files:
+        write_bytes(folder / name, data)
+    checkpoint = folder / measure.POLICIES / file_name(unit.name) / "checkpoint"
+    if checkpoint.is_dir() and not done.failed:
+        shutil.rmtree(checkpoint)  # a replay buffer that nothing needs any more
+
+
+class _Log:
+    """``runs.json``: what each run took, kept up to date: seconds and CPU seconds, also of its simulations alone."""
+
+    def __init__(self, folder: Path, command: str, workers: int, shards: int) -> None:
+        self._path, self._began, self._shards = folder / LOG, time.perf_counter(), shards
+        self._before = runs(folder)
+        self._row: dict[str, Any] = {
+            "command": command,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "workers": workers,
+            "units": 0,
+            "seconds": 0.0,
+            "cpu_seconds": 0.0,
+            "simulating": {"seconds": 0.0, "cpu_seconds": 0.0},
+        }
+
+    def add(self, unit: Unit, done: Done) -> None:
+        now = time.perf_counter() - self._began
+        self._row = {**self._row, "units": self._row["units"] + 1, "seconds": now}
+        self._row["cpu_seconds"] += done.cpu_seconds
+        if self._shards and unit.name.startswith("simulations/"):
+            self._shards -= 1
+            spent = self._row["simulating"]["cpu_seconds"] + done.cpu_seconds
+            self._row["simulating"] = {"seconds": now, "cpu_seconds": spent}
+        write_text(self._path, to_json({"runs": [*self._before, self._row]}, indent=0) + "\n")
+
+
+def runs(folder: Path) -> list[dict[str, Any]]:
+    """What each run in a folder of results took."""
+    path = folder / LOG
+    try:
+        found: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["runs"] if path.is_file() else []
+    except (ValueError, KeyError) as error:
+        raise OutputError(f"{path}: cannot be read ({error}); delete it") from None
+    return found
+
+
+def changed(cells: Sequence[Cell], **changes: Any) -> list[Cell]:
+    """Cells with another budget, length or training, where one is given."""
+    given = {name: value for name, value in changes.items() if value is not None}
+    return [replace(cell, **given) for cell in cells] if given else list(cells)

@@ -1,0 +1,318 @@
+"""Tables of the benchmark: one number per estimator and environment, as mean and standard error over seeds.
+
+An entry is set apart as the best of its column only when that is outside noise: it must be the best mean and differ from every
+other estimator's by Welch's t-test at 5 % (B. Welch 1947, "The generalization of 'Student's' problem when several different
+population variances are involved", Biometrika 34, https://doi.org/10.1093/biomet/34.1-2.28). It follows that a column of
+equally good estimators has a best one in less than 5 % of cases, and that one seed never has one. Baselines do not compete, but the
+best must beat the prior mean and the prior too, except on the default variant, whose truth the prior mean is.
+
+A run with a policy counts only if the policy solved simulators drawn from the estimate, as in the paper (Mehta, Handa, Fox, Ramos
+2020, https://arxiv.org/abs/2011.08985, Section 3.2); where no run of a setting did, all count, and the report says so.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from sipe_bayes.benchmark.cells import BASELINES
+from sipe_bayes.benchmark.records import Record
+
+LEVEL = 0.05
+OUTSIDE = "out_of_distribution"
+ALL = "mean of all"
+
+Value = Callable[[Record, "Context"], float | None]
+Key = tuple[str, str, int]
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a value may need beside its record: the prior's CRPS (N,) by task, variant and seed."""
+
+    prior_crps: dict[Key, list[float]]
+
+    @classmethod
+    def of(cls, records: Sequence[Record]) -> Context:
+        return cls(
+            {(r.task, r.variant, r.seed): r.scores["crps"] for r in records if r.done and r.estimator == "prior"}
+        )
+
+    def crps(self, record: Record) -> list[float] | None:
+        """The prior's, on the same truth; of another seed where this one was not scored: the truth is the same."""
+        same = (
+            crps
+            for (task, variant, _), crps in self.prior_crps.items()
+            if (task, variant) == (record.task, record.variant)
+        )
+        return self.prior_crps.get((record.task, record.variant, record.seed)) or next(same, None)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A column's number. better: 1 where larger is better, -1 where smaller is, 0 where nothing is the best."""
+
+    name: str
+    meaning: str
+    better: int
+    digits: int
+    value: Value
+
+
+def _of_scores(key: str) -> Value:
+    return lambda record, _: record.scores.get(key)
+
+
+def _determined_skill(record: Record, context: Context) -> float | None:
+    """1 - CRPS / CRPS of the prior over the parameters that the log determines."""
+    reference = context.crps(record)
+    if reference is None or not record.determined or not any(record.determined):
+        return None
+    known = np.array(record.determined)
+    worst = float(np.array(reference)[known].mean())
+    return 1 - float(np.array(record.scores["crps"])[known].mean()) / worst if worst > 0 else None
+
+
+def _spread(record: Record, _: Context) -> float | None:
+    return float(record.scores["max_accuracy"]) - float(record.scores["min_accuracy"])
+
+
+def _noticed(record: Record, _: Context) -> float | None:
+    """Share of the parameters whose truth lies outside that put their median on that bound."""
+    outside = [float(n) for n in record.scores["noticed"] if n is not None]
+    return float(np.mean(outside)) if outside else None
+
+
+MEASURES = {
+    m.name: m
+    for m in (
+        Measure("accuracy", "1 - |mean - truth|, mean over parameters", 1, 3, _of_scores("mean_accuracy")),
+        Measure("worst accuracy", "the same of the worst parameter", 1, 3, _of_scores("min_accuracy")),
+        Measure("spread", "accuracy of the best parameter less that of the worst", -1, 3, _spread),
+        Measure("CRPS skill", "1 - CRPS / CRPS of the prior; 0 is the prior, 1 the truth", 1, 3, _of_scores("skill_over_prior")),
+        Measure("CRPS skill, determined", "the same over the parameters that the log determines", 1, 3, _determined_skill),
+        Measure("CRPS", "continuous ranked probability score in theta, mean over parameters", -1, 4, _of_scores("mean_crps")),
+        Measure("energy score", "of all parameters together, in theta", -1, 3, _of_scores("energy")),
+        Measure("coverage", "share of parameters whose 90 % interval holds the truth; 0.9 is right", 0, 2, lambda r, _: r.scores["coverage"]["0.9"]),
+        Measure("contraction", "1 - sd / sd of the prior, mean over parameters", 0, 2, _of_scores("mean_contraction")),
+        Measure("noticed", "share of parameters outside the bounds whose median sits on that bound", 1, 2, _noticed),
+        Measure("CPU seconds", "of the method, simulations included unless they were shared", 0, 0, lambda r, _: r.cpu_seconds),
+    )
+}  # fmt: skip
+_INSIDE_MEASURES = (
+    "accuracy",
+    "worst accuracy",
+    "spread",
+    "CRPS skill",
+    "CRPS skill, determined",
+    "coverage",
+    "contraction",
+    "CPU seconds",
+)
+_OUTSIDE_MEASURES = ("CRPS", "energy score", "noticed", "CPU seconds")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """values: of the seeds. best: set apart."""
+
+    values: tuple[float, ...]
+    digits: int
+    best: bool = False
+
+    @property
+    def mean(self) -> float:
+        return float(np.mean(self.values))
+
+    @property
+    def standard_error(self) -> float | None:
+        """None for one seed."""
+        count = len(self.values)
+        return float(np.std(self.values, ddof=1)) / math.sqrt(count) if count > 1 else None
+
+    def texts(self) -> tuple[str, str]:
+        """Mean and standard error; the latter empty for one seed."""
+        error = self.standard_error
+        return f"{self.mean + 0.0:.{self.digits}f}", "" if error is None else f"{error:.{self.digits}f}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """rows: (estimator, an entry or None for each column)."""
+
+    measure: Measure
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[Entry | None, ...]], ...]
+
+    def part(self, columns: Sequence[int]) -> Table:
+        """The same table with some of its columns."""
+        rows = tuple((name, tuple(entries[c] for c in columns)) for name, entries in self.rows)
+        return Table(self.measure, tuple(self.columns[c] for c in columns), rows)
+
+    def entry(self, row: str, column: str) -> Entry | None:
+        return dict(self.rows)[row][self.columns.index(column)]
+
+
+def measures(variant: str) -> tuple[str, ...]:
+    """The measures that mean something on a variant: outside the bounds neither accuracy nor coverage does."""
+    return _OUTSIDE_MEASURES if variant == OUTSIDE else _INSIDE_MEASURES
+
+
+def score_table(records: Sequence[Record], name: str, context: Context) -> Table | None:
+    """A table over the tasks of ``records``, all of one setting and variant; None where no record has the measure."""
+    measure = MEASURES[name]
+    columns = order_tasks({r.task for r in records})
+    default = all(r.variant == "default" for r in records)
+    rows: dict[str, dict[str, dict[int, float]]] = {e: {} for e in order_estimators({r.estimator for r in records})}
+    for record in records:
+        value = measure.value(record, context) if record.done else None
+        if value is not None and math.isfinite(value):
+            rows[record.estimator].setdefault(record.task, {})[record.seed] = float(value)
+    columns = [c for c in columns if any(c in row for row in rows.values())]
+    if not columns:
+        return None
+    rows = {estimator: row for estimator, row in rows.items() if row}
+    whole = [ALL] if len(columns) > 1 else []
+    entries = {
+        e: [*(_seeds(row.get(c, {})) for c in columns), *(_over_tasks(row, columns) for _ in whole)]
+        for e, row in rows.items()
+    }
+    best = [
+        _best({e: v[k] for e, v in entries.items()}, measure.better, default) for k in range(len(columns) + len(whole))
+    ]
+    return Table(
+        measure,
+        (*columns, *whole),
+        tuple(
+            (e, tuple(Entry(v, measure.digits, best[k] == e) if v else None for k, v in enumerate(values)))
+            for e, values in entries.items()
+        ),
+    )
+
+
+def _seeds(values: dict[int, float]) -> tuple[float, ...]:
+    return tuple(values[seed] for seed in sorted(values))
+
+
+def _over_tasks(row: dict[str, dict[int, float]], columns: Sequence[str]) -> tuple[float, ...]:
+    """Means over all tasks, of the seeds that have them all."""
+    if not all(c in row for c in columns):
+        return ()
+    seeds = set.intersection(*(set(row[c]) for c in columns))
+    return tuple(float(np.mean([row[c][seed] for c in columns])) for seed in sorted(seeds))
+
+
+def _best(column: dict[str, tuple[float, ...]], better: int, default: bool = False) -> str | None:
+    """The estimator that is the best outside noise, if there is one."""
+    mine = {e: v for e, v in column.items() if e not in BASELINES and v}
+    if better == 0 or len(mine) < 2:
+        return None
+    first = max(mine, key=lambda e: better * float(np.mean(mine[e])))
+    rest = [v for e, v in mine.items() if e != first]
+    trivial = [] if default else [float(np.mean(v)) for e, v in column.items() if e in BASELINES and v]
+    ahead = all(better * (float(np.mean(mine[first])) - t) > 0 for t in trivial)
+    return first if ahead and all(differ(mine[first], other) for other in rest) else None
+
+
+def differ(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Whether two means differ outside noise, by Welch's test; never with one seed on either side."""
+    if len(a) < 2 or len(b) < 2:
+        return False
+    if np.ptp(a) == 0 and np.ptp(b) == 0:  # deterministic
+        return bool(abs(a[0] - b[0]) > 1e-9)
+    moments = [m for v in (a, b) for m in (np.mean(v), np.std(v, ddof=1), len(v))]
+    return bool(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue < LEVEL)
+
+
+def counted(records: Sequence[Record]) -> tuple[list[Record], str]:
+    """The finished records that count, and a sentence about those that do not, empty where all do."""
+    done = [r for r in records if r.done]
+    judged = [r for r in done if r.converged is not None]
+    if not judged:
+        return done, ""
+    solved = [r for r in judged if r.converged]
+    where = f"{len(solved)} of {len(judged)} runs ended with a policy that solves the estimated simulators"
+    if not solved:
+        return done, f"{where}; so all runs are shown, and none would count in the paper."
+    return [r for r in done if r.converged is not False], f"{where}; the others do not count, as in the paper."
+
+
+def order_tasks(tasks: set[str]) -> list[str]:
+    from sipe_bayes.envs.registry import TASKS
+
+    return _ordered(tasks, list(TASKS))
+
+
+def order_estimators(names: set[str]) -> list[str]:
+    """As in the registry, the baselines last."""
+    from sipe_bayes.inference.registry import ESTIMATORS
+
+    return _ordered(names, [*ESTIMATORS, *BASELINES])
+
+
+def _ordered(names: set[str], order: list[str]) -> list[str]:
+    return sorted(names, key=lambda n: (order.index(n) if n in order else len(order) - len(BASELINES) - 0.5, n))
+
+
+def results(records: Sequence[Record]) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    """What the SiPE plot wants: estimator -> task -> scores of each seed."""
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for estimator in order_estimators({r.estimator for r in records}):
+        mine = [r for r in records if r.estimator == estimator and r.done]
+        found[estimator] = {t: [r.scores for r in mine if r.task == t] for t in order_tasks({r.task for r in mine})}
+    return found
+
+
+def renamed(records: Sequence[Record], label: str) -> list[Record]:
+    """The same records with the setting in the estimator's name, so that two settings stand in one table."""
+    return [replace(r, estimator=f"{r.estimator}, {label}") for r in records if r.estimator not in BASELINES]
+
+
+def warning_counts(records: Sequence[Record]) -> list[tuple[str, str, int]]:
+    """Estimator, warning and how often, the most frequent first; parameters and numbers left out, so that like counts as like."""
+
+    def general(record: Record, warning: str) -> str:
+        for name in sorted(record.names, key=len, reverse=True):
+            warning = re.sub(rf"\b{re.escape(name)}\b(, )?", "", warning)
+        return " ".join(re.sub(r"\d[\d.,e-]*", "#", warning).split())
+
+    count = Counter((r.estimator, general(r, w)) for r in records for w in r.warnings)
+    return [(estimator, text, times) for (estimator, text), times in count.most_common()]
+
+
+def sweep_rows(records: Sequence[Record]) -> list[tuple[str, str, Entry, bool]]:
+    """Of the search over hyper-parameters: estimator, values, mean accuracy over the tasks it was tuned on, whether these are the
+    library's defaults; the best first. Only combinations that were run on every task and seed of the search are comparable."""
+    tried: dict[tuple[str, str], dict[str, dict[int, float]]] = {}
+    ours: dict[tuple[str, str], bool] = {}
+    for record in records:
+        if record.setting == "sweep" and record.done:
+            key = (record.estimator, ", ".join(f"{k} = {v}" for k, v in record.values.items()))
+            tried.setdefault(key, {}).setdefault(record.task, {})[record.seed] = record.scores["mean_accuracy"]
+            ours[key] = all(_default(record.estimator, k) == v for k, v in record.values.items())
+    found = []
+    for estimator in order_estimators({e for e, _ in tried}):
+        mine = {key: row for key, row in tried.items() if key[0] == estimator}
+        tasks = sorted({t for row in mine.values() for t in row})
+        values = {key[1]: over for key, row in mine.items() if (over := _over_tasks(row, tasks))}
+        best = _best(values, 1)
+        ranked = sorted(values, key=lambda v: -float(np.mean(values[v])))
+        found += [(estimator, v, Entry(values[v], 3, v == best), ours[estimator, v]) for v in ranked]
+    return found
+
+
+def _default(estimator: str, argument: str) -> Any:
+    from sipe_bayes.inference.registry import estimator_class
+
+    for one in estimator_class(estimator).__mro__[:-1]:
+        if argument in inspect.signature(one).parameters:
+            return inspect.signature(one).parameters[argument].default
+    return None

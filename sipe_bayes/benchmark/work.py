@@ -1,0 +1,59 @@
+"""Units of work, which an executor carries out anywhere, and what they come to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
+
+ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+"""Environment of a worker: set before it starts, as numerical libraries read it when they are loaded."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a unit came to. files: (path in the folder of results, bytes), to be written in this order; line: a few words."""
+
+    files: tuple[tuple[str, bytes], ...]
+    line: str
+    cpu_seconds: float
+    failed: bool = False
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A call of a module's function, which does not write where the results lie. needs: names of units that have to be written
+    before. broken: what it comes to when its process dies, again and again."""
+
+    name: str
+    function: Callable[..., Done]
+    arguments: Mapping[str, Any]
+    needs: frozenset[str] = field(default=frozenset())
+    broken: Callable[..., Done] | None = None
+
+    def __call__(self) -> Done:
+        import torch
+
+        torch.set_num_threads(1)
+        return self.function(**self.arguments)
+
+    def gave_up(self, why: str) -> Done:
+        """Raises RuntimeError where nothing stands in for a result."""
+        if self.broken is None:
+            raise RuntimeError(f"{self.name}: {why}")
+        return self.broken(why=why, **self.arguments)
+
+
+class Executor(Protocol):
+    """Where units run: ``submit`` returns at once, ``next`` waits for one to end."""
+
+    workers: int
+
+    def submit(self, unit: Unit) -> None: ...
+
+    def next(self) -> tuple[Unit, Done]: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None:
+        """Ends what still runs."""

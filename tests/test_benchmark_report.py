@@ -1,0 +1,334 @@
+"""The benchmark's tables, figures and reports: numbers against plain sums, pages in a browser and through pdflatex."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import sipe_bayes as sipe
+from sipe_bayes.benchmark import figures, report_contents, report_html, report_latex, tables
+from sipe_bayes.benchmark.records import Record, RecordError, plan
+from sipe_bayes.benchmark.report_commands import report
+from sipe_bayes.diagnostics.scores import score
+from sipe_bayes.posterior import Dirac, Posterior, prior
+
+NAMES = ("mass_1", "friction_2")
+SPACE = sipe.ParameterSpace([sipe.Parameter(name, 0.0, 1.0) for name in NAMES])
+BOTH = ("in_distribution", "out_of_distribution")
+TRUTHS = {"in_distribution": (0.25, 0.8), "out_of_distribution": (-0.1, 1.1)}
+EVIL = r"</table><script>alert(1)</script> 100 % & $x$ #1 \input{a} _b^c~ ½ é 中"
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+PDFLATEX = shutil.which("pdflatex")
+
+
+def make(
+    task: str = "Door", estimator: str = "adr", seed: int = 0, setting: str = "direct", variant: str = "in_distribution",
+    at: Any = None, label: str = "", **other: Any,
+) -> Record:  # fmt: skip
+    """A record whose posterior is the point ``at``, the prior or its mean."""
+    truth = np.array(TRUTHS[variant])
+    posterior: Posterior = Dirac([0.5, 0.5] if at is None else at, SPACE)
+    posterior = prior(SPACE) if estimator == "prior" else posterior
+    made: dict[str, Any] = {
+        "budget": 1000, "steps": 50, "status": "done", "seconds": 2.0, "cpu_seconds": 3.0, "rollouts": 1000,
+        "names": list(NAMES), "truth": truth.tolist(), "mean": posterior.mean.tolist(), "sd": posterior.stddev.tolist(),
+        "scores": score(posterior, truth).to_dict(), "determined": [True, False] if variant == "in_distribution" else None,
+        "history": [{"rollouts": n, "mean_accuracy": 0.6 + n / 1e4, "mean_crps": 0.1} for n in (100, 1000)],
+        "log": "excitation", "versions": {"mujoco": "4.0.0"}, "command": "sipe benchmark run --suite quick",
+    }  # fmt: skip
+    cell = f"{task}/{estimator}/{label or setting}/{variant}/seed{seed}"
+    return Record(cell, task, estimator, setting, variant, seed, **{**made, **other})
+
+
+def near(error: float, seed: int, variant: str = "in_distribution") -> list[float]:
+    """A point about ``error`` from the truth, a little different with every seed."""
+    return list(np.clip(np.array(TRUTHS[variant]) + error * (1 + 0.1 * seed) * np.array([1, -1]), 0, 1))
+
+
+def every() -> list[Record]:
+    """A small run of everything: three tasks, three estimators and a toy one, both baselines."""
+    errors = {"laplace": 0.001, "adr": 0.1, "simopt": 0.12, "toy": 0.3}
+    tasks = ("Door", "FetchPush", "Relocate")
+    records = [
+        make(task, name, seed, variant=variant, at=near(error, seed, variant))
+        for task in tasks for variant in BOTH for name, error in errors.items() for seed in range(3)
+    ]  # fmt: skip
+    records += [
+        make(task, name, variant=variant) for task in tasks for variant in BOTH for name in ("prior", "prior_mean")
+    ]
+    records += [make(t, "adr", s, "learned_reward", at=near(0.2, s)) for t in tasks for s in range(2)]
+    records += [make(t, "adr", s, "policy", at=near(0.2, s), converged=s != 1) for t in tasks for s in range(3)]
+    records += [
+        make("Door", "maml", s, "gradient_steps", at=near(0.3 / (1 + n), s), label=f"gradient_steps={n}", values={"gradient_steps": n})
+        for n in range(3) for s in range(2)
+    ]  # fmt: skip
+    records += [
+        make(t, "adr", s, "sweep", at=near(error, s), label=f"sweep,particles={n}", values={"particles": n})
+        for t in ("FetchPush", "Relocate") for n, error in ((4, 0.05), (10, 0.2)) for s in range(3)
+    ]  # fmt: skip
+    failed = make(
+        "Door", "npe", status="failed", traceback=f"Traceback\n  File\nValueError: {EVIL}", scores={}, mean=[], sd=[]
+    )
+    records[0] = dataclasses.replace(records[0], warnings=[f"mass_1 at a bound: {EVIL}"], command=EVIL)
+    return [*records, failed]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results")
+    for record in every():
+        record.write(out)
+    plan(
+        out,
+        [
+            "Door/adr/direct/in_distribution/seed0",
+            "Door/bayessim/direct/in_distribution/seed0",
+            "Relocate/bayessim/direct/in_distribution/seed1",
+        ],
+    )
+    return out
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> report_contents.Contents:
+    return report_contents.contents(folder)
+
+
+@pytest.fixture(scope="module")
+def written(folder: Path, found: report_contents.Contents) -> Path:
+    paths, note = report_latex.write_reports(found, folder / "report")
+    assert [p.name for p in paths] == ["report.html", "report.tex", *(["report.pdf"] if PDFLATEX else [])], note
+    return folder / "report"
+
+
+# Tables
+
+
+def test_entries_are_mean_and_standard_error_over_seeds() -> None:
+    records = every()
+    table = tables.score_table(
+        [r for r in records if (r.setting, r.variant) == ("direct", "in_distribution")],
+        "accuracy",
+        tables.Context.of(records),
+    )
+    assert table is not None
+    assert table.columns == ("FetchPush", "Relocate", "Door", tables.ALL)
+    assert [name for name, _ in table.rows] == ["laplace", "simopt", "adr", "toy", "prior", "prior_mean"]
+    entry = table.entry("adr", "Door")
+    accuracy = [1 - 0.1 * (1 + 0.1 * s) for s in range(3)]
+    assert entry is not None
+    assert entry.mean == pytest.approx(np.mean(accuracy))
+    assert entry.standard_error == pytest.approx(np.std(accuracy, ddof=1) / np.sqrt(3))
+    assert [name for name, row in table.rows if row[2] is not None and row[2].best] == ["laplace"]
+
+
+def test_skill_over_determined_parameters() -> None:
+    records = [make(estimator="adr", at=[0.35, 0.8]), make(estimator="prior")]
+    table = tables.score_table(records, "CRPS skill, determined", tables.Context.of(records))
+    assert table is not None
+    entry = table.entry("adr", "Door")
+    assert entry is not None
+    assert entry.mean == pytest.approx(1 - 0.1 / (0.25**2 - 0.25 + 1 / 3), rel=1e-3)  # the uniform prior's CRPS
+
+
+def column(values: dict[str, list[float]]) -> str | None:
+    return tables._best({name: tuple(v) for name, v in values.items()}, 1)
+
+
+def test_the_best_is_set_apart_only_outside_noise() -> None:
+    clear = {"a": [0.9, 0.91, 0.92], "b": [0.7, 0.71, 0.72]}
+    assert column(clear) == "a"
+    assert column({**clear, "c": [0.89, 0.92, 0.9]}) is None  # a close second
+    assert column({"a": [0.9], "b": [0.1]}) is None  # one seed
+    assert column({**clear, "prior_mean": [0.95]}) is None  # knowing nothing is better
+    assert column({"a": [0.9, 0.9], "b": [0.8, 0.8]}) == "a"  # deterministic
+    assert column({"a": [0.9, 0.9], "b": [0.9, 0.9]}) is None
+
+
+def test_equal_estimators_seldom_have_a_best_one() -> None:
+    """At most 5 %; two hundred columns of two equal estimators exceed 10 % by chance once in 300 at 5 %."""
+    rng = np.random.default_rng(1)
+    equal = sum(column({"a": list(rng.normal(size=3)), "b": list(rng.normal(size=3))}) is not None for _ in range(200))
+    apart = sum(column({"a": list(5 + rng.normal(size=3)), "b": list(rng.normal(size=3))}) == "a" for _ in range(200))
+    assert equal <= 20, equal
+    assert apart >= 150, apart
+
+
+def test_runs_whose_policy_solves_nothing_do_not_count() -> None:
+    runs = [make(seed=s, setting="policy", converged=s > 0) for s in range(3)]
+    kept, sentence = tables.counted(runs)
+    assert [r.seed for r in kept] == [1, 2]
+    assert "2 of 3 runs" in sentence
+    kept, sentence = tables.counted([dataclasses.replace(r, converged=False) for r in runs])
+    assert len(kept) == 3
+    assert "none would count" in sentence
+    assert tables.counted([make()])[1] == ""
+
+
+def test_warnings_are_counted_without_names_and_numbers() -> None:
+    runs = [make(seed=s, warnings=[f"{name} at a bound: sd 0.{s}"]) for s, name in enumerate(NAMES)]
+    assert tables.warning_counts(runs) == [("adr", "at a bound: sd #", 2)]
+
+
+# Figures
+
+
+def test_every_seed_and_the_truth_are_drawn() -> None:
+    runs = [make(seed=s, at=near(0.1, s)) for s in range(3)]
+    error = figures.error_per_parameter(runs).axes[0]
+    dots = [line.get_ydata() for line in error.lines if line.get_marker() == "."]
+    np.testing.assert_allclose(dots, [2 * [0.1 * (1 + 0.1 * s)] for s in range(3)])
+    posterior = figures.posterior_against_truth(runs).axes[0]
+    ticks = [seg[0, 1] for c in posterior.collections if len(c.get_segments()) == 2 for seg in c.get_segments()]  # type: ignore[attr-defined]
+    assert set(TRUTHS["in_distribution"]) <= set(np.round(ticks, 9))
+    with pytest.raises(ValueError, match="one task, setting and variant"):
+        figures.error_per_parameter([*runs, make("FetchPush")])
+
+
+def test_accuracy_against_rollouts_prefers_whole_runs() -> None:
+    on_the_way = figures.accuracy_against_rollouts([make()])
+    np.testing.assert_allclose(on_the_way.axes[0].lines[0].get_xdata(), [100, 1000])
+    runs = [make(setting="rollouts", label=f"rollouts={n}", budget=n, at=near(10 / n, 0)) for n in (50, 200)]
+    line = figures.accuracy_against_rollouts([*runs, make()]).axes[0].lines[0]
+    np.testing.assert_allclose(line.get_xdata(), [50, 200])
+    np.testing.assert_allclose(line.get_ydata(), [0.8 + 0.0, 0.95], atol=0.03)
+
+
+def test_histories_of_seeds_on_other_grids_are_carried_on() -> None:
+    rows = [[(100, 0.5), (300, 0.7)], [(200, 0.9)]]
+    runs = [make(seed=s, history=[{"rollouts": n, "mean_accuracy": a} for n, a in row]) for s, row in enumerate(rows)]
+    line = figures.accuracy_against_rollouts(runs).axes[0].lines[0]
+    np.testing.assert_allclose(line.get_xdata(), [100, 200, 300])
+    np.testing.assert_allclose(line.get_ydata(), [0.5, 0.7, 0.8])
+
+
+# Reports
+
+
+def test_contents_say_what_was_run_and_what_is_missing(found: report_contents.Contents) -> None:
+    assert "1 failed, 2 of 3 planned are missing" in found.headline
+    assert found.missing == [("direct, in distribution", "bayessim", 2, "Relocate, Door")]
+    assert found.failed[0][0] == "Door/npe/direct/in_distribution/seed0"
+    facts = dict(found.facts)
+    assert facts["versions"] == "mujoco 4.0.0"
+    assert "toy" in facts["estimators"]
+    assert facts["time"].startswith(f"{3 * len(every()) / 60:.1f} min of CPU")
+    titles = [section.title for section in found.sections]
+    assert titles[0] == "Direct estimation, in distribution"
+    assert {
+        "Policy against demonstrations",
+        "Learned rewards against state differences",
+        "Gradient steps of MAML",
+    } <= set(titles)
+    sweep = next(s for s in found.sections if s.anchor == "sweep")
+    assert "would choose particles = 4" in sweep.sentences[0]
+    outside = next(s for s in found.sections if s.anchor.endswith("out_of_distribution"))
+    assert [t.measure.name for t in outside.tables] == ["CRPS", "energy score", "noticed", "CPU seconds"]
+
+
+def test_page_stands_alone_and_escapes(written: Path) -> None:
+    page = (written / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|@import|url\(", page)
+    assert page.count("<script") == 1
+    assert "alert(1)&lt;/script&gt;" in page
+    assert page.count('src="data:image/png;base64,') == page.count("<img")
+    for words in (
+        "Planned, and not run",
+        "mujoco 4.0.0",
+        "toy",
+        "prior mean",
+        "Learned rewards against state differences",
+    ):
+        assert words in page
+
+
+_PROBE = """<script>addEventListener("load", () => {
+const table = document.querySelector("table.scores"), said = {};
+const values = () => [...table.tBodies[0].rows].map(r => Number(r.cells[1].dataset.value));
+const button = table.tHead.rows[0].cells[1].querySelector("button");
+said.given = values(); button.click(); said.descending = values(); button.click(); said.ascending = values();
+said.drawn = [...document.images].filter(i => i.complete && i.naturalWidth > 0).length; said.images = document.images.length;
+said.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+document.body.innerHTML = "<pre>" + JSON.stringify(said) + "</pre>"; });</script>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+@pytest.mark.parametrize("width", [500, 1200])
+def test_page_in_a_browser(written: Path, tmp_path: Path, width: int) -> None:
+    """Figures are drawn, tables sort, nothing is wider than the window, and the console stays empty."""
+    page = (written / "report.html").read_text(encoding="utf-8")
+    (tmp_path / "page.html").write_text(page.replace("</body>", _PROBE + "</body>"), encoding="utf-8")
+    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", "--enable-logging=stderr",
+               f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--dump-dom", (tmp_path / "page.html").as_uri()]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    found = re.search(r"<pre>(\{.*\})</pre>", done.stdout)
+    assert found is not None, done.stdout[-500:]
+    said = json.loads(found[1])
+    assert said["ascending"] == sorted(said["given"]) != said["given"]
+    assert said["descending"] == sorted(said["given"], reverse=True)
+    assert said["images"] == said["drawn"] > 5
+    assert said["wide"] <= 0
+
+
+@pytest.mark.skipif(PDFLATEX is None, reason="needs pdflatex")
+def test_document_compiles(written: Path) -> None:
+    assert (written / "report.pdf").read_bytes().startswith(b"%PDF")
+    source = (written / "report.tex").read_text(encoding="utf-8")
+    drawn = set(re.findall(r"\{figures/([^}]+)\}", source))
+    assert drawn == {p.stem for p in (written / "figures").iterdir()}
+    assert r"\toprule" in source
+    assert r"\textbf{0.99" in source
+
+
+@pytest.mark.parametrize("text", [EVIL, "--out", "a\nb", "\\", "{}"])
+def test_no_letter_reaches_latex_unescaped(text: str) -> None:
+    assert not re.search(
+        r"(?<!\\)[&%$#_{}~^]", re.sub(r"\\[a-z]+\{\}|-\{\}|\$-\$|\$\\pm\$", "", report_latex.escaped(text))
+    )
+    assert report_latex.escaped(text).isascii()
+
+
+def test_without_pdflatex_the_source_remains(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    assert "pdflatex is not installed" in report_latex.compile_pdf(written)
+
+
+@pytest.mark.skipif(PDFLATEX is None, reason="needs pdflatex")
+def test_what_latex_refuses_is_said(tmp_path: Path) -> None:
+    (tmp_path / "report.tex").write_text(r"\documentclass{article}\begin{document}\nonsense\end{document}")
+    assert "Undefined control sequence" in report_latex.compile_pdf(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.tex"]
+
+
+def test_the_least_there_can_be(tmp_path: Path) -> None:
+    make().write(tmp_path)
+    found = report_contents.contents(tmp_path)
+    assert "no plan" in found.headline
+    page, document = report_html.render(found), report_latex.render(found)
+    assert "none was run" in page
+    assert "what is missing is not known" in document
+
+
+def test_command(folder: Path, tmp_path: Path) -> None:
+    app = typer.Typer()
+    app.command()(report)
+    with pytest.raises(RecordError, match="holds no records"):
+        report_contents.contents(tmp_path)
+    refused = CliRunner().invoke(app, [str(tmp_path)])
+    assert refused.exit_code == 2
+    assert len(refused.stderr.splitlines()) == 1
+    (tmp_path / "file").write_text("")
+    refused = CliRunner().invoke(app, [str(folder), "--out", str(tmp_path / "file")])
+    assert refused.exit_code == 2
+    assert "choose another name" in refused.stderr
