@@ -388,7 +388,8 @@ def filled(folder: Path, budget: int) -> int:
 def test_shards_merge_resume_and_verify(tmp_path: Path) -> None:
     """Two folders that hold shards of one bank are merged by copying; what results is what an estimator simulates by itself."""
     filled(tmp_path / "a", 230)
-    units = bank.shards(PENDULUM_BANK, 430, tmp_path / "a")
+    units = bank.shards(PENDULUM_BANK, 430, bank.place(PENDULUM_BANK, tmp_path / "a"))
+    assert bank.place(PENDULUM_BANK, tmp_path / "a") == bank.known_place(PENDULUM_BANK, tmp_path / "a")
     assert [u.arguments["blocks"] for u in units] == [[(4, 50), (5, 50), (6, 50), (7, 50)], [(8, 30)]]
     for name, data in [*units[0]().files, *units[1]().files]:  # made elsewhere
         records.write_bytes(tmp_path / "b" / name, data)
@@ -432,6 +433,19 @@ def test_simulate_command_serves_the_benchmark(tmp_path: Path) -> None:
     assert load_all(tmp_path)[0].simulation_cpu_seconds > 0
     refused(sipe("simulate", "Pendulumm", *out), "did you mean 'Pendulum'")
     refused(sipe("simulate", "Pendulum", "--variant", "odd", *out), "--variant odd")
+
+
+def test_shard_that_cannot_be_made_stops_nothing(
+    monkeypatch: pytest.MonkeyPatch, undisturbed: Path, tmp_path: Path
+) -> None:
+    def damaged(**_: object) -> None:
+        raise RuntimeError("diverged")
+
+    monkeypatch.setattr(bank, "_simulate", damaged)
+    found = measured(tmp_path, "--select", "pendulum/regression/direct/in_distribution/seed0")
+    assert "left out: RuntimeError: diverged" in found.stdout
+    (record,) = load_all(tmp_path)
+    assert (record.id, what_counts(tmp_path)[record.id]) in what_counts(undisturbed).items()
 
 
 def test_cells_that_share_simulations_are_the_prior_sampling_ones() -> None:

@@ -73,16 +73,36 @@ def _opened(bank: Bank, folder: Path) -> _Blocks:
     return _Blocks(simulator, prior(simulator.space), log.trajectories, starts, bank.seed, folder)
 
 
-def shards(bank: Bank, budget: int, folder: Path) -> list[Unit]:
-    """What is to be simulated of the first ``budget`` rows, those left out that ``folder``/simulations has."""
+def place(bank: Bank, folder: Path) -> Path:
+    """Where the blocks of a bank lie; its log is made to know that."""
+    return folder / FOLDER / _opened(bank, folder / FOLDER).key
+
+
+def known_place(bank: Bank, folder: Path) -> Path | None:
+    """Where they lie as far as the shards that are there tell; None where there are none, or those of several logs."""
+    notes = (folder / FOLDER).glob("*/shard-*.json")
+    found = {path.parent for path in notes if json.loads(path.read_text(encoding="utf-8"))["bank"] == bank.id}
+    return found.pop() if len(found) == 1 else None
+
+
+def shards(bank: Bank, budget: int, made: Path | None) -> list[Unit]:
+    """What is to be simulated of the first ``budget`` rows, without the blocks that lie in ``made``."""
     rows = [min(BLOCK, budget - start) for start in range(0, whole("budget", budget), BLOCK)]
-    blocks = _opened(bank, folder / FOLDER)
-    assert blocks.folder is not None
-    lacking = [k for k, count in enumerate(rows) if _rows(blocks.folder / f"block-{k:06d}.npz") < count]
+    lacking = [k for k, count in enumerate(rows) if made is None or _rows(made / f"block-{k:06d}.npz") < count]
     return [
-        Unit(f"simulations/{bank.id}/{part[0]}", _simulate, {"bank": bank, "blocks": [(k, rows[k]) for k in part]})
+        Unit(
+            f"simulations/{bank.id}/{part[0]}",
+            _simulate,
+            {"bank": bank, "blocks": [(k, rows[k]) for k in part]},
+            broken=_left_out,
+        )
         for part in (lacking[i : i + SHARD] for i in range(0, len(lacking), SHARD))
     ]
+
+
+def _left_out(bank: Bank, blocks: list[tuple[int, int]], why: str) -> Done:
+    """What a shard comes to that cannot be made: nothing; the cells that need it make it themselves, or fail by themselves."""
+    return Done((), f"left out: {why}", 0.0)
 
 
 def _rows(path: Path) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-import traceback
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,16 +42,14 @@ class Pool:
             assert isinstance(ready, Connection)
             process, unit = self._busy.pop(ready)
             try:
-                answer = ready.recv()
+                done = ready.recv()
             except (EOFError, OSError):
                 found = self._buried(process, unit)
                 if found is None:
                     continue
                 return unit, found
             self._idle.append((process, ready))
-            if isinstance(answer, str):
-                raise RuntimeError(f"{unit.name} failed: {answer}")
-            return unit, answer
+            return unit, done
 
     def __enter__(self) -> Self:
         return self
@@ -145,8 +142,6 @@ def _work(pipe: Connection) -> None:
             pipe.send(unit())
         except KeyboardInterrupt:
             return
-        except Exception:
-            pipe.send(traceback.format_exc().strip().splitlines()[-1])
 
 
 def _end_with(sentinel: int) -> None:

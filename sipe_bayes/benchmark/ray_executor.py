@@ -49,10 +49,8 @@ class RayExecutor:
         unit = self._running.pop(reference)
         try:
             return unit, self._ray.get(reference)
-        except self._ray.exceptions.RayTaskError as error:
-            raise RuntimeError(f"{unit.name} failed: {str(error).strip().splitlines()[-1]}") from None
         except self._ray.exceptions.RayError as error:
-            return unit, unit.gave_up(f"Ray gave it up after {_RETRIES} retries: {str(error).splitlines()[0]}")
+            return unit, unit.gave_up(f"Ray gave it up: {str(error).strip().splitlines()[-1]}")
 
     def __enter__(self) -> Self:
         return self

@@ -54,7 +54,7 @@ def simulate(
 ) -> int:
     """Fill the first ``budget`` rows of a bank; returns how many shards there were to make. Raises as ``run``."""
     with _claimed(folder):
-        units = bank.shards(which, budget, folder)
+        units = bank.shards(which, budget, bank.place(which, folder))
         if units:
             _carried_out(units, folder, start, command, report)
         return len(units)
@@ -106,13 +106,13 @@ def _units(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:
         which = _bank(cell)
         if which is not None:
             banks[which] = max(banks.get(which, 0), cell.budget)
-    made = {which: bank.shards(which, budget, folder) for which, budget in banks.items()}
+    made = {which: bank.shards(which, budget, bank.known_place(which, folder)) for which, budget in banks.items()}
     units = [shard for shards in made.values() for shard in shards]
     for cell in cells:
         arguments = {"cell": cell, "folder": folder.resolve(), "command": command}
         which = _bank(cell)
         needs = frozenset(shard.name for shard in made[which]) if which is not None else frozenset()
-        units.append(Unit(cell.id, measure.run, arguments, needs, measure.died))
+        units.append(Unit(cell.id, measure.run, arguments, measure.died, needs))
     return units
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, Self
@@ -23,24 +24,24 @@ class Done:
 @dataclass(frozen=True)
 class Unit:
     """A call of a module's function, which does not write where the results lie. needs: names of units that have to be written
-    before. broken: what it comes to when its process dies, again and again."""
+    before. broken: what it comes to when it raises, or its process dies again and again."""
 
     name: str
     function: Callable[..., Done]
     arguments: Mapping[str, Any]
+    broken: Callable[..., Done]
     needs: frozenset[str] = field(default=frozenset())
-    broken: Callable[..., Done] | None = None
 
     def __call__(self) -> Done:
         import torch
 
         torch.set_num_threads(1)
-        return self.function(**self.arguments)
+        try:
+            return self.function(**self.arguments)
+        except Exception:
+            return self.gave_up(traceback.format_exc().strip().splitlines()[-1])
 
     def gave_up(self, why: str) -> Done:
-        """Raises RuntimeError where nothing stands in for a result."""
-        if self.broken is None:
-            raise RuntimeError(f"{self.name}: {why}")
         return self.broken(why=why, **self.arguments)
 
 
