@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -34,9 +35,11 @@ class CallableSimulator:
     """``fn(values (B, N)) -> x (B, D)``, or noisy: ``fn(values, generator) -> x``; NaN where a simulation failed.
 
     values are physical. generator: a numpy Generator, fn's only source of randomness; each theta has one of its own, from
-    ``seed`` and theta, so that the same theta give the same x. likelihood: sd of independent normal noise about fn's x, one
-    number or (D,); ``laplace`` and ``mcmc`` need it, and the others add that noise to what they simulate. name: tells
-    functions apart in checkpoints and caches; default fn's qualified name. Raises ValueError for an fn of another form.
+    ``seed`` and theta, so that the same theta give the same x. fn takes it as its second argument without a default, or as the one
+    called ``generator`` or ``rng``; other arguments with defaults are left alone. likelihood: sd of independent normal noise
+    about fn's x, one number or (D,); ``laplace`` and ``mcmc`` need it, and the others add that noise to what they simulate. name: tells
+    functions apart in checkpoints and caches; default the qualified name of a module's function. Any other fn (a lambda, a local
+    function, a partial, an object) shares its own with others and needs one there. Raises ValueError for an fn of another form.
     """
 
     failure: ClassVar[str] = "made fn return NaN or infinity"  # what is said of simulations that are not valid
@@ -59,8 +62,11 @@ class CallableSimulator:
                 f"fn: expected a function fn(values (B, {len(space)})) -> x (B, D), got a {type(fn).__name__}"
             )
         self.fn, self.space, self.seed = fn, space, whole("seed", seed, 0)
-        self.name = name or f"{getattr(fn, '__module__', '')}.{getattr(fn, '__qualname__', type(fn).__name__)}"
-        self.noisy = len(inspect.signature(fn).parameters) > 1
+        if name is not None and (not isinstance(name, str) or not name):
+            raise ValueError(f"name: expected a text that tells fn from other functions, got {name!r}")
+        self.name = name or _own_name(fn)
+        self._generator = _generator_parameter(fn)
+        self.noisy = self._generator is not None
         if self.noisy and likelihood is not None:
             raise ValueError(
                 "likelihood: the noise is either fn's own or normal with these sds; give fn(values) -> x without noise"
@@ -133,7 +139,7 @@ class CallableSimulator:
 
     def _call(self, values: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
         try:
-            x = np.asarray(self.fn(values, rng) if self.noisy else self.fn(values), float)
+            x = np.asarray(self._evaluated(values, rng), float)
         except (IndexError, TypeError, ValueError) as error:
             raise ValueError(
                 f"fn: expected fn(values (B, {len(self.space)})) -> x (B, D), a row for each theta, values[:, 0] the first "
@@ -144,3 +150,29 @@ class CallableSimulator:
                 f"fn: expected x ({len(values)}, D) for values {values.shape}, a row for each theta, got shape {x.shape}"
             )
         return x
+
+    def _evaluated(self, values: FloatArray, rng: np.random.Generator | None) -> Any:
+        if self._generator is None:
+            return self.fn(values)
+        return self.fn(values, **{self._generator: rng}) if self._generator else self.fn(values, rng)
+
+
+def _own_name(fn: Callable[..., Any]) -> str:
+    """Module, or script, and name of a module's function, which no other has; "" of anything else."""
+    name, module = getattr(fn, "__qualname__", ""), getattr(fn, "__module__", None) or ""
+    home = sys.modules.get(module)
+    place = getattr(home, "__file__", "") if module == "__main__" else module
+    return f"{place}.{name}" if place and getattr(home, name, None) is fn else ""
+
+
+def _generator_parameter(fn: Callable[..., Any]) -> str | None:
+    """Where fn takes a generator: the parameter's name, "" for the second place, None if it takes none."""
+    try:
+        parameters = list(inspect.signature(fn).parameters.values())[1:]
+    except (TypeError, ValueError):  # written in C, without a signature
+        return None
+    for parameter in parameters:
+        if parameter.name in ("generator", "rng") and parameter.kind is not parameter.POSITIONAL_ONLY:
+            return parameter.name
+    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return "" if any(p.kind in places and p.default is p.empty for p in parameters) else None

@@ -1,9 +1,12 @@
-"""Numbers that a user gives, checked in one way: a ValueError of one line names the argument, what was expected, what came."""
+"""What a user gives, checked in one way: a ValueError of one line names the argument, what was expected, what came."""
 
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Iterable
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 
@@ -36,6 +39,30 @@ def share(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < 1:
         raise ValueError(f"{name}: expected a share above 0 and below 1, got {_shown(value)}")
     return float(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """``value`` if it is True or False."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}: expected True or False, got {_shown(value)}")
+    return value
+
+
+def one_of(name: str, value: Any, known: Iterable[str]) -> str:
+    """``value`` if it is one of the ``known`` texts."""
+    known = tuple(known)
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name}: expected one of {', '.join(known)}, got {_shown(value)}")
+    return value
+
+
+def path(name: str, value: Any) -> Path | None:
+    """``value`` as a Path; None stays."""
+    if value is None:
+        return None
+    if not isinstance(value, str | os.PathLike) or not str(value):
+        raise ValueError(f"{name}: expected a path, got {_shown(value)}")
+    return Path(value)
 
 
 def _shown(value: Any) -> str:

@@ -8,48 +8,30 @@ contact and chaos hide the parameters (half-cheetah, 200 steps: least squares is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.callable_windows import CallableWindows
 from sipe_bayes.likelihood import Windows
 
 FloatArray = NDArray[np.float64]
 
 _BATCH = 32  # thetas simulated at once
 _STILL = 1e-3  # of the median channel's spread: less motion than that is scaled as if it were that much
-
-
-@dataclass(frozen=True)
-class Transitions:
-    """Control steps (s, a, s'): features (n, 2 C + A) float64, finite, and theta's row (n,) that each belongs to."""
-
-    features: FloatArray
-    row: NDArray[np.int64]
+_ROUNDING = 1e-7  # of a function's output: outputs that differ by less are equal
 
 
 class StateDifference:
-    """Mean squared difference between simulated and recorded channels, each in units of its own recorded spread.
+    """Mean squared difference between simulated and recorded channels, each in units of ``scale`` (C,), see ``channel_scale``.
 
     Deviation from the SiPE paper: it sums plain squares, so that its metres and radians per second weigh alike.
     """
 
-    def __init__(self, windows: Windows) -> None:
-        self.windows = windows
-        spread = np.array(
-            [_spread(windows.measured[..., c][windows.observed[..., c]]) for c in range(len(windows.channels))]
-        )
-        moving = spread[spread > 0]
-        floor = _STILL * float(np.median(moving)) if len(moving) else 1.0
-        self.scale = np.maximum(spread, floor)
+    def __init__(self, windows: Windows, scale: FloatArray) -> None:
+        self.windows, self.scale = windows, scale
 
-    def __call__(self, theta: FloatArray) -> FloatArray:
-        """Cost (B,) of theta (B, N), infinite where the simulation diverged; raises BudgetExhausted."""
-        return self.of(simulate(self.windows, theta))
-
-    def of(self, predicted: FloatArray) -> FloatArray:
-        """Cost (B,) of predictions (B, W, L, C), NaN where they diverged."""
+    def __call__(self, predicted: FloatArray) -> FloatArray:
+        """Cost (B,) of predictions (B, W, L, C), infinite where the simulation diverged."""
         windows = self.windows
         with np.errstate(invalid="ignore"):
             square = ((predicted - windows.measured) / self.scale) ** 2
@@ -57,25 +39,41 @@ class StateDifference:
         return np.where(np.isfinite(cost), cost, np.inf)
 
 
+def channel_scale(windows: Windows, first: FloatArray) -> FloatArray:
+    """What a channel's differences are divided by (C,): its recorded spread, of channels that hardly move as much as
+    ``_STILL`` of the median channel's.
+
+    One observed x of a function has no spread: it is that of the first simulations ``first`` (B, W, L, C) there, and the
+    channel's magnitude where they do not differ; NaN where none was valid. So nothing depends on the channels' units.
+    """
+    if isinstance(windows, CallableWindows):
+        return _simulated_scale(windows, first)
+    spread = np.array(
+        [_spread(windows.measured[..., c][windows.observed[..., c]]) for c in range(len(windows.channels))]
+    )
+    moving = spread[spread > 0]
+    floor = _STILL * float(np.median(moving)) if len(moving) else 1.0
+    return np.maximum(spread, floor)
+
+
+def _simulated_scale(windows: CallableWindows, first: FloatArray) -> FloatArray:
+    samples = first[:, :, 1].reshape(-1, first.shape[-1])
+    samples = samples[np.isfinite(samples).all(1)]
+    if not len(samples):
+        return np.full(first.shape[-1], np.nan)
+    size = np.maximum(np.abs(samples).max(0), np.nanmax(np.abs(windows.measured[:, 1]), axis=0))
+    spread = samples.std(0)
+    return np.where(spread > _ROUNDING * size, spread, np.where(size > 0, size, 1.0))
+
+
 def simulate(windows: Windows, theta: FloatArray) -> FloatArray:
-    """Predictions (B, W, L, C) from the windows' own starts; raises BudgetExhausted."""
+    """Predictions (B, W, L, C) of theta (B, N) from the windows' own starts; raises BudgetExhausted."""
     starts = windows.no_starts()
     parts = [
         windows.predict(rows, np.broadcast_to(starts, (len(rows), *starts.shape)))[0]
         for rows in np.split(theta, range(_BATCH, len(theta), _BATCH))
     ]
     return np.concatenate(parts)
-
-
-def transitions(windows: Windows, samples: FloatArray) -> Transitions:
-    """The control steps of samples (B, W, L, C), predicted or measured (B = 1), where all channels are finite."""
-    batch = len(samples)
-    actions = np.broadcast_to(windows.actions, (batch, *windows.actions.shape))
-    features = np.concatenate([samples[:, :, :-1], actions, samples[:, :, 1:]], axis=-1)
-    inside = np.arange(windows.actions.shape[1]) < windows.steps[:, None]
-    good = np.isfinite(features).all(-1) & inside
-    row = np.broadcast_to(np.arange(batch)[:, None, None], good.shape)
-    return Transitions(features[good], row[good])
 
 
 def _spread(values: FloatArray) -> float:

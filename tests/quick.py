@@ -15,7 +15,7 @@ FORM: Settings = {
     "bayessim": {"components": 2, "training": Training(epochs=40)},
     "maml": {"iterations": 20, "tasks": 3},
     "npe": {"max_epochs": 10, "transforms": 1, "hidden": 16},
-    "regression": {"epochs": 20},
+    "regression": {"iterations": 2000},
 }
 """Where only form counts."""
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 
+from sipe_bayes.inference import bayesopt
 from sipe_bayes.inference.bayesopt import BayesOpt, independent_residuals, log_improvement
-from sipe_bayes.models.gaussian_process import fit_gaussian_process
+from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import SurrogatePosterior, load_posterior, uniform
 from sipe_bayes.simulator import Simulator
@@ -99,9 +103,76 @@ def test_the_density_integrates_to_one_and_draws_agree(n: int, tmp_path: Path) -
     assert loaded.mixing == posterior.mixing
 
 
-def test_exact_draws_of_the_example() -> None:
+def test_the_mode_is_the_best_point() -> None:
     posterior = example_surrogate(space_of(2), 2000)
-    assert float(posterior.log_prob(posterior.mode)) >= float(posterior.log_prob(posterior.draws).max())
+    values = posterior.process.y.tolist()
+    assert torch.equal(posterior.mode, posterior.process.x[values.index(min(values))])
+
+
+def test_the_density_is_the_probability_of_another_simulation_below_epsilon() -> None:
+    """With a noise that counts: the process's own, on top of what it does not know of the mean."""
+    process, theta = replace(bowl(2), noise=0.5), torch.rand(6, 2, dtype=torch.float64)
+    mean, sd = (part.numpy() for part in process.predict(theta))
+    expected = scipy.stats.norm.logcdf(-1.0, mean, np.sqrt(sd**2 + 0.5 * process.scale**2))
+    posterior = SurrogatePosterior(process, -1.0, uniform(space_of(2)), theta, 1, 0.3, 0.0)
+    np.testing.assert_allclose(posterior.log_prob(theta).numpy(), expected - 0.3, rtol=1e-9)
+
+
+def test_epsilon_gives_a_quadratic_log_cost_its_gaussians_covariance() -> None:
+    """log C = log C_min + (theta - m)' S^-1 (theta - m) / n: theta uniform below epsilon have covariance S, to 8 %."""
+    rng, sd, residuals = np.random.default_rng(0), np.array([0.03, 0.05]), 40.0
+    theta = rng.uniform(0.2, 0.8, (200_000, 2))
+    cost = 0.02 * np.exp((((theta - 0.5) / sd) ** 2).sum(1) / residuals)
+    method = BayesOpt(pendulum(), floor=1e-9)
+    process: Any = SimpleNamespace(x=theta, predict=lambda _: (torch.from_numpy(np.log(cost)), None))
+    epsilon = method._threshold({"cost": cost, "independent": residuals}, process)
+    below = theta[np.log(cost) < epsilon]
+    np.testing.assert_allclose(np.cov(below.T).diagonal(), sd**2, rtol=0.08)
+
+
+def test_expected_improvement_is_that_of_its_definition() -> None:
+    """By quadrature, over the lowest value less xi."""
+    process, theta = bowl(2), torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    method = BayesOpt(pendulum(), acquisition="expected_improvement", xi=0.2)
+    mean, sd = process.predict(theta)
+    y = mean + sd * torch.linspace(-12, 12, 200_001, dtype=torch.float64)[:, None]
+    gain = (process.y.min() - 0.2 - y).clamp_min(0) * torch.exp(-(((y - mean) / sd) ** 2) / 2) / (2 * math.pi) ** 0.5
+    expected = gain.sum(0) * 24 / 200_000
+    torch.testing.assert_close(method._merit(process, theta).exp(), expected, rtol=1e-4, atol=1e-300)
+
+
+def test_hyper_parameters_are_fitted_where_the_data_have_grown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a fifth: 10 evaluations, then 12, 15 and 18."""
+    fits: list[int] = []
+
+    def fit(x: torch.Tensor, *_: Any) -> GaussianProcess:
+        fits.append(len(x))
+        return bowl(2)
+
+    monkeypatch.setattr(bayesopt, "fit_gaussian_process", fit)
+    method, rng = BayesOpt(pendulum()), np.random.default_rng(0)
+    state = {"fitted": 0}
+    for count in range(10, 20):
+        state = method._fitted({**state, "theta": rng.random((count, 2)), "cost": rng.random(count)})
+    assert fits == [10, 12, 15, 18]
+
+
+def test_other_trajectories_start_a_new_process() -> None:
+    simulator = pendulum()
+    one, other = (log(simulator, list(TRUTH), k, steps=100) for k in (1, 2))
+    method = BayesOpt(simulator, budget=200, **ROUGH)
+    for _ in range(3):
+        method.update_parameter_estimate(one)
+    before = method.rollouts
+    method.update_parameter_estimate(other)
+    fresh = BayesOpt(simulator, budget=200, **ROUGH)
+    fresh.update_parameter_estimate(other)
+    assert np.array_equal(method._state["cost"], fresh._state["cost"])
+    assert method.rollouts == before + fresh.rollouts
+    method.get_parameter_estimate(other)
+    assert not any("other trajectories" in w for w in method.warnings)
+    method.get_parameter_estimate(one)
+    assert any("other trajectories" in w for w in method.warnings)
 
 
 @pytest.mark.parametrize("acquisition", ["upper_confidence_bound", "expected_improvement"])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
 from sipe_bayes.inference import ESTIMATORS
 from tests.quick import SMALL
 
@@ -58,6 +61,105 @@ def test_noise_of_a_row_depends_on_theta_and_seed_alone() -> None:
     assert np.array_equal(simulator.replay(theta[2:3], log).observations[0], together[2])
     other = sipe.CallableSimulator(noisy, SPACE, seed=2).replay(theta, log).observations
     assert not np.allclose(other[:, 1], together[:, 1])
+
+
+@pytest.mark.parametrize("units", [(1e3, 1e-3), (1e-9, 1e-9)])
+@pytest.mark.parametrize("name", [n for n in ESTIMATORS if n != "mcmc"])
+def test_units_of_the_outputs_do_not_matter(name: str, units: tuple[float, float]) -> None:
+    """x = (a, b) in units of any size: searches give the same theta to rounding, bayesopt's best point is b's as well, networks
+    find both to 0.25. (mcmc goes by laplace's likelihood.)"""
+    values, sd = np.array([0.6, -0.5]), np.array(units)
+    simulator = sipe.CallableSimulator(lambda v: v * sd, SPACE, likelihood=SD * sd)
+    settings = {"seed": 0, "budget": 400, **SMALL.get(name, {})}
+    posterior = sipe.get_estimator(simulator, name, **settings).fit(values * sd)
+    found = SPACE.values((posterior.mode if name == "bayesopt" else posterior.mean).numpy())
+    print(name, units, found)
+    np.testing.assert_allclose(found, values, atol=0.25 if name in ("npe", "maml", "bayessim", "abc") else 0.06)
+    if name in ("cem", "simopt", "adr"):
+        plain = sipe.get_estimator(sipe.CallableSimulator(lambda v: v, SPACE, likelihood=SD), name, **settings)
+        np.testing.assert_allclose(posterior.mean, plain.fit(values).mean, atol=1e-6)
+
+
+def test_outputs_as_small_as_rounding_are_named() -> None:
+    for unit, said in ((1e-14, True), (1e-9, False)):
+        fit = sipe.get_estimator(sipe.CallableSimulator(lambda v, u=unit: u * v, SPACE), "abc", budget=100)
+        fit.fit(np.array([0.6, -0.5]) * unit)
+        assert any("x[0, 1] vary by 6e-15 only" in w for w in fit.warnings) == said, fit.warnings
+
+
+def test_an_output_that_never_varies_is_left_out_and_all_invalid_is_no_scale() -> None:
+    simulator = sipe.CallableSimulator(lambda v: np.column_stack([v[:, 0], np.full(len(v), 7.0), 0 * v[:, 0]]), SPACE)
+    windows = sipe.Segments(None, starts="recorded").bind(
+        simulator, sipe.Trajectories.stack(simulator.trajectory([1.0, 7.0, 0.0]))
+    )
+    first = simulate(windows, np.random.default_rng(0).random((50, 2)))
+    scale = channel_scale(windows, first)
+    np.testing.assert_allclose(scale, [first[:, 0, 1, 0].std(), 7.0, 1.0])
+    assert np.isfinite(StateDifference(windows, scale)(first)).all()
+    first[1:] = np.nan
+    np.testing.assert_allclose(channel_scale(windows, first)[1:], [7.0, 1.0])
+    assert np.isnan(channel_scale(windows, np.full_like(first, np.nan))).all()
+
+
+def test_a_learned_reward_of_an_observed_x_is_refused() -> None:
+    with pytest.raises(ValueError, match=r'got 1; .*reward="state_difference"'):
+        sipe.get_estimator(sipe.CallableSimulator(plain, SPACE), "adr", reward="learned").fit(X)
+
+
+def with_default(values: np.ndarray, square: bool = False, k: float = 3.0) -> np.ndarray:
+    return k * values**2 if square else values
+
+
+def keyword(values: np.ndarray, scale: float = 1.0, *, rng: np.random.Generator) -> np.ndarray:
+    return values + scale * rng.standard_normal(values.shape)
+
+
+def optional(values: np.ndarray, generator: np.random.Generator | None = None) -> np.ndarray:
+    assert generator is not None
+    return values + generator.standard_normal(values.shape)
+
+
+@pytest.mark.parametrize(
+    ("fn", "takes"),
+    [
+        (with_default, False),
+        (np.sin, False),
+        (functools.partial(np.power, 2.0), False),
+        (lambda *v: v[0], False),
+        (keyword, True),
+        (optional, True),
+        (lambda v, g: v + g.standard_normal(v.shape), True),
+    ],
+)
+def test_a_generator_is_told_from_other_arguments(fn: Callable[..., Any], takes: bool) -> None:
+    simulator = sipe.CallableSimulator(fn, SPACE)
+    assert simulator.noisy == takes
+    log = sipe.Trajectories.stack(simulator.trajectory([0.5, 0.5]))
+    one, same = (simulator.replay(np.full((2, 2), 0.3), log).observations[:, 1] for _ in "ab")
+    np.testing.assert_array_equal(one, same)
+    if takes:
+        with pytest.raises(ValueError, match="fn's own"):
+            sipe.CallableSimulator(fn, SPACE, likelihood=0.1)
+    else:
+        np.testing.assert_array_equal(one, fn(SPACE.values(np.full((2, 2), 0.3))))
+
+
+@pytest.mark.parametrize("argument", ["cache", "checkpoint"])
+def test_functions_without_a_name_of_their_own_need_one_on_disk(argument: str, tmp_path: Path) -> None:
+    """Two lambdas would share simulations, so would partials and objects; a module's function has its own name."""
+    for fn in (lambda v: v, functools.partial(with_default, k=2.0)):
+        with pytest.raises(ValueError, match=f"name: {argument}= needs one"):
+            sipe.get_estimator(sipe.CallableSimulator(fn, SPACE), "abc", **{argument: tmp_path / "a"})
+    found = []
+    for name, factor in (("one", 1.0), ("two", 2.0)):
+        simulator = sipe.CallableSimulator(lambda v, k=factor: k * v, SPACE, name=name)
+        fit = sipe.get_estimator(
+            simulator, "abc", budget=100, **{argument: tmp_path / f"{name * (argument != 'cache')} c"}
+        )
+        found.append(fit.fit([0.5, 0.5]).mean)
+    assert not torch.equal(*found)
+    sipe.get_estimator(sipe.CallableSimulator(plain, SPACE), "abc", **{argument: tmp_path / "c"})
+    assert sipe.CallableSimulator(plain, SPACE).name == "tests.test_callable.plain"
 
 
 def test_failed_simulations_are_named() -> None:

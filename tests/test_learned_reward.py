@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +22,15 @@ from tests.pendulums import XML, log, pendulum
 TRUTH = np.array([[0.3, 0.6]])
 
 
-def whole_state() -> Windows:
-    """Angle and velocity both recorded, from ``TRUTH``: single control steps tell mass and damping."""
+def whole_state(seeds: Iterable[int] = (3,)) -> Windows:
+    """Angle and velocity both recorded, from ``TRUTH``: single control steps tell mass and damping. seeds: of each log's actions."""
     plain = pendulum()
     channels = ["joint:hinge.position", "joint:hinge.velocity"]
     environment = MjcfEnvironment.build(XML, list(plain.space), ["motor"], channels)
     simulator = Simulator(environment, num_threads=1)
-    trajectory = log(simulator, simulator.space.values(TRUTH)[0].tolist(), 3, steps=400, sd=0.0)
-    return Segments(noise_sd=(0.0, 0.0)).bind(simulator, Trajectories.stack(trajectory))
+    values = simulator.space.values(TRUTH)[0].tolist()
+    logs = [log(simulator, values, seed, str(seed), steps=400, sd=0.0) for seed in seeds]
+    return Segments(noise_sd=(0.0, 0.0)).bind(simulator, Trajectories.stack(logs))
 
 
 def windows(sd: float = 0.0, likelihood: Segments | None = None) -> Windows:
@@ -54,6 +56,20 @@ def test_the_truth_is_rewarded_above_wrong_thetas() -> None:
     rewards = reward(state, reward.features(simulate(bound, np.concatenate([TRUTH, wrong]))))
     print(rewards)
     assert (rewards[0] > rewards[1:]).all(), rewards
+
+
+def test_starting_states_and_actions_need_not_match() -> None:
+    """Six recordings; it is trained on, and rewards, simulations under other actions from other states, which reach about the same."""
+    recorded, other = whole_state(range(3, 9)), whole_state(range(50, 56))
+    assert not np.isclose(recorded.actions, other.actions).any((1, 2)).all()
+    assert not np.isclose(recorded.measured[:, 0], other.measured[:, 0])[recorded.start > 0].any()
+    reward = LearnedReward(recorded)
+    pool = reward.features(simulate(other, np.random.default_rng(0).uniform(size=(20, 2))), other)
+    wrong = np.array([[0.9, 0.6], [0.3, 0.05], [0.8, 0.1]])
+    made = reward.features(simulate(other, np.concatenate([TRUTH, wrong])), other)
+    rewards = reward(trained(reward, pool, 20), made)
+    print(rewards)
+    assert (rewards[0] > rewards[1:] + 0.2).all(), rewards
 
 
 def test_noise_alone_rewards_nothing() -> None:

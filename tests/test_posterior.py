@@ -26,6 +26,7 @@ from sipe_bayes.posterior import (
     NoDensityError,
     Particles,
     Posterior,
+    SurrogatePosterior,
     load_posterior,
     prior,
     uniform,
@@ -159,11 +160,11 @@ def test_quantiles_agree_with_samples(posterior: Posterior) -> None:
 
 
 def test_mode_is_no_worse_than_any_draw(posterior: Posterior) -> None:
-    if posterior.has_density:
+    if isinstance(posterior, Particles | SurrogatePosterior):
+        assert torch.equal(posterior.mode, posterior.best)
+    elif posterior.has_density:
         draws = posterior.sample((5000,), generator=seeded(5))
         assert float(posterior.log_prob(posterior.mode)) >= float(posterior.log_prob(draws).max()) - 1e-9
-    elif isinstance(posterior, Particles):
-        assert torch.equal(posterior.mode, posterior.best)
 
 
 def test_round_trip_is_exact(posterior: Posterior, tmp_path: Path) -> None:
@@ -462,11 +463,43 @@ def test_inference_data_has_physical_units() -> None:
     assert float(data["p1"][0, 0]) == pytest.approx(2.0)  # the geometric middle of 1 and 4
 
 
+def test_inference_data_holds_what_else_is_known(tmp_path: Path) -> None:
+    """Prior in units, what was observed, predictions and densities of each draw, what the sampler knows; also after storing."""
+    theta, lp = np.linspace(0, 1, 12).reshape(12, 1), np.arange(12.0)
+    chains = Particles(theta, space_of(1), chains=3, sample_stats={"lp": lp})
+    chains.save(tmp_path / "chains")
+    predictive = np.random.default_rng(0).random((3, 4, 5))
+    given = {"observed_data": {"x": np.arange(5.0)}, "posterior_predictive": {"x": predictive}}
+    for found in (chains, load_posterior(tmp_path / "chains")):
+        data = found.to_inference_data(50, prior=uniform(space_of(1)), log_likelihood={"x": predictive}, **given)
+        np.testing.assert_array_equal(data.sample_stats["lp"], lp.reshape(3, 4))
+        np.testing.assert_array_equal(data.posterior_predictive["x"], predictive)
+        np.testing.assert_array_equal(data.log_likelihood["x"], predictive)
+        np.testing.assert_array_equal(data.observed_data["x"], np.arange(5.0))
+        assert data.prior["p0"].shape == (1, 50)
+        low, high = space_of(1)[0].low, space_of(1)[0].high
+        assert low <= float(data.prior["p0"].min()) < float(data.prior["p0"].max()) <= high
+        assert data.prior["p0"].attrs["units"] == data.posterior["p0"].attrs["units"]
+    plain = Dirac([0.5], space_of(1)).to_inference_data(10)
+    assert plain.groups() == ["posterior"]
+
+
 # Wrong input and broken files.
 
 EYE = np.eye(2)[None]
 TWO = space_of(2)
 WRONG_INPUT: list[tuple[Callable[[], object], type[Exception], str]] = [
+    (lambda: Particles([[0.5, 0.5]], TWO, sample_stats={"lp": [1.0]}), ValueError, "sample_stats: expected chains"),
+    (
+        lambda: Dirac([0.5, 0.5], TWO).to_inference_data(10, log_likelihood={"x": np.zeros((1, 9))}),
+        ValueError,
+        "log_likelihood: expected x",
+    ),
+    (
+        lambda: Dirac([0.5, 0.5], TWO).to_inference_data(prior=uniform(space_of(1))),
+        ValueError,
+        "prior: expected one over",
+    ),
     (lambda: Dirac([0.5], TWO), ValueError, r"theta: expected shape \(2\), got \(1,\)"),
     (lambda: Dirac([0.5, 1.5], TWO), ValueError, r"theta: expected theta in \[0, 1\].*normalise"),
     (lambda: Dirac([0.5, math.nan], TWO), ValueError, "theta: expected finite"),

@@ -16,7 +16,8 @@ from torch.distributions import Distribution
 from sipe_bayes.diagnostics.scores import c2st, crps, energy_score, nats, score
 from sipe_bayes.output import to_json
 from sipe_bayes.parameters import Parameter, ParameterSpace
-from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, prior, uniform
+from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, SurrogatePosterior, prior, uniform
+from tests.surrogates import example_surrogate
 
 SPACE = ParameterSpace([Parameter("mass", 1.0, 2.0, unit="kg"), Parameter("damping", 0.1, 1.0, scale="log")])
 
@@ -156,6 +157,19 @@ def test_a_classifier_tells_what_differs_and_not_what_agrees() -> None:
     assert c2st(posterior, other) > 0.85
     assert Distribution._validate_args == validated
     assert c2st(posterior, same) == c2st(posterior, same)
+
+
+def test_stored_draws_are_not_repeated() -> None:
+    """A SurrogatePosterior of 400 exact draws against 400 others: 0.5 to 0.1; drawn with replacement, half of them twice, 0.6 and more."""
+    exact = example_surrogate(SPACE, 800)
+    halves = [Particles(part, SPACE) for part in exact.draws.split(400)]
+    args = (exact.process, exact.epsilon, exact.prior, halves[0].theta, 1, exact.log_normaliser, exact.normaliser_error)
+    found = c2st(SurrogatePosterior(*args), halves[1].theta)
+    repeated = halves[0].sample((400,), generator=torch.Generator().manual_seed(0))
+    worse = c2st(Particles(repeated, SPACE), halves[1].theta)
+    print(found, worse)
+    assert found == c2st(halves[0], halves[1].theta)
+    assert abs(found - 0.5) < 0.1 < worse - 0.5
 
 
 def test_a_truth_in_physical_units_is_doubted() -> None:

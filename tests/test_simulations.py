@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch.func import functional_call
 
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.maml import MAML
-from sipe_bayes.inference.regression import _Linear
 from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.likelihood import first_states
 from sipe_bayes.models.mixture_density import MixtureDensity, RandomFourier
@@ -84,19 +81,96 @@ def test_two_estimators_share_one_cache_and_its_simulations_count(tmp_path: Path
     assert simulator.lanes == 130
 
 
-@pytest.mark.parametrize("name", ["abc", "maml", "cem", "bayesopt"])
-def test_no_more_is_simulated_than_the_budget_says(name: str) -> None:
-    """Two logs in turn, counted where they are simulated."""
+@pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        *((name, {}) for name in ("abc", "maml", "cem")),
+        ("bayesopt", {"budget": 40}),
+        *((name, {"rounds": 2}) for name in ("bayessim", "npe")),
+    ],
+)
+def test_no_more_is_simulated_than_the_budget_says(name: str, settings: dict[str, Any], every: int) -> None:
+    """Two logs in turn, each for one step or for three, counted where they are simulated."""
     simulator = Counting()
     logs = [log(simulator, TRUTH, k, steps=60) for k in (1, 2)]
-    estimator = get_estimator(simulator, name, **{**FORM.get(name, {}), "budget": 150})
+    estimator = get_estimator(simulator, name, **{**FORM.get(name, {}), "budget": 150, **settings})
     simulator.lanes = 0
     windows = -(-60 // 50)
     for k in range(30):
-        estimator.update_parameter_estimate(logs[k % 2])
-    most = 150 * (windows if name in ("cem", "bayesopt") else 1)
+        estimator.update_parameter_estimate(logs[k // every % 2])
+    most = estimator.budget * (windows if name in ("cem", "bayesopt") else 1)
     assert 0 < simulator.lanes <= most
-    assert estimator.rollouts <= 150
+    assert estimator.rollouts <= estimator.budget
+
+
+def test_rounds_begin_anew_with_another_log() -> None:
+    """What was simulated and proposed for one log is not joined with the other's, which is fitted with what is left."""
+    simulator = Counting()
+    one, other = (log(simulator, TRUTH, k, steps=60) for k in (1, 2))
+    estimator = get_estimator(simulator, "bayessim", rounds=2, budget=200, **FORM["bayessim"])
+    while estimator._state is None or estimator._state["round"] == 1:
+        estimator.update_parameter_estimate(one)
+    estimator.update_parameter_estimate(one)
+    assert estimator.rollouts == 150
+    simulator.lanes = 0
+    while not estimator._state["done"]:
+        estimator.update_parameter_estimate(other)
+    assert simulator.lanes == 50
+    estimator.get_parameter_estimate(other)
+    fresh = get_estimator(simulator, "bayessim", rounds=2, budget=50, **FORM["bayessim"])
+    assert torch.equal(estimator.get_parameter_estimate(other).mean, fresh.fit(other).mean)
+    with pytest.raises(ValueError, match="trained for other ones"):
+        estimator.get_parameter_estimate(one)
+
+
+class Breaking(Counting):
+    """Diverges where the rod is heavier than three tenths of its range, and counts that too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.broken = 0
+
+    def rollout(self, theta: Any, *args: Any, **settings: Any) -> Trajectories:
+        made = super().rollout(theta, *args, **settings)
+        bad = np.broadcast_to(np.atleast_2d(theta)[:, 0] > 0.3, (len(made),))
+        self.broken += int(bad.sum())
+        return replace(made, valid=made.valid & ~bad[:, None])
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_invalid_simulations_of_all_rounds_are_described_together(rounds: int) -> None:
+    recorded, simulator = log(pendulum(), TRUTH, 1, steps=60), Breaking()
+    estimator = get_estimator(simulator, "bayessim", rounds=rounds, budget=160, **FORM["bayessim"])
+    estimator.fit(recorded)
+    said = [w for w in estimator.warnings if "diverged" in w]
+    assert len(said) == 1, said
+    assert said[0].startswith(f"{simulator.broken} of 160 simulations diverged, mostly at high rod_mass")
+    assert estimator.diagnostics["invalid_simulations"] == simulator.broken
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("bayessim", {"training": Training(epochs=2)}, "after 2 epochs; raise training.epochs"),
+        ("maml", {"iterations": 20}, "after 20 iterations; raise iterations"),
+        ("npe", {"max_epochs": 2}, "after 2 epochs; raise max_epochs"),
+        ("regression", {"iterations": 30}, "after 30 gradient steps; raise iterations"),
+    ],
+)
+def test_a_training_that_was_cut_short_says_so(name: str, settings: dict[str, Any], words: str) -> None:
+    """And no other does: patience of one step ends it."""
+    simulator = pendulum()
+    recorded = log(simulator, TRUTH, 1, steps=60)
+    estimator = get_estimator(simulator, name, budget=100, **{**FORM[name], **settings})
+    estimator.fit(recorded)
+    assert any(f"still improving {words}" in w for w in estimator.warnings), estimator.warnings
+    enough = {"training": Training(patience=1)} if name == "bayessim" else {"patience": 1}
+    if name == "maml":
+        enough["look_every"] = 1
+    patient = get_estimator(simulator, name, budget=100, **enough)
+    patient.fit(recorded)
+    assert not any("still improving" in w for w in patient.warnings)
 
 
 def test_where_the_invalid_simulations_lie_is_said() -> None:
@@ -178,53 +252,6 @@ def test_random_features_approximate_their_kernel() -> None:
         kernel = features(x) @ features(x[:1]).T
     r = np.sqrt(5) * x.norm(dim=1).numpy()
     np.testing.assert_allclose(kernel[:, 0].numpy(), (1 + r + r**2 / 3) * np.exp(-r), atol=0.05)
-
-
-def test_regression_descends_the_gradient_of_autograd() -> None:
-    torch.manual_seed(0)
-    network, inputs, targets = _Linear(3, 2), torch.randn(7, 3), torch.randn(7, 2)
-    slope, bias = torch.autograd.grad((network.map(inputs) - targets).square().mean(), list(network.parameters()))
-    before = [p.detach().clone() for p in network.parameters()]
-    network.descend(inputs, targets, 0.1)
-    torch.testing.assert_close(network.slope.data, before[0] - 0.1 * slope)
-    torch.testing.assert_close(network.bias.data, before[1] - 0.1 * bias)
-
-
-def test_mamls_outer_gradient_goes_through_the_inner_step() -> None:
-    """Against plain autograd with create_graph, one task; the first-order gradient differs."""
-    method = MAML(pendulum(), neighbours=2, hidden=5)
-    network = method._network(3, 0)
-    rng = torch.Generator().manual_seed(0)
-    inputs, theta, good = torch.randn(4, 6, 3, generator=rng), torch.rand(4, 2, generator=rng), torch.ones(4, 6)
-    tasks, pool = torch.tensor([0]), torch.arange(4)
-    fixed = torch.Generator().manual_seed(1)
-    ours = method._meta_loss(network, inputs, theta, good)(tasks, pool, fixed).sum()
-    parameters = dict(network.named_parameters())
-    outer = torch.autograd.grad(ours, list(parameters.values()))
-    picked = torch.randint(6, (6,), generator=torch.Generator().manual_seed(1))
-    near = (theta[1:] - theta[0]).norm(dim=1).argsort()[:2] + 1
-
-    def mean_square(weights: dict[str, torch.Tensor], rows: torch.Tensor) -> torch.Tensor:
-        out = functional_call(network, weights, (inputs[rows][:, picked],))
-        return (out - theta[rows][:, None]).square().mean()
-
-    inner = torch.autograd.grad(mean_square(parameters, near), list(parameters.values()), create_graph=True)
-    moved = {n: w - method.learning_rate * g for (n, w), g in zip(parameters.items(), inner, strict=True)}
-    plain = torch.autograd.grad(mean_square(moved, tasks), list(parameters.values()))
-    for a, b in zip(outer, plain, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-7)
-
-
-def test_maml_without_gradient_steps_simulates_nothing_more() -> None:
-    simulator = Counting()
-    recorded = log(simulator, TRUTH, 1, steps=60)
-    simulator.lanes = 0
-    for steps, reserved in ((0, 0), (2, 10)):
-        estimator = get_estimator(simulator, "maml", budget=100, gradient_steps=steps, iterations=20)
-        estimator.fit(recorded)
-        assert estimator.rollouts == 100
-        assert estimator.reserved == reserved
-    assert simulator.lanes == 200
 
 
 def trained(name: str = "abc") -> tuple[Simulator, Estimator, Trajectory]:

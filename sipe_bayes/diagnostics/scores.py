@@ -30,7 +30,7 @@ from scipy.spatial.distance import cdist
 
 from sipe_bayes.inference.base import AT_BOUND
 from sipe_bayes.models.sbi_tools import import_sbi
-from sipe_bayes.posterior import Dirac, Particles, Posterior
+from sipe_bayes.posterior import Dirac, Particles, Posterior, SurrogatePosterior
 from sipe_bayes.posterior import prior as default_prior
 
 FloatArray = NDArray[np.float64]
@@ -189,14 +189,23 @@ def c2st(posterior: Posterior, reference: Any, seed: int = 0) -> float:
     if given.ndim != 2 or len(given) < 20:
         raise ValueError(f"reference: expected at least 20 draws (M, {len(posterior.space)}), got {given.shape}")
     generator = torch.Generator().manual_seed(seed)
-    if isinstance(posterior, Particles) and float(posterior.weights.max() - posterior.weights.min()) < 1e-12:
-        count = min(len(given), len(posterior.theta))  # without replacement: a repeated draw gives itself away
-        own = posterior.theta[torch.randperm(len(posterior.theta), generator=generator)[:count]]
+    stored = _stored(posterior)
+    if stored is not None:  # without replacement: a repeated draw gives itself away
+        own = stored[torch.randperm(len(stored), generator=generator)[: len(given)]]
     else:
         own = posterior.sample((len(given),), generator=generator)
     return float(
         import_sbi("utils.metrics").c2st(torch.from_numpy(given)[: len(own)].float(), own.float(), seed=seed + 1)
     )
+
+
+def _stored(posterior: Posterior) -> torch.Tensor | None:
+    """The equally likely draws (M, N) that ``sample`` repeats; None where it makes new ones."""
+    if isinstance(posterior, SurrogatePosterior):
+        return posterior.draws
+    if isinstance(posterior, Particles) and float(posterior.weights.max() - posterior.weights.min()) < 1e-12:
+        return posterior.theta
+    return None
 
 
 def _checked(posterior: Posterior, truth: Any) -> FloatArray:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.checks import positive
+from sipe_bayes.checks import flag, positive
 from sipe_bayes.inference.prior_sampling import PriorSampling
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
@@ -43,11 +43,10 @@ class ABC(PriorSampling):
     """
 
     name: ClassVar[str] = "abc"
-    default_budget: ClassVar[int] = 1000
 
     def __init__(self, simulator: Any, *, accepted: float = 0.05, regression: bool = False, **settings: Any) -> None:
         super().__init__(simulator, **settings)
-        self.accepted, self.regression = positive("accepted", accepted), bool(regression)
+        self.accepted, self.regression = positive("accepted", accepted), flag("regression", regression)
         if self.accepted > 1:
             raise ValueError(f"accepted: expected a fraction above 0 and at most 1, got {accepted}; try 0.05")
 
@@ -103,12 +102,8 @@ class ABC(PriorSampling):
         spread = float(np.sqrt(2 * simulated.shape[1]))  # distance of two independent simulations, root mean square
         self.diagnostics.update(accepted=len(distances), epsilon=float(distances.max()), nearest=float(distances.min()))
         self.diagnostics["epsilon_relative"] = float(distances.max()) / spread
-        sentences = []
         if len(distances) < _FEW:
-            sentences.append(
-                f"only {len(distances)} simulations were accepted; raise the budget or the accepted fraction"
-            )
-        self.warnings.extend(s for s in sentences if s not in self.warnings)
+            self.warn(f"only {len(distances)} simulations were accepted; raise the budget or the accepted fraction")
 
 
 class _Given:

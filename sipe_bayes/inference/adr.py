@@ -35,7 +35,7 @@ from scipy.optimize import brentq
 from scipy.stats import rankdata
 
 from sipe_bayes.checks import positive, whole
-from sipe_bayes.inference.gaussian_search import Search
+from sipe_bayes.inference.gaussian_search import RewardSearch
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import Particles
 from sipe_bayes.trajectory import Trajectories
@@ -43,17 +43,16 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 
-class ADR(Search):
+class ADR(RewardSearch):
     """Particles of equal weights where they stand; ``state["paths"]`` (steps + 1, M, N) is where they went.
 
     particles: how many. temperature: alpha, for rewards as centred ranks. step_size: of the particles. exploration: sd of their
     policies in units of the particles' spread. pool_steps: the latest steps whose draws take part. least_spread: floor of the
     spread, in theta. longest_move: of a particle in a step, in units of the spread. ridge: of the gradients' regression, in
-    units of the draws' mean variance. reward: see ``Search``.
+    units of the draws' mean variance. reward: see ``RewardSearch``.
     """
 
     name: ClassVar[str] = "adr"
-    default_budget: ClassVar[int] = 1000
 
     def __init__(
         self,

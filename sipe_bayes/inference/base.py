@@ -7,6 +7,7 @@ windows; finite differences count.
 from __future__ import annotations
 
 import hashlib
+import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.checks import whole
+from sipe_bayes.checks import path, whole
 from sipe_bayes.demonstration import Given
 from sipe_bayes.inference.state import State, load_state, save_state
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
@@ -55,13 +56,27 @@ class Estimator(ABC):
     The simplest method draws from the prior and keeps the best::
 
         class RandomSearch(Estimator):
-            def start(self, trajectories):
-                return {"theta": np.empty((0, self.n)), "loss": np.empty(0), "done": False}
+            name = "random_search"
 
-            def step(self, state, trajectories): ...
+            def start(self, trajectories):
+                return {"theta": np.empty((0, len(self.space))), "cost": np.empty(0), "done": False}
+
+            def step(self, state, trajectories):
+                generator = torch.Generator().manual_seed(self.seed + len(state["theta"]))
+                theta = self.prior.sample((1,), generator=generator).numpy()
+                windows = self.windows(trajectories)
+                predicted = simulate(windows, theta)  # raises BudgetExhausted
+                cost = StateDifference(windows, channel_scale(windows, predicted))(predicted)
+                return {
+                    **state,
+                    "theta": np.concatenate([state["theta"], theta]),
+                    "cost": np.concatenate([state["cost"], cost]),
+                }
 
             def posterior(self, state, trajectories):
-                return Dirac(state["theta"][state["loss"].argmin()], self.space)
+                return Dirac(state["theta"][state["cost"].argmin()], self.space)
+
+    ``warn`` adds to ``warnings``, ``digest`` tells trajectories apart.
     """
 
     name: ClassVar[str]
@@ -94,9 +109,12 @@ class Estimator(ABC):
         if self.prior.space.names != self.space.names or not self.prior.has_density:
             raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
+        if likelihood is not None and not isinstance(likelihood, Segments):
+            raise ValueError(f"likelihood: expected sipe.Segments(...), got {likelihood!r}")
+        if progress is not None and not callable(progress):
+            raise ValueError(f"progress: expected a function (what, rollouts, budget), got {progress!r}")
         self.seed, self.likelihood = whole("seed", seed, 0), likelihood or _default_likelihood(simulator)
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self.progress = progress
+        self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts = 0
         self.warnings: list[str] = []
         self.diagnostics: dict[str, Any] = {}
@@ -108,6 +126,15 @@ class Estimator(ABC):
             raise ValueError(
                 f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
             )
+
+    def stored(self, name: str, given: Any) -> Path | None:
+        """The path that an argument gives; raises ValueError for a simulator that others there cannot be told from."""
+        if given is not None and isinstance(self.simulator, CallableSimulator) and not self.simulator.name:
+            raise ValueError(
+                f"name: {name}= needs one to tell functions apart, and {self.simulator.fn!r} has none of its own; make "
+                'CallableSimulator(fn, space, name="...")'
+            )
+        return path(name, given)
 
     @abstractmethod
     def start(self, trajectories: Trajectories) -> State: ...
@@ -127,8 +154,7 @@ class Estimator(ABC):
         state = None
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)
-            self.rollouts = int(state["rollouts"])
-            self.warnings = list(state["warnings"])
+            self._recall(state)
         saved = time.monotonic()
         try:
             if state is None:
@@ -145,7 +171,7 @@ class Estimator(ABC):
         except BudgetExhausted as error:
             if state is None:
                 raise ValueError(f"budget: {error}; raise it") from None
-            self.warnings.append(self._spent())
+            self.warn(self._spent())
         self._state = state
         return self._finished(state, batch)
 
@@ -159,10 +185,11 @@ class Estimator(ABC):
             except BudgetExhausted as error:
                 raise ValueError(f"budget: {error}; raise it") from None
         if not self._state["done"]:
+            self._recall(self._state)
             try:
                 self._state = self._counted(self.step(self._state, batch), batch)
             except BudgetExhausted:
-                self.warnings.append(self._spent())
+                self.warn(self._spent())
                 self._state = self._counted({**self._state, "done": True}, batch)
 
     def _spent(self) -> str:
@@ -174,7 +201,7 @@ class Estimator(ABC):
             raise ValueError(
                 "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
             )
-        self.warnings = list(self._state["warnings"])
+        self._recall(self._state)
         return self._finished(self._state, self._given.stack(self._recorded(trajectories)))
 
     def _finished(self, state: State, trajectories: Trajectories) -> Posterior:
@@ -191,7 +218,7 @@ class Estimator(ABC):
             said = (
                 f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
             )
-            self.warnings.append(said)
+            self.warn(said)
             self.diagnostics["at_bound"] = said
         return posterior
 
@@ -205,6 +232,11 @@ class Estimator(ABC):
         if self._observed is None or not np.array_equal(made.observations, self._observed.observations, equal_nan=True):
             self._observed = made
         return self._observed
+
+    def warn(self, sentence: str | None) -> None:
+        """Add a sentence to the warnings, once; None adds nothing."""
+        if sentence is not None and sentence not in self.warnings:
+            self.warnings.append(sentence)
 
     def describe(self, state: State) -> str:
         """What is being done, in a few words, for the progress bar."""
@@ -221,7 +253,13 @@ class Estimator(ABC):
     def _counted(self, state: State, trajectories: Trajectories) -> State:
         if self._bound is not None:
             self.rollouts = self._bound[1].rollouts
-        return {**state, "rollouts": self.rollouts, "warnings": list(self.warnings)}
+        said = json.dumps(self.diagnostics)
+        return {**state, "rollouts": self.rollouts, "warnings": list(self.warnings), "diagnostics": said}
+
+    def _recall(self, state: State) -> None:
+        """Count, warnings and diagnostics as they were when ``state`` was made: an estimate in between adds its own."""
+        self.rollouts, self.warnings = int(state["rollouts"]), list(state["warnings"])
+        self.diagnostics = json.loads(state["diagnostics"])
 
     def settings(self) -> dict[str, Any]:
         """Whatever changes the result besides the trajectories, as plain data; subclasses add theirs."""
@@ -236,11 +274,16 @@ class Estimator(ABC):
         }
 
     def _fingerprint(self, trajectories: Trajectories) -> str:
-        digest = hashlib.sha256(repr(self.settings()).encode())
-        states = np.empty(0) if trajectories.states is None else trajectories.states
-        for array in (trajectories.observations, trajectories.actions, trajectories.dt, trajectories.length, states):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()
+        return hashlib.sha256(f"{self.settings()!r}{digest(trajectories)}".encode()).hexdigest()
+
+
+def digest(trajectories: Trajectories) -> str:
+    """SHA-256 of what was recorded: the same trajectories have the same, others another."""
+    found = hashlib.sha256()
+    states = np.empty(0) if trajectories.states is None else trajectories.states
+    for array in (trajectories.observations, trajectories.actions, trajectories.dt, trajectories.length, states):
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
 
 
 def _default_likelihood(simulator: Simulator | CallableSimulator) -> Segments:

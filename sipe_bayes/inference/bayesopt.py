@@ -45,8 +45,8 @@ from torch import Tensor
 
 from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.checks import at_least, positive, whole
-from sipe_bayes.discrepancy import StateDifference, simulate
-from sipe_bayes.inference.base import Estimator
+from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
+from sipe_bayes.inference.base import Estimator, digest
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Windows
 from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
@@ -126,8 +126,10 @@ class BayesOpt(Estimator):
             )
         n = len(self.space)
         return {
+            "logs": digest(trajectories),
             "theta": np.empty((0, n)),
             "cost": np.empty(0),
+            "units": np.full(len(self.windows(trajectories).channels), np.nan),
             "independent": 0.0,
             "fitted": 0,
             "lengthscale": np.ones(n),
@@ -136,7 +138,9 @@ class BayesOpt(Estimator):
         }
 
     def step(self, state: State, trajectories: Trajectories) -> State:
-        """The initial design, or a batch of candidates."""
+        """The initial design, or a batch of candidates; costs of other trajectories are of another scale, and are left."""
+        if state["logs"] != digest(trajectories):
+            state = self.start(trajectories)
         affordable = self._affordable(trajectories)
         if not affordable:
             return {**state, "done": True}
@@ -164,7 +168,7 @@ class BayesOpt(Estimator):
             process, self._threshold(state, process), self.prior, self.seed, self.effective_draws, self.most_steps
         )
         known = trajectories.states is not None or isinstance(self.simulator, CallableSimulator)
-        self._report(state, process, found, known)
+        self._report(state, process, found, known, state["logs"] == digest(trajectories))
         return found
 
     def _affordable(self, trajectories: Trajectories) -> int:
@@ -180,9 +184,9 @@ class BayesOpt(Estimator):
 
     def _evaluated(self, state: State, theta: FloatArray, windows: Windows) -> State:
         """``state`` with the costs of theta (q, N), and the number of independent residuals where a new one is the best."""
-        discrepancy = StateDifference(windows)
         predicted = simulate(windows, theta)
-        cost = discrepancy.of(predicted)
+        units = state["units"] if np.isfinite(state["units"]).all() else channel_scale(windows, predicted)
+        cost = StateDifference(windows, units)(predicted)
         best = int(cost.argmin())
         independent = state["independent"]
         if cost[best] < state["cost"].min(initial=np.inf):
@@ -191,6 +195,7 @@ class BayesOpt(Estimator):
             **state,
             "theta": np.concatenate([state["theta"], theta]),
             "cost": np.concatenate([state["cost"], cost]),
+            "units": units,
             "independent": independent,
         }
 
@@ -294,7 +299,9 @@ class BayesOpt(Estimator):
         allowed = lowest * math.exp((len(self.space) + 2) / max(state["independent"], 1.0))
         return float(mean.min()) + math.log((allowed + self.floor) / (lowest + self.floor))
 
-    def _report(self, state: State, process: GaussianProcess, found: SurrogatePosterior, starts_known: bool) -> None:
+    def _report(
+        self, state: State, process: GaussianProcess, found: SurrogatePosterior, starts_known: bool, same_logs: bool
+    ) -> None:
         diverged, count = int((~np.isfinite(state["cost"])).sum()), len(state["cost"])
         mixing = found.mixing
         with torch.no_grad():
@@ -314,6 +321,8 @@ class BayesOpt(Estimator):
             "noise_sd": process.noise_sd,
         }
         doubts = []
+        if not same_logs:
+            doubts.append("the costs are those of other trajectories than these: the posterior is theirs")
         if not starts_known:
             doubts.append(
                 "the trajectories have no recorded states: errors of the windows' estimated starts are not in the posterior; "
@@ -343,7 +352,8 @@ class BayesOpt(Estimator):
                 f"the density is known up to a factor only (log normaliser +- {found.normaliser_error:.2f}): "
                 "do not compare log_prob between runs"
             )
-        self.warnings += [doubt for doubt in doubts if doubt not in self.warnings]
+        for doubt in doubts:
+            self.warn(doubt)
 
 
 def log_improvement(z: Tensor) -> Tensor:

@@ -95,6 +95,7 @@ class BayesSim(Rounds):
             self.training,
             torch.Generator().manual_seed(torch_seed),
         )
+        self.still_improving(trained.converged, trained.epochs, "epochs", "training.epochs")
         return {
             **weights(network),
             "held_out_loss": trained.held_out_loss,

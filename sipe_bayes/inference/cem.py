@@ -43,8 +43,6 @@ class CEM(Search):
     """
 
     name: ClassVar[str] = "cem"
-    default_budget: ClassVar[int] = 1000
-    rewards: ClassVar[tuple[str, ...]] = ("state_difference",)
 
     def __init__(
         self,

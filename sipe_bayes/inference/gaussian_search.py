@@ -7,16 +7,15 @@ particles and starts a new pool.
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from sipe_bayes.checks import positive, whole
-from sipe_bayes.discrepancy import StateDifference, simulate
-from sipe_bayes.inference.base import Estimator, Recorded
+from sipe_bayes.checks import one_of, positive, whole
+from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
+from sipe_bayes.inference.base import Estimator, Recorded, digest
 from sipe_bayes.inference.state import State
 from sipe_bayes.learned_reward import LearnedReward
 from sipe_bayes.likelihood import BudgetExhausted
@@ -33,84 +32,39 @@ REWARDS = ("state_difference", "learned")
 
 
 class Search(Estimator):
-    """Base of the methods that simulate where they expect good rewards.
+    """Base of the methods that simulate where they expect good rewards: minus the cost of ``discrepancy.StateDifference``.
 
-    reward: "state_difference", minus the cost of ``discrepancy.StateDifference``, or "learned", a discriminator's (see
-    ``learned_reward``), with two layers of ``discriminator_hidden`` units, which takes ``discriminator_updates`` steps of Adam, of
-    ``learning_rate`` and on batches of ``discriminator_batch``, after each draw. The State holds pool_theta (P, N), pool_reward (P,), -inf where the simulation diverged,
-    pool_draw (P,), the number of the draw that each came from, and, with learned rewards, pool_features (P, M, F) and the
-    discriminator.
+    The State holds pool_theta (P, N), pool_reward (P,), -inf where the simulation diverged, pool_draw (P,), the number of the draw
+    that each came from, and units (C,), NaN before the first valid simulation: what the pool's differences are divided by.
     """
 
     uses_prior: ClassVar[bool] = False
-    rewards: ClassVar[tuple[str, ...]] = REWARDS
-
-    def __init__(
-        self,
-        simulator: Any,
-        *,
-        reward: str = "state_difference",
-        learning_rate: float = 0.001,
-        discriminator_batch: int = 320,
-        discriminator_updates: int = 30,
-        discriminator_hidden: int = HIDDEN,
-        **settings: Any,
-    ) -> None:
-        super().__init__(simulator, **settings)
-        if reward not in self.rewards:
-            raise ValueError(f"reward: expected one of {', '.join(self.rewards)}, got {reward!r}")
-        self.reward, self.learning_rate = reward, positive("learning_rate", learning_rate)
-        self.discriminator_batch = whole("discriminator_batch", discriminator_batch, 2)
-        self.discriminator_updates = whole("discriminator_updates", discriminator_updates)
-        self.discriminator_hidden = whole("discriminator_hidden", discriminator_hidden)
-        self._learned: tuple[Trajectories, LearnedReward] | None = None
+    begins_with_prior: ClassVar[bool] = True
 
     def fit(self, trajectories: Recorded) -> Posterior:
-        """As ``Estimator.fit``; a warning if a prior was given, which a search does not use."""
+        """As ``Estimator.fit``; a warning if a prior was given, of which a search makes little use."""
         found = super().fit(trajectories)
         if (self.prior.gaussian_moments()[1].diagonal() < 1).any():  # a uniform prior counts as enormously wide
-            self.warnings.append(
-                f"{self.name} searches within the bounds and does not use the prior; bayesopt and npe do"
-            )
+            use = "uses the prior only to begin" if self.begins_with_prior else "does not use the prior"
+            self.warn(f"{self.name} searches within the bounds and {use}; bayesopt and npe count it")
         return found
-
-    def settings(self) -> dict[str, Any]:
-        own = ("reward", "learning_rate", "discriminator_batch", "discriminator_updates", "discriminator_hidden")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def empty_pool(self, trajectories: Trajectories) -> State:
         """The pool's entries before the first simulation."""
-        state: State = {
+        return {
             "pool_theta": np.empty((0, len(self.space))),
             "pool_reward": np.empty(0),
             "pool_draw": np.empty(0, np.int64),
-            "pool_of": _digest(trajectories),
+            "pool_of": digest(trajectories),
+            "units": np.full(len(self.windows(trajectories).channels), np.nan),
             "draws": 0,
             "simulated": 0,
             "diverged": 0,
         }
-        if self.reward == "learned":
-            learned = self.learned(trajectories)
-            state.update(learned.start(), pool_features=learned.features(None))
-        return state
-
-    def learned(self, trajectories: Trajectories) -> LearnedReward:
-        """The discriminator's reward on the trajectories."""
-        if self._learned is None or self._learned[0] is not trajectories:
-            made = LearnedReward(
-                self.windows(trajectories),
-                seed=self.seed,
-                learning_rate=self.learning_rate,
-                batch=self.discriminator_batch,
-                updates=self.discriminator_updates,
-                hidden=self.discriminator_hidden,
-            )
-            self._learned = (trajectories, made)
-        return self._learned[1]
 
     def renewed(self, state: State, trajectories: Trajectories) -> State:
         """The state, without its pool where that belongs to other trajectories."""
-        if state["pool_of"] == _digest(trajectories):
+        if state["pool_of"] == digest(trajectories):
             return state
         keep = {k: state[k] for k in state if k in ("draws", "simulated", "diverged") or k.startswith("reward_")}
         return {**state, **self.empty_pool(trajectories), **keep}
@@ -130,24 +84,23 @@ class Search(Estimator):
 
     def evaluated(self, state: State, theta: FloatArray, trajectories: Trajectories, most: int) -> State:
         """The state with theta (B, N) simulated and added to the pool of at most the ``most`` latest, rewards up to date."""
-        windows = self.windows(trajectories)
-        predicted = simulate(windows, theta)
+        predicted = simulate(self.windows(trajectories), theta)
         pool = {
             "pool_theta": np.concatenate([state["pool_theta"], theta])[-most:],
             "pool_draw": np.concatenate([state["pool_draw"], np.full(len(theta), state["draws"])])[-most:],
+            **self.rewarded(state, predicted, trajectories, most),
         }
-        if self.reward == "learned":
-            learned = self.learned(trajectories)
-            features = np.concatenate([state["pool_features"], learned.features(predicted)])[-most:]
-            pool["pool_features"] = features
-            pool.update(learned.train({**state, **pool}, features))
-            pool["pool_reward"] = learned({**state, **pool}, features)
-        else:
-            reward = -StateDifference(windows).of(predicted)
-            pool["pool_reward"] = np.concatenate([state["pool_reward"], reward])[-most:]
         lost = int((~np.isfinite(pool["pool_reward"][-len(theta) :])).sum())
         counts = {"simulated": state["simulated"] + len(theta), "diverged": state["diverged"] + lost}
         return {**state, **pool, **counts, "draws": state["draws"] + 1}
+
+    def rewarded(self, state: State, predicted: FloatArray, trajectories: Trajectories, most: int) -> State:
+        """pool_reward of the ``most`` latest, predictions (B, W, L, C) the newest of them, and what else rewards change."""
+        windows, units = self.windows(trajectories), state["units"]
+        if not np.isfinite(units).all():
+            units = channel_scale(windows, predicted)
+        reward = -StateDifference(windows, units)(predicted)
+        return {"units": units, "pool_reward": np.concatenate([state["pool_reward"], reward])[-most:]}
 
     def report(self, state: State) -> None:
         """Diagnostics and warnings of the simulations; raises ValueError where none was valid."""
@@ -171,10 +124,65 @@ class Search(Estimator):
                 f"the search is still wide (sd {sd:.2f} of the bounds' range): raise the budget, or expect nothing of it"
             )
 
-    def warn(self, sentence: str) -> None:
-        """Add a sentence to the warnings, once."""
-        if sentence not in self.warnings:
-            self.warnings.append(sentence)
+
+class RewardSearch(Search):
+    """Base of the searches that can learn their reward.
+
+    reward: "state_difference", as ``Search``, or "learned", a discriminator's (see ``learned_reward``), with two layers of
+    ``discriminator_hidden`` units, which takes ``discriminator_updates`` steps of Adam, of ``learning_rate`` and on batches of
+    ``discriminator_batch``, after each draw. With learned rewards the State also holds pool_features (P, M, F) and the discriminator.
+    """
+
+    def __init__(
+        self,
+        simulator: Any,
+        *,
+        reward: str = "state_difference",
+        learning_rate: float = 0.001,
+        discriminator_batch: int = 320,
+        discriminator_updates: int = 30,
+        discriminator_hidden: int = HIDDEN,
+        **settings: Any,
+    ) -> None:
+        super().__init__(simulator, **settings)
+        self.reward, self.learning_rate = one_of("reward", reward, REWARDS), positive("learning_rate", learning_rate)
+        self.discriminator_batch = whole("discriminator_batch", discriminator_batch, 2)
+        self.discriminator_updates = whole("discriminator_updates", discriminator_updates)
+        self.discriminator_hidden = whole("discriminator_hidden", discriminator_hidden)
+        self._learned: tuple[Trajectories, LearnedReward] | None = None
+
+    def settings(self) -> dict[str, Any]:
+        own = ("reward", "learning_rate", "discriminator_batch", "discriminator_updates", "discriminator_hidden")
+        return {**super().settings(), **{name: getattr(self, name) for name in own}}
+
+    def empty_pool(self, trajectories: Trajectories) -> State:
+        state = super().empty_pool(trajectories)
+        if self.reward == "learned":
+            learned = self.learned(trajectories)
+            state.update(learned.start(), pool_features=learned.features(None))
+        return state
+
+    def learned(self, trajectories: Trajectories) -> LearnedReward:
+        """The discriminator's reward on the trajectories."""
+        if self._learned is None or self._learned[0] is not trajectories:
+            made = LearnedReward(
+                self.windows(trajectories),
+                seed=self.seed,
+                learning_rate=self.learning_rate,
+                batch=self.discriminator_batch,
+                updates=self.discriminator_updates,
+                hidden=self.discriminator_hidden,
+            )
+            self._learned = (trajectories, made)
+        return self._learned[1]
+
+    def rewarded(self, state: State, predicted: FloatArray, trajectories: Trajectories, most: int) -> State:
+        if self.reward != "learned":
+            return super().rewarded(state, predicted, trajectories, most)
+        learned = self.learned(trajectories)
+        features = np.concatenate([state["pool_features"], learned.features(predicted)])[-most:]
+        trained = learned.train(state, features)
+        return {**trained, "pool_features": features, "pool_reward": learned(trained, features)}
 
 
 def draw_in_cube(mean: FloatArray, covariance: FloatArray, count: int, random: np.random.Generator) -> FloatArray:
@@ -212,10 +220,3 @@ def gaussian_kl(mean: FloatArray, covariance: FloatArray, old_mean: FloatArray, 
     shift = solve_triangular(factor, mean - old_mean, lower=True)
     log_ratio = np.log(np.abs(np.diag(white))).sum()
     return float(0.5 * ((white**2).sum() + shift @ shift - len(mean)) - log_ratio)
-
-
-def _digest(trajectories: Trajectories) -> str:
-    digest = hashlib.sha256()
-    for array in (trajectories.observations, trajectories.actions, trajectories.dt, trajectories.length):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]

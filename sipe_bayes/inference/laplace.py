@@ -35,6 +35,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.least_squares import Fit, QuadraticPrior, energy_of, step
 from sipe_bayes.inference.state import State
@@ -89,10 +90,8 @@ class Laplace(Estimator):
         initial: FloatArray | None = None,
         **settings: Any,
     ) -> None:
-        if restarts < 1 or candidates < 0:
-            raise ValueError(f"restarts: expected at least 1, got {restarts}; candidates: at least 0, got {candidates}")
         super().__init__(simulator, **settings)
-        self.restarts, self.candidates = restarts, candidates
+        self.restarts, self.candidates = whole("restarts", restarts), whole("candidates", candidates, 0)
         self.initial = None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
 
     def settings(self) -> dict[str, Any]:
@@ -180,11 +179,11 @@ class Laplace(Estimator):
         }
         if settled or iteration >= _MAX_ITERATIONS:
             if not settled:
-                self.warnings.append(
+                self.warn(
                     f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
                 )
             elif fit.refused > _DRIFT:
-                self.warnings.append(
+                self.warn(
                     f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
                     "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
                 )
@@ -332,7 +331,7 @@ class Laplace(Estimator):
             "noise_tau": state["mode_tau"][kept[0]].tolist(),
         }
         if len(kept) > 1:
-            self.warnings.append(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
+            self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         weights = torch.tensor(np.array(evidence) - np.max(evidence))
         return GaussianMixture(weights, np.stack(means), np.stack(covariances), self.space)
 
@@ -391,7 +390,7 @@ def screen(estimator: Laplace, windows: Windows, trajectories: Trajectories) -> 
     spread = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), 1e-12)
     loss = np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
     if not valid[0]:
-        estimator.warnings.append("the model as given diverges on these logs; the search started elsewhere")
+        estimator.warn("the model as given diverges on these logs; the search started elsewhere")
     order = np.argsort(loss, kind="stable")[: int(valid.sum())]
     chosen = [0, *[i for i in order if i != 0]] if valid[0] else list(order)
     return points[chosen[: estimator.restarts]]

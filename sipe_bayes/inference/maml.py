@@ -29,6 +29,7 @@ from sipe_bayes.checks import positive, share, whole
 from sipe_bayes.inference.prior_sampling import PriorSampling, recorded_steps
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.models.training import EarlyStopping, check_device, restore, split, weights
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
@@ -124,7 +125,16 @@ class MAML(PriorSampling):
             if stopping.stops(now):
                 break
         stopping.restore()
-        return {**weights(network), "held_out_loss": float(stopping.best), "iterations": k}
+        converged = stopping.waited >= self.patience
+        self.still_improving(converged, k, "iterations", "iterations")
+        return {
+            **weights(network),
+            "held_out_loss": float(stopping.best),
+            "iterations": k,
+            "converged": converged,
+            "near": 0,
+            "near_invalid": 0,
+        }
 
     def _meta_loss(self, network: _Regressor, inputs: Tensor, theta: Tensor, good: Tensor) -> Any:
         """A function of tasks (t,), the rows their neighbours come from, and a generator: query losses (t,) after the inner
@@ -155,7 +165,11 @@ class MAML(PriorSampling):
         return loss
 
     def _adapted(self, state: State, trajectories: Trajectories) -> State:
-        """One gradient step on simulations near the estimate."""
+        """One gradient step on simulations near the estimate; raises BudgetExhausted."""
+        if self.rollouts + self.neighbours * len(trajectories) > self.budget:
+            raise BudgetExhausted(
+                f"{self.neighbours} simulations near the estimate are not left of {self.budget} rollouts"
+            )
         steps = recorded_steps(trajectories)
         network = self._network(steps.shape[-1], 0)
         restore(network, state)
@@ -176,13 +190,20 @@ class MAML(PriorSampling):
             for parameter, slope in zip(parameters, torch.autograd.grad(error, parameters), strict=True):
                 parameter.data.sub_(self.learning_rate * slope)
         adapted = state["adapted"] + 1
-        return {**state, **weights(network), "adapted": adapted, "done": adapted == self.gradient_steps}
+        near = {"near": state["near"] + len(made), "near_invalid": state["near_invalid"] + int((~made.valid).sum())}
+        return {**state, **weights(network), **near, "adapted": adapted, "done": adapted == self.gradient_steps}
 
     def infer(self, state: State, trajectories: Trajectories) -> Dirac:
         steps = recorded_steps(trajectories)
         network = self._network(steps.shape[-1], 0)
         restore(network, state)
-        self.diagnostics.update({name: state[name] for name in ("held_out_loss", "iterations")})
+        told = ("held_out_loss", "iterations", "converged", "near", "near_invalid")
+        self.diagnostics.update({name: state[name] for name in told})
+        if state["near_invalid"]:
+            self.warn(
+                f"{state['near_invalid']} of {state['near']} simulations near the estimate {self.simulator.failure}; the "
+                "gradient steps took the others"
+            )
         return Dirac(self._estimate(network, steps), self.space)
 
     @property

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.checks import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace import Laplace, distinct_modes, free_noise, longest_tau
 from sipe_bayes.inference.state import State
@@ -73,10 +74,9 @@ class MCMC(Estimator):
         super().__init__(simulator, **settings)
         if self.likelihood.noise == "sandwich":
             raise ValueError("noise: 'sandwich' is a width without a likelihood, for laplace only; use 'ar1' with mcmc")
-        if walkers is not None and walkers < 2 * len(self.space) + 2:
-            raise ValueError(f"walkers: expected at least {2 * len(self.space) + 2}, got {walkers}")
-        self.walkers, self.effective = walkers, effective
-        self.restarts, self.candidates = restarts, candidates
+        self.walkers = None if walkers is None else whole("walkers", walkers, 2 * len(self.space) + 2)
+        self.effective = whole("effective", effective)
+        self.restarts, self.candidates = whole("restarts", restarts), whole("candidates", candidates, 0)
 
     def settings(self) -> dict[str, Any]:
         own = ("walkers", "effective", "restarts", "candidates")
@@ -96,7 +96,8 @@ class MCMC(Estimator):
         windows = self.windows(trajectories)
         first._bound = (trajectories, windows)
         found = first.fit(trajectories)
-        self.warnings += first.warnings
+        for sentence in first.warnings:
+            self.warn(sentence)
         if not first._state or not len(first._state["mode_theta"]):
             raise BudgetExhausted("the budget did not suffice for the first laplace fit")
         best = distinct_modes(first._state)[0]
@@ -116,7 +117,6 @@ class MCMC(Estimator):
             "proposal_means": found.means.numpy(),
             "proposal_covariances": _WIDER**2 * found.covariances.numpy(),
             "proposal_noise": _WIDER**2 * spread,
-            "accepted": 0,
         }
         dimensions = len(self.space) + len(spread)
         count = self.walkers or max(24, 2 * dimensions + 2)
@@ -129,6 +129,8 @@ class MCMC(Estimator):
             "best": picked["theta"],
             "best_log_prob": float(_Target(self, windows, state)(centre[None])[0]),
             "chain": np.empty((0, *walkers.shape)),
+            "chain_log_prob": np.empty((0, count)),
+            "accepted": np.zeros(count),
             **_random_state(random),
         }
 
@@ -195,7 +197,8 @@ class MCMC(Estimator):
             "best": chain[top][: len(self.space)] if better else state["best"],
             "best_log_prob": float(max(log_prob[top], state["best_log_prob"])),
             "chain": np.concatenate([state["chain"], chain]),
-            "accepted": int(state["accepted"] + sampler.backend.accepted.sum()),
+            "chain_log_prob": np.concatenate([state["chain_log_prob"], log_prob]),
+            "accepted": state["accepted"] + sampler.backend.accepted,
             **_random_state(random),
         }
         mixing = self._mixing(state)
@@ -220,7 +223,7 @@ class MCMC(Estimator):
             "rhat": rhat,
             "ess": steps * walkers / tau if steps >= 10 * tau else min(steps * walkers / tau, 10.0 * walkers),
             "autocorrelation_steps": tau,
-            "acceptance": state["accepted"] / (len(state["chain"]) * walkers),
+            "acceptance": float(state["accepted"].sum()) / (len(state["chain"]) * walkers),
             "steps": len(state["chain"]),
         }
 
@@ -235,21 +238,24 @@ class MCMC(Estimator):
         chain = self._kept(state)
         thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
         theta = np.swapaxes(chain[::-thin][::-1], 0, 1)[:, :, :n]
+        log_prob = state["chain_log_prob"][-len(chain) :][::-thin][::-1].T
+        rates = np.repeat(state["accepted"] / len(state["chain"]), theta.shape[1])
+        stats = {"lp": log_prob.ravel(), "acceptance_rate": rates}
         mixing = self._mixing(state)
         mixing["linearisation_error"] = self._linearisation_error(state, trajectories)
         self.diagnostics = {"mixing": mixing, **self._noise_summary(state, trajectories)}
         if not (mixing["rhat"] <= _MIXED_RHAT and mixing["ess"] >= self.effective / 2):
-            self.warnings.append(
+            self.warn(
                 f"the chains have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective draws): "
                 "raise the budget before you trust the intervals"
             )
         if mixing["linearisation_error"] > 0.5:
-            self.warnings.append(
+            self.warn(
                 f"the windows' starts are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): "
                 "use shorter windows"
             )
         flat = np.clip(theta.reshape(-1, n), 0, 1)
-        return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1))
+        return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
 
     def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
         target = _Target(self, self.windows(trajectories), state)

@@ -31,6 +31,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sipe_bayes.checks import one_of, positive, share, whole
 from sipe_bayes.inference.rounds import Rounds
 from sipe_bayes.inference.simulations import Simulations
 from sipe_bayes.inference.state import State
@@ -59,7 +60,6 @@ class NPE(Rounds):
     """
 
     name: ClassVar[str] = "npe"
-    default_budget: ClassVar[int] = 1000
 
     def __init__(
         self,
@@ -79,30 +79,17 @@ class NPE(Rounds):
         **settings: Any,
     ) -> None:
         super().__init__(simulator, **settings)
-        if embedding not in ("transitions", "none"):
-            raise ValueError(f"embedding: expected 'transitions' or 'none', got {embedding!r}")
-        if not 0 < learning_rate < 1:
-            raise ValueError(f"learning_rate: expected a number between 0 and 1, got {learning_rate}; try 1e-3")
-        counts = {
-            "embedding_features": embedding_features,
-            "transforms": transforms,
-            "hidden": hidden,
-            "bins": bins,
-            "batch_size": 1 if batch_size is None else batch_size,
-            "patience": 1 if patience is None else patience,
-            "max_epochs": max_epochs,
+        self.embedding = one_of("embedding", embedding, ("transitions", "none"))
+        self.embedding_features = whole("embedding_features", embedding_features)
+        self.architecture = {
+            "transforms": whole("transforms", transforms),
+            "hidden": whole("hidden", hidden),
+            "bins": whole("bins", bins, 2),
         }
-        for name, value in counts.items():
-            if value < (least := 2 if name == "bins" else 1):
-                raise ValueError(f"{name}: expected at least {least}, got {value}")
-        self.embedding = embedding
-        self.embedding_features = int(embedding_features)
-        self.architecture = {"transforms": int(transforms), "hidden": int(hidden), "bins": int(bins)}
-        if not 0 < held_out < 1:
-            raise ValueError(f"held_out: expected a share between 0 and 1, got {held_out}; try 0.1")
-        self.batch_size, self.learning_rate = batch_size, float(learning_rate)
-        self.held_out = float(held_out)
-        self.patience, self.max_epochs, self.device = patience, int(max_epochs), check_device(device)
+        self.batch_size = None if batch_size is None else whole("batch_size", batch_size)
+        self.learning_rate, self.held_out = positive("learning_rate", learning_rate), share("held_out", held_out)
+        self.patience = None if patience is None else whole("patience", patience)
+        self.max_epochs, self.device = whole("max_epochs", max_epochs), check_device(device)
 
     def settings(self) -> dict[str, Any]:
         return {
@@ -130,10 +117,17 @@ class NPE(Rounds):
         with seeded(_number(self.seed, 4)), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             net, summary = self._optimise(((line - mean) / sd).float(), x)
-        self._report(summary, len(x))
+        epochs = int(summary["epochs_trained"][-1])
+        converged = epochs <= self.max_epochs
+        self.still_improving(converged, self.max_epochs, "epochs", "max_epochs")
         weights = {f"weights.{key}": value.numpy() for key, value in net.state_dict().items()}
-        shape: State = {"features": x.shape[-1]}
-        return {**weights, **shape, "line_mean": mean.numpy(), "line_sd": sd.numpy()}
+        told: State = {
+            "simulations": len(x),
+            "epochs": epochs,
+            "validation_loss": float(summary["best_validation_loss"][-1]),
+            "converged": converged,
+        }
+        return {**weights, **told, "features": x.shape[-1], "line_mean": mean.numpy(), "line_sd": sd.numpy()}
 
     def infer(self, state: State, trajectories: Trajectories) -> Posterior:
         x = torch.from_numpy(self._features(trajectories.observations[None].astype(np.float32), trajectories))
@@ -144,6 +138,9 @@ class NPE(Rounds):
             )
         if self.embedding == "transitions" and not x.isfinite().any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
+        self.diagnostics.update(
+            {name: state[name] for name in ("simulations", "epochs", "validation_loss", "converged")}
+        )
         embedding = self._embedding(x.shape[-1])
         weights = {
             k.removeprefix("weights."): torch.from_numpy(v) for k, v in state.items() if k.startswith("weights.")
@@ -195,18 +192,6 @@ class NPE(Rounds):
             max_num_epochs=self.max_epochs,
         )
         return net.to("cpu").eval(), trainer.summary
-
-    def _report(self, summary: dict[str, Any], count: int) -> None:
-        epochs = int(summary["epochs_trained"][-1])
-        self.diagnostics.update(
-            simulations=count, epochs=epochs, validation_loss=float(summary["best_validation_loss"][-1])
-        )
-        if epochs > self.max_epochs:
-            self._warn(f"the training was still improving after {self.max_epochs} epochs; raise max_epochs")
-
-    def _warn(self, sentence: str) -> None:
-        if sentence not in self.warnings:
-            self.warnings.append(sentence)
 
 
 def _inside(trajectories: Trajectories) -> NDArray[np.bool_]:

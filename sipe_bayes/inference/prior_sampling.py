@@ -7,7 +7,6 @@ the posterior would be that of another experiment, and a warning says so (``unli
 
 from __future__ import annotations
 
-import hashlib
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.inference.base import Estimator, Recorded
+from sipe_bayes.inference.base import Estimator, Recorded, digest
 from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, first_states
 from sipe_bayes.models.statistics import step_statistics
-from sipe_bayes.models.transitions import control_steps
+from sipe_bayes.models.transitions import SMALLEST, control_steps
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -52,7 +51,7 @@ class PriorSampling(Estimator):
     def __init__(self, simulator: Any, *, cache: str | Path | None = None, **settings: Any) -> None:
         super().__init__(simulator, **settings)
         beside = None if self.checkpoint is None else self.checkpoint.with_name("simulations")
-        self.cache = beside if cache is None else Path(cache)
+        self.cache = beside if cache is None else self.stored("cache", cache)
         self._cached: tuple[Trajectories, Cache] | None = None
 
     @abstractmethod
@@ -126,15 +125,31 @@ class PriorSampling(Estimator):
     def simulations(self, state: State, trajectories: Trajectories) -> Simulations:
         """The valid simulations so far, with noise."""
         made = self._simulations(trajectories).first(state["simulated"])
-        self.warn(describe_invalid(made, self.space, self.simulator.failure))
-        self.diagnostics["invalid_simulations"] = int((~made.valid).sum())
+        self.judge(made)
+        return self._usable(made, trajectories)
+
+    def judge(self, made: Simulations) -> None:
+        """Count all that were made so far and say where the invalid ones lie; raises ValueError where too few are valid."""
+        self.warnings = [w for w in self.warnings if w != self.diagnostics.get("invalid")]  # said of fewer
+        said = describe_invalid(made, self.space, self.simulator.failure)
+        self.warn(said)
+        self.diagnostics.update({"invalid": said} if said else {}, invalid_simulations=int((~made.valid).sum()))
         if made.valid.sum() < _FEWEST:
             raise ValueError(
-                f"budget: {int(made.valid.sum())} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}, the others "
-                f"{self.simulator.failure}; raise the budget, or narrow the bounds"
+                f"budget: {int(made.valid.sum())} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}"
+                f"{self._lost(made)}; raise the budget{'' if made.valid.all() else ', or narrow the bounds'}"
             )
-        valid = Simulations(made.theta[made.valid], made.observations[made.valid], made.valid[made.valid])
-        return self._noisy(valid, trajectories, np.random.default_rng([self.seed, 1]))
+
+    def still_improving(self, converged: bool, passes: int, unit: str, argument: str) -> None:
+        """A warning where a training ended at ``argument``, its limit on ``passes`` of a unit, and not by itself."""
+        if not converged:
+            self.warn(f"the training was still improving after {passes} {unit}; raise {argument}")
+
+    def _usable(self, made: Simulations, trajectories: Trajectories) -> Simulations:
+        return self._noisy(made.usable(), trajectories, np.random.default_rng([self.seed, 1]))
+
+    def _lost(self, made: Simulations) -> str:
+        return "" if made.valid.all() else f", the others {self.simulator.failure}"
 
     def _noisy(self, made: Simulations, trajectories: Trajectories, rng: np.random.Generator) -> Simulations:
         sd = noise_level(trajectories, self.likelihood)
@@ -152,11 +167,22 @@ class PriorSampling(Estimator):
 
     def _trained(self, state: State, trajectories: Trajectories) -> State:
         simulations = self.simulations(state, trajectories)
+        self._check_units(simulations)
         seen = self._looks(simulations.observations[-_SEEN:], trajectories)
         trained = self.train(simulations, trajectories)
         where = np.isfinite(trajectories.observations).all(-1)
         replayed = _experiment(trajectories, simulations.observations[:, :, 0])
         return {**state, **trained, **seen, **replayed, "seen_where": where, "trained": True, "done": True}
+
+    def _check_units(self, simulations: Simulations) -> None:
+        """A warning where a function's outputs vary by less than networks take for rounding."""
+        if isinstance(self.simulator, CallableSimulator):
+            sd = simulations.observations[:, 0, 1].astype(float).std(0)
+            small = np.flatnonzero((sd > 0) & (sd <= SMALLEST)).tolist()
+            if small:
+                self.warn(
+                    f"x{small} vary by {sd[small].max():.0e} only, as rounding does; give fn's outputs in smaller units"
+                )
 
     def _simulated(self, state: State, trajectories: Trajectories) -> Trajectories:
         """The trajectories whose simulations the untrained state counts: these, or the last ones that were stepped on."""
@@ -166,11 +192,6 @@ class PriorSampling(Estimator):
         raise ValueError(
             "trajectories: nothing was simulated for these; call update_parameter_estimate with them first"
         )
-
-    def warn(self, sentence: str | None) -> None:
-        """Add a sentence to the warnings, once."""
-        if sentence is not None and sentence not in self.warnings:
-            self.warnings.append(sentence)
 
     def _simulations(self, trajectories: Trajectories) -> Cache:
         if self._cached is None or self._cached[0] is not trajectories:
@@ -202,14 +223,6 @@ class PriorSampling(Estimator):
             raise ValueError(
                 f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
             )
-
-
-def digest(trajectories: Trajectories) -> str:
-    """Of what was observed and commanded."""
-    found = hashlib.sha256()
-    for array in (trajectories.observations, trajectories.actions):
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
 
 
 def _experiment(trajectories: Trajectories, first: NDArray[np.floating]) -> State:

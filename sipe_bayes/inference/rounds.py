@@ -22,7 +22,8 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.checks import share, whole
-from sipe_bayes.inference.prior_sampling import PriorSampling, digest
+from sipe_bayes.inference.base import digest
+from sipe_bayes.inference.prior_sampling import PriorSampling
 from sipe_bayes.inference.simulations import BLOCK, Simulations
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted
@@ -50,15 +51,23 @@ class Rounds(PriorSampling):
         return {**super().settings(), "rounds": self.rounds, "truncated": self.truncated}
 
     def start(self, trajectories: Trajectories) -> State:
-        if self.budget // len(trajectories) < self.rounds:
-            raise BudgetExhausted(f"{self.rounds} rounds take {self.rounds * len(trajectories)} rollouts or more")
-        return {**super().start(trajectories), "round": 1}
+        return self._begun(trajectories, 0)
+
+    def _begun(self, trajectories: Trajectories, before: int) -> State:
+        """Nothing simulated for these trajectories yet, ``before`` rollouts spent on others."""
+        left = self.budget - before
+        if left // len(trajectories) < self.rounds:
+            least = self.rounds * len(trajectories)
+            raise BudgetExhausted(f"{self.rounds} rounds take {least} rollouts or more, the budget has {left}")
+        return {**super().start(trajectories), "round": 1, "before": before}
 
     def step(self, state: State, trajectories: Trajectories) -> State:
-        """A block of simulations, or a training at the end of a round."""
-        most = self.budget // len(trajectories)
+        """A block of simulations, or a training at the end of a round; with other trajectories, the first block of all."""
         if self.rounds == 1:
             return super().step(state, trajectories)
+        if state["logs"] != digest(trajectories):
+            state = self._begun(trajectories, self.rollouts)
+        most = self._affordable(trajectories, state["before"])
         until = most * state["round"] // self.rounds
         if state["simulated"] == until:
             state = {**self._trained(state, trajectories), "trained_on": digest(trajectories)}
@@ -74,7 +83,7 @@ class Rounds(PriorSampling):
         else:
             self._simulations(trajectories).first(state["simulated"] + count)
         count += state["simulated"]
-        self.rollouts = count * len(trajectories)
+        self.rollouts = state["before"] + count * len(trajectories)
         return {**state, "simulated": count}
 
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
@@ -87,10 +96,9 @@ class Rounds(PriorSampling):
         if "round_theta" not in state:
             return super().simulations(state, trajectories)
         later = Simulations(*(state[f"round_{key}"] for key in _FIELDS))
-        made = super().simulations({**state, "simulated": state["simulated"] - len(later)}, trajectories)
-        self.diagnostics["invalid_simulations"] += int((~later.valid).sum())
-        pairs = ((getattr(made, name), getattr(later, name)[later.valid]) for name in _FIELDS)
-        return Simulations(*(np.concatenate(pair) for pair in pairs))
+        first = self._simulations(trajectories).first(state["simulated"] - len(later))
+        self.judge(_both(first, later))
+        return _both(self._usable(first, trajectories), later.usable())
 
     def _propose(self, state: State, count: int, trajectories: Trajectories) -> FloatArray:
         """``count`` theta of the prior where the posterior has all but 1e-4 of its mass."""
@@ -120,6 +128,10 @@ class Rounds(PriorSampling):
             "rounds, or a larger ``truncated``"
         )
         return chosen.numpy()
+
+
+def _both(first: Simulations, later: Simulations) -> Simulations:
+    return Simulations(*(np.concatenate([getattr(first, name), getattr(later, name)]) for name in _FIELDS))
 
 
 def _joined(state: State, new: Simulations) -> State:

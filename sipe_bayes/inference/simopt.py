@@ -40,7 +40,7 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from sipe_bayes.checks import at_least, positive, share, whole
-from sipe_bayes.inference.gaussian_search import Search, draw_in_cube, gaussian_kl, log_normal
+from sipe_bayes.inference.gaussian_search import RewardSearch, draw_in_cube, gaussian_kl, log_normal
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.trajectory import Trajectories
@@ -50,17 +50,17 @@ FloatArray = NDArray[np.float64]
 _LEAST_VARIANCE = 1e-10
 
 
-class SimOpt(Search):
+class SimOpt(RewardSearch):
     """The last iteration's weighted draws as Particles; ``proposal`` is the Gaussian that they fit.
 
     updates: REPS updates in an iteration. particles: simulated in each. initial_variance: of the first Gaussian, whose mean
     is drawn uniformly from [0, initial_mean]^N. epsilon: bound on the KL of an update, in nats. damping: of the covariance, 0 or
     more; the more, the slower it follows few draws. least_factor: by which an update narrows, or its inverse widens, a
-    variance at most. converged_sd: of every parameter, in theta, where the search ends. reward: see ``Search``.
+    variance at most. converged_sd: of every parameter, in theta, where the search ends. reward: see ``RewardSearch``.
     """
 
     name: ClassVar[str] = "simopt"
-    default_budget: ClassVar[int] = 1000
+    begins_with_prior: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -161,12 +161,6 @@ class SimOpt(Search):
         }
         self.warn_if_wide(self.diagnostics["search"]["largest_sd"])
         return result
-
-
-def reps_dual(temperature: float, reward: FloatArray, log_base: FloatArray, epsilon: float) -> float:
-    """g(eta) of rewards (n,), -inf allowed, and normalised log base weights (n,)."""
-    best = reward.max()
-    return float(temperature * (epsilon + logsumexp(log_base + (reward - best) / temperature)) + best)
 
 
 def reps_weights(reward: FloatArray, log_base: FloatArray, temperature: float) -> FloatArray:

@@ -42,6 +42,10 @@ class Simulations:
     def __len__(self) -> int:
         return len(self.theta)
 
+    def usable(self) -> Simulations:
+        """The valid ones."""
+        return Simulations(self.theta[self.valid], self.observations[self.valid], self.valid[self.valid])
+
 
 class Cache:
     """Simulations of theta drawn from ``prior``, replaying R ``trajectories`` from ``starts`` (R, S); in memory, and in

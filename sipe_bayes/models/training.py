@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from sipe_bayes.checks import at_least, positive, share, whole
+
 Loss = Callable[[Tensor], Tensor]
 """Losses (b,) of the rows (b,) whose indices are given."""
 
@@ -27,8 +29,11 @@ class Training:
     weight_decay: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.batch, self.epochs, self.patience) < 1 or not 0 < self.held_out < 1 or self.learning_rate <= 0:
-            raise ValueError(f"training: expected numbers above zero and held_out below 1, got {self}")
+        for name in ("batch", "epochs", "patience"):
+            object.__setattr__(self, name, whole(name, getattr(self, name)))
+        object.__setattr__(self, "held_out", share("held_out", self.held_out))
+        object.__setattr__(self, "learning_rate", positive("learning_rate", self.learning_rate))
+        object.__setattr__(self, "weight_decay", at_least("weight_decay", self.weight_decay, 0))
 
 
 @dataclass(frozen=True)
@@ -64,10 +69,10 @@ class EarlyStopping:
 
 
 def check_device(device: str) -> str:
-    """``device`` if torch has it here; raises ValueError otherwise."""
+    """``device`` if torch can compute on it here; raises ValueError otherwise."""
     try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError):
+        torch.ones(1, device=device).sum().item()  # "meta" holds no numbers
+    except (RuntimeError, AssertionError, TypeError):
         raise ValueError(f"device: {device!r} is not available here; use 'cpu'") from None
     return device
 

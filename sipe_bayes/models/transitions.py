@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 FloatArray = NDArray[np.float64]
 
+SMALLEST = 1e-12  # sd: what the rounding of numbers of order one leaves of channels that do not move
+_ROUNDING = 1e-7  # of a column's largest number
 MOST_STEPS = 200  # of a simulation that are looked at, spread evenly
 
 
@@ -36,7 +38,8 @@ def control_steps(
 
 
 class Standardise(nn.Module):
-    """(x - mean) / sd of the last axis, with the finite rows' mean and sd; columns that never change become zero."""
+    """(x - mean) / sd of the last axis, with the finite rows' mean and sd, whatever a column's unit; columns that change by no more
+    than rounding become zero."""
 
     mean: Tensor
     sd: Tensor
@@ -50,10 +53,15 @@ class Standardise(nn.Module):
         """Take mean and sd from x (..., F)."""
         rows = x.reshape(-1, x.shape[-1])
         rows = rows[rows.isfinite().all(-1)]
-        self.mean.copy_(rows.mean(0))
+        size = rows.abs().amax(0)
+        unit = torch.ldexp(
+            torch.ones_like(size), torch.frexp(size).exponent
+        )  # a power of two: squares neither vanish nor overflow
+        rows = rows / unit
         sd = rows.std(0)
-        still = sd <= 1e-7 * (1 + self.mean.abs())
-        self.sd.copy_(torch.where(still, torch.full_like(sd, torch.inf), sd))
+        still = (sd <= _ROUNDING * (size / unit)) | (sd * unit <= SMALLEST)
+        self.mean.copy_(rows.mean(0) * unit)
+        self.sd.copy_(torch.where(still, torch.full_like(sd, torch.inf), sd * unit))
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) / self.sd

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -60,6 +60,15 @@ def check_bandwidth(bandwidth: Any) -> float:
     if isinstance(bandwidth, (int, float)) and 0 < bandwidth < float("inf"):
         return float(bandwidth)
     raise ValueError(f"bandwidth: expected a positive number in theta units, got {bandwidth!r}; try 0.02")
+
+
+def _drawn(name: str, given: Mapping[str, Any] | None, theta: Tensor) -> dict[str, NDArray[Any]]:
+    """Arrays (chain, draw, ...) by name, one for each draw of theta (chain, draw, N)."""
+    arrays = {key: np.asarray(x) for key, x in (given or {}).items()}
+    for key, x in arrays.items():
+        if x.shape[:2] != theta.shape[:2]:
+            raise ValueError(f"{name}: expected {key} {(*theta.shape[:2], '...')}, chains and draws, got {x.shape}")
+    return arrays
 
 
 class Posterior(TorchDistribution):
@@ -138,6 +147,10 @@ class Posterior(TorchDistribution):
     def _chains(self, num_draws: int, generator: Generator | None) -> Tensor:
         return self._sample(num_draws, generator)[None]
 
+    def _sample_stats(self) -> dict[str, Tensor]:
+        """What a sampler knows of each draw of ``_chains``: (chain, draw) by ArviZ's names."""
+        return {}
+
     # What the base class owns.
 
     @cached_property
@@ -210,7 +223,7 @@ class Posterior(TorchDistribution):
 
     @property
     def mode(self) -> Tensor:
-        """The most probable theta (N,)."""
+        """The most probable theta (N,); of a search, the best that it evaluated."""
         return self._expanded(self._cached_mode)
 
     def gaussian_moments(self) -> tuple[Tensor, Tensor]:
@@ -254,21 +267,49 @@ class Posterior(TorchDistribution):
         with torch.no_grad():
             return self.space.values(self._sample(n, generator).numpy())
 
-    def to_inference_data(self, num_draws: int = 2000, generator: Generator | None = None) -> Any:
+    def to_inference_data(
+        self,
+        num_draws: int = 2000,
+        generator: Generator | None = None,
+        *,
+        prior: Posterior | None = None,
+        observed_data: Mapping[str, Any] | None = None,
+        posterior_predictive: Mapping[str, Any] | None = None,
+        log_likelihood: Mapping[str, Any] | None = None,
+    ) -> Any:
         """ArviZ InferenceData: one (chain, draw) variable per parameter, in physical units, attribute
-        ``units``.
+        ``units``; and what else is given.
 
-        Posteriors that came as chains keep all of their draws; the others draw ``num_draws`` in one chain.
+        Posteriors that came as chains keep all of their draws, with what the sampler knows of each as sample_stats; the others draw
+        ``num_draws`` in one chain. prior: ``num_draws`` draws of it. observed_data: arrays by name; posterior_predictive,
+        log_likelihood: arrays (chain, draw, ...) by name, simulated at ``data.posterior``. Raises ValueError for
+        other shapes.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # arviz < 1 announces its successor on import
             import arviz
+        if prior is not None and prior.space.names != self.space.names:
+            raise ValueError(f"prior: expected one over {list(self.space.names)}, got {list(prior.space.names)}")
         with torch.no_grad():
-            values = self.space.values(self._chains(num_draws, generator).numpy())
-        data = arviz.from_dict(posterior={name: values[..., j] for j, name in enumerate(self.space.names)})
-        for parameter in self.space:
-            data.posterior[parameter.name].attrs.update(units=parameter.unit, description=parameter.description)
+            theta = self._chains(num_draws, generator)
+            before = None if prior is None else prior._sample(num_draws, generator)[None]
+        data = arviz.from_dict(
+            posterior=self._by_name(theta),
+            prior=None if before is None else self._by_name(before),
+            observed_data={name: np.asarray(x) for name, x in (observed_data or {}).items()} or None,
+            posterior_predictive=_drawn("posterior_predictive", posterior_predictive, theta) or None,
+            log_likelihood=_drawn("log_likelihood", log_likelihood, theta) or None,
+            sample_stats={name: x.numpy() for name, x in self._sample_stats().items()} or None,
+        )
+        for group in (data.posterior, *([] if before is None else [data.prior])):
+            for parameter in self.space:
+                group[parameter.name].attrs.update(units=parameter.unit, description=parameter.description)
         return data
+
+    def _by_name(self, theta: Tensor) -> dict[str, NDArray[Any]]:
+        """Values (chain, draw) of theta (chain, draw, N) by parameter."""
+        values = self.space.values(theta.numpy())
+        return {name: values[..., j] for j, name in enumerate(self.space.names)}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``<path>.safetensors`` and ``<path>.json``; ``load_posterior(path)`` reads them back."""

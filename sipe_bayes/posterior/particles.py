@@ -10,7 +10,7 @@ w_m^2.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -22,6 +22,7 @@ from sipe_bayes.posterior.base import Posterior, as_float64, as_theta, check_ban
 from sipe_bayes.posterior.mixture import GaussianMixture
 
 MAX_KERNELS = 500
+_STATS = "sample_stats."
 
 
 class Particles(Posterior):
@@ -29,7 +30,8 @@ class Particles(Posterior):
 
     chains: the rows are this many equal consecutive Markov chains (their weights must be equal).
     best: (N,) the point of highest density that the method found, which is then the ``mode``. Without it, ``mode`` is
-    the row closest to the weighted mean in the metric of the covariance.
+    the row closest to the weighted mean in the metric of the covariance. sample_stats: what the sampler knows of each row, (M,) by
+    ArviZ's names (``lp``, ``acceptance_rate``), for ``to_inference_data``; with chains only.
     """
 
     has_density: ClassVar[bool] = False
@@ -41,6 +43,7 @@ class Particles(Posterior):
         weights: Any = None,
         chains: int | None = None,
         best: Any = None,
+        sample_stats: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(space)
         self.theta = as_theta("theta", theta, (None, len(space)))
@@ -50,6 +53,9 @@ class Particles(Posterior):
         self.weights = _normalised(weights, rows)
         self.best = None if best is None else as_theta("best", best, (len(space),))
         self.chains = chains
+        self.sample_stats = {k: as_float64(f"sample_stats {k}", v, (rows,)) for k, v in (sample_stats or {}).items()}
+        if self.sample_stats and chains is None:
+            raise ValueError("sample_stats: expected chains, which they are of, got none; give chains")
         if chains is not None and (chains < 1 or rows % chains):
             raise ValueError(
                 f"chains: expected a divisor of the {rows} rows, got {chains}; cut the chains to one length"
@@ -123,15 +129,20 @@ class Particles(Posterior):
             return super()._chains(num_draws, generator)
         return self.theta.reshape(self.chains, -1, len(self.space))
 
+    def _sample_stats(self) -> dict[str, Tensor]:
+        return {name: x.reshape(self.chains or 1, -1) for name, x in self.sample_stats.items()}
+
     def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {"theta": self.theta, "weights": self.weights}
         if self.best is not None:
             tensors["best"] = self.best
+        tensors.update({_STATS + name: x for name, x in self.sample_stats.items()})
         return tensors, {"chains": self.chains}
 
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
-        return cls(tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("best"))
+        stats = {name.removeprefix(_STATS): x for name, x in tensors.items() if name.startswith(_STATS)}
+        return cls(tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("best"), stats)
 
 
 def _normalised(weights: Any, rows: int) -> Tensor:

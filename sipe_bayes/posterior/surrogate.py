@@ -19,6 +19,9 @@ with m and C the draws' moments, in z. Z is estimated by importance sampling fro
 ``normaliser_error`` of log Z; where its weights are even enough they also redraw the walkers and q's centres, so that none stays
 behind in a far corner.
 
+``mode`` is the evaluated theta of lowest discrepancy: what Bayesian optimisation answers. It need not be where p is largest, which
+the prior has a part in, and where the process smooths over what was evaluated.
+
 Deviations: exact draws are impossible; ``sample`` draws with replacement from the stored chains, whose mean, covariance and
 quantiles are the posterior's. R-hat treats the walkers of one ensemble as chains, an optimistic diagnostic.
 """
@@ -143,23 +146,8 @@ class SurrogatePosterior(Posterior):
         return torch.quantile(self.draws, q, dim=0)
 
     def _mode(self) -> Tensor:
-        """The point of highest density among the evaluated points and the draws, climbed from within the cube."""
-        from scipy.optimize import minimize
-
-        points = torch.cat([self.process.x, self.draws])
-        density = self._log_prob(points)
-        start = points[density.argmax()]
-
-        def negative(theta: FloatArray) -> tuple[float, FloatArray]:
-            with torch.enable_grad():
-                point = torch.from_numpy(theta)[None].requires_grad_(True)
-                value = -self._log_prob(point).sum()
-                (gradient,) = torch.autograd.grad(value, point)
-            return float(value), gradient[0].numpy()
-
-        found = minimize(negative, start.numpy(), jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(start))
-        climbed = torch.from_numpy(np.clip(found.x, 0, 1))
-        return climbed if float(self._log_prob(climbed[None])) > float(density.max()) else start
+        """The best point, not the density's maximum."""
+        return self.best
 
     def _chains(self, num_draws: int, generator: Generator | None) -> Tensor:
         if self.chains == 1:
