@@ -50,9 +50,11 @@ class Standardise(nn.Module):
         self.register_buffer("sd", torch.ones(features))
 
     def fit(self, x: Tensor) -> None:
-        """Take mean and sd from x (..., F)."""
+        """Take mean and sd from x (..., F); stays as it is where no row is finite."""
         rows = x.reshape(-1, x.shape[-1])
         rows = rows[rows.isfinite().all(-1)]
+        if not len(rows):
+            return
         size = rows.abs().amax(0)
         unit = torch.ldexp(
             torch.ones_like(size), torch.frexp(size).exponent
