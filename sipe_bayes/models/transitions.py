@@ -38,8 +38,8 @@ def control_steps(
 
 
 class Standardise(nn.Module):
-    """(x - mean) / sd of the last axis, with the finite rows' mean and sd, whatever a column's unit; columns that change by no more
-    than rounding become zero."""
+    """(x - mean) / sd of the last axis, with the finite rows' mean and sd, in whatever unit; columns that change by no more than
+    rounding, ``_ROUNDING`` of their size or ``SMALLEST``, become zero."""
 
     mean: Tensor
     sd: Tensor
@@ -56,9 +56,8 @@ class Standardise(nn.Module):
         if not len(rows):
             return
         size = rows.abs().amax(0)
-        unit = torch.ldexp(
-            torch.ones_like(size), torch.frexp(size).exponent
-        )  # a power of two: squares neither vanish nor overflow
+        # a power of two, exact: squares neither vanish nor overflow
+        unit = torch.ldexp(torch.ones_like(size), torch.frexp(size).exponent)
         rows = rows / unit
         sd = rows.std(0)
         still = (sd <= _ROUNDING * (size / unit)) | (sd * unit <= SMALLEST)
