@@ -18,7 +18,6 @@ import json
 import os
 import time
 import traceback
-import warnings
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes import acting
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.output import write_text
 from sipe_bayes.posterior import Dirac, Posterior, prior
@@ -55,14 +55,13 @@ BUDGET, SEEDS, STEPS = 1000, 3, 100
 
 
 def recorded(task: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, Trajectories]:
-    """Simulator, true theta and log."""
+    """Simulator, true theta and log, by the excitation policy, also where an agent is installed."""
     simulator = sipe.Simulator(sipe.make_task(task), num_threads=1)
-    env = sipe.make(task, variant="in_distribution")
-    steps = min(STEPS, simulator.environment.episode_steps)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        trajectories = sipe.demonstrations(env, count=1, seed=seed, steps=steps)
-    return simulator, simulator.environment.theta("in_distribution"), trajectories
+    environment = simulator.environment
+    steps, truth = min(STEPS, environment.episode_steps), environment.theta("in_distribution")
+    behaviour = acting.excitation(environment, simulator.dt)
+    trajectories, _ = acting.simulate(simulator, truth, behaviour, "reference", 1, seed, steps)
+    return simulator, truth, trajectories
 
 
 def path(task: str, method: str, seed: int) -> Path:
