@@ -6,10 +6,11 @@ import hashlib
 import importlib.metadata
 import json
 import math
-import os
 import platform
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from sipe_bayes.atomic import replacing, write_text
 
 if TYPE_CHECKING:
     from sipe_bayes.calibration import Problem
@@ -22,13 +23,6 @@ _PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emc
 
 class OutputError(ValueError):
     """An output folder that cannot be used."""
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def to_json(data: Any, indent: int | None = None) -> str:
@@ -111,9 +105,8 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
     from sipe_bayes.envs.export import ExportError, write_identified
 
     calibration.posterior.save(folder / "posterior")
-    temporary = folder / f".posterior.{os.getpid()}.nc"
-    calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
-    os.replace(temporary, folder / "posterior.nc")
+    with replacing(folder / "posterior.nc") as temporary:
+        calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
     values = problem.environment.space.values(calibration.posterior.mode.numpy())
     try:
         calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")

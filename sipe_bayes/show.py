@@ -3,8 +3,6 @@ SiPE plot."""
 
 from __future__ import annotations
 
-import os
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +13,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from sipe_bayes.atomic import write_bytes
 from sipe_bayes.posterior import Dirac, Posterior
 from sipe_bayes.posterior import prior as default_prior
 
@@ -142,9 +141,4 @@ def _save(figure: Figure, path: Path) -> None:
     from sipe_bayes.diagnostics.plots import png
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        temporary.write_bytes(png(figure))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, png(figure))

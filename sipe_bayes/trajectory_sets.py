@@ -25,7 +25,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import platform
 import zipfile
 import zlib
@@ -39,8 +38,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.acting import AGENTS, SPLITS, Agent, Split
+from sipe_bayes.atomic import write_bytes, write_text
 from sipe_bayes.envs.task import VARIANTS, Task, Variant
-from sipe_bayes.output import to_json, write_text
+from sipe_bayes.output import to_json
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
 
@@ -158,9 +158,7 @@ def write(
     content = buffer.getvalue()
     path = folder / name.file
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    write_bytes(path, content)
     entry = {
         "sha256": hashlib.sha256(content).hexdigest(),
         "bytes": len(content),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from sipe_bayes import atomic
 from sipe_bayes.diagnostics import plots, report
 from sipe_bayes.diagnostics.result import (
     Calibration,
@@ -550,7 +551,7 @@ def test_an_interrupted_write_keeps_the_old_report(
     tmp_path: Path, images: list[report.Picture], monkeypatch: Any
 ) -> None:
     (tmp_path / "report.html").write_text("old")
-    replace = report.os.replace
+    replace = atomic.os.replace
 
     def interrupted(source: Any, target: Any) -> None:
         if Path(target).name == "report.html":
@@ -558,7 +559,7 @@ def test_an_interrupted_write_keeps_the_old_report(
         replace(source, target)
 
     monkeypatch.setattr(report, "pictures", lambda _: images)
-    monkeypatch.setattr(report.os, "replace", interrupted)
+    monkeypatch.setattr(atomic.os, "replace", interrupted)
     with pytest.raises(OSError, match="disk full"):
         report.write_report(make_calibration(), tmp_path)
     assert (tmp_path / "report.html").read_text() == "old"

@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.atomic import write_text
 from sipe_bayes.diagnostics.calibration import check_calibration
-from sipe_bayes.output import write_text
 from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.trajectory import Trajectories
 

@@ -27,8 +27,8 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes import acting
+from sipe_bayes.atomic import write_text
 from sipe_bayes.diagnostics.scores import score
-from sipe_bayes.output import write_text
 from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.trajectory import Trajectories
 

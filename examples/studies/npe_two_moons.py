@@ -36,11 +36,11 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.atomic import write_text
 from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.inference.npe import NPE
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
-from sipe_bayes.output import write_text
 from sipe_bayes.parameters import Parameter, ParameterSpace
 
 HERE = Path(__file__).parent

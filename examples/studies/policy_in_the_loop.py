@@ -27,8 +27,9 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.atomic import write_text
 from sipe_bayes.diagnostics.scores import score
-from sipe_bayes.output import to_json, write_text
+from sipe_bayes.output import to_json
 from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.rl.policy_in_the_loop import train_in_the_loop
 

@@ -7,12 +7,12 @@ posterior (ArviZ, physical units); and ``plan.json``, every cell that was ever a
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from sipe_bayes.output import OutputError, to_json, write_text
+from sipe_bayes.atomic import write_text
+from sipe_bayes.output import OutputError, to_json
 
 RECORDS = "records"
 PLAN = "plan.json"
@@ -134,14 +134,3 @@ def plan(folder: Path, cells: list[str]) -> None:
     """Add cells to those that were asked for."""
     every = list(dict.fromkeys([*planned(folder), *cells]))
     write_text(folder / PLAN, to_json({"cells": every}, indent=0) + "\n")
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically; what could not be written leaves nothing behind."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -16,12 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sipe_bayes.atomic import write_bytes, write_text
 from sipe_bayes.benchmark import bank, measure
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
-from sipe_bayes.benchmark.records import Record, file_name, plan, record_path, write_bytes
+from sipe_bayes.benchmark.records import Record, file_name, plan, record_path
 from sipe_bayes.benchmark.work import Done, Executor, Unit
-from sipe_bayes.output import OutputError, to_json, write_text
+from sipe_bayes.output import OutputError, to_json
 
 LOG = "runs.json"
 _LOCK = ".lock"
@@ -150,7 +151,9 @@ def _carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor],
 
 def _write(unit: Unit, done: Done, folder: Path) -> None:
     for name, data in done.files:
-        write_bytes(folder / name, data)
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, data)
     checkpoint = folder / measure.POLICIES / file_name(unit.name) / "checkpoint"
     if checkpoint.is_dir() and not done.failed:
         shutil.rmtree(checkpoint)  # a replay buffer that nothing needs any more

@@ -12,7 +12,6 @@ import json
 import math
 import os
 import re
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from sipe_bayes.atomic import write_bytes
 from sipe_bayes.diagnostics import plots
 from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary
 from sipe_bayes.parameters import Parameter
@@ -389,18 +389,6 @@ def render(calibration: Calibration, images: Sequence[Picture]) -> str:
     return environment.get_template("report.html.j2").render(**_context(calibration, images))
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Write to a temporary name in the same folder and rename, so that no half file is ever seen."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
-
-
 def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
     """Write ``figures/*.png`` and ``report.html`` into ``folder``, made when missing; returns the report's
     path.
@@ -412,7 +400,7 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Pa
     figures = Path(folder) / "figures"
     figures.mkdir(parents=True, exist_ok=True)
     for image in images:
-        _write(figures / image.file, image.content)
+        write_bytes(figures / image.file, image.content)
     path = Path(folder) / "report.html"
-    _write(path, page.encode())
+    write_bytes(path, page.encode())
     return path

@@ -6,7 +6,6 @@ field before it gets its name, so what is written is what was calibrated.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.atomic import replacing
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
 
@@ -39,8 +39,7 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
         for target in parameter.targets:
             if not target.startswith("sensor:"):
                 _copy(spec, model, target)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.xml")
-    try:
+    with replacing(path) as temporary:
         try:
             spec.compile()
             temporary.write_text(spec.to_xml())
@@ -53,9 +52,6 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
             raise ExportError(
                 f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written"
             )
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
     return [
         f"identified.xml has no place for the sensor bias {name!r}; subtract it from the measurement" for name in biased

@@ -9,7 +9,6 @@ they are counted, marked and described.
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ import scipy.stats
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.atomic import replacing
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.trajectory import Trajectories
@@ -123,14 +123,8 @@ class Cache:
         if self.folder is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"block-{block:06d}.npz"
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            with temporary.open("wb") as file:
-                np.savez(file, theta=simulations.theta, observations=simulations.observations, valid=simulations.valid)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replacing(self.folder / f"block-{block:06d}.npz") as temporary, temporary.open("wb") as file:
+            np.savez(file, theta=simulations.theta, observations=simulations.observations, valid=simulations.valid)
 
     def _read(self, block: int) -> Simulations | None:
         """A block from disk; None where there is none or it cannot be read: it is then simulated again."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
+
+from sipe_bayes.atomic import write_bytes
 
 State = dict[str, Any]
 """Arrays, numbers, text, booleans and lists of text by name; nothing nested."""
@@ -25,9 +26,7 @@ def save_state(path: Path, state: State, fingerprint: str) -> None:
     plain = {k: v for k, v in state.items() if not isinstance(v, np.ndarray)}
     arrays.setdefault("_", np.zeros(1))  # safetensors wants at least one
     data = save(arrays, metadata={"plain": json.dumps(plain), "fingerprint": fingerprint})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    write_bytes(path, data)
 
 
 def load_state(path: Path, fingerprint: str) -> State:

@@ -16,6 +16,8 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from sipe_bayes.atomic import write_bytes
+
 FORMAT = "sipe_bayes.posterior/1"
 _SAVE_AGAIN = "save it again with posterior.save(path)"
 
@@ -28,15 +30,6 @@ def pair_paths(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     return stem.with_name(stem.name + ".safetensors"), stem.with_name(stem.name + ".json")
 
 
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_pair(path: str | os.PathLike[str], header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     """Write header and tensors; missing parent directories are made."""
     tensor_path, header_path = pair_paths(path)
@@ -44,8 +37,8 @@ def write_pair(path: str | os.PathLike[str], header: dict[str, Any], tensors: di
     header = {"format": FORMAT, **header, "sha256": hashlib.sha256(content).hexdigest()}
     text = json.dumps(header, indent=1, default=float)
     tensor_path.parent.mkdir(parents=True, exist_ok=True)
-    _write(tensor_path, content)
-    _write(header_path, text.encode())
+    write_bytes(tensor_path, content)
+    write_bytes(header_path, text.encode())
 
 
 def read_pair(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.atomic import write_text
 from sipe_bayes.envs.adroit import Adroit
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.episodes import Episodes
-from sipe_bayes.output import to_json, write_text
+from sipe_bayes.output import to_json
 from sipe_bayes.rl import planning, scripted
 from sipe_bayes.rl.planning import Report
 from sipe_bayes.rl.scripted import Demonstrator

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.atomic import replacing, write_text
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.episodes import Episodes
-from sipe_bayes.output import to_json, write_text
+from sipe_bayes.output import to_json
 from sipe_bayes.rl.policy import Controller, load_policy
 from sipe_bayes.simulator import Simulator
 
@@ -117,9 +118,8 @@ def install(folder: Path, into: Path = AGENTS) -> list[Path]:
     into.mkdir(parents=True, exist_ok=True)
     for path, there in pairs:
         for suffix in (".json", ".safetensors"):  # an agent never without its card
-            temporary = there.with_name(f".{there.stem}{suffix}.tmp")
-            shutil.copyfile(path.with_suffix(suffix), temporary)
-            temporary.replace(there.with_suffix(suffix))
+            with replacing(there.with_suffix(suffix)) as temporary:
+                shutil.copyfile(path.with_suffix(suffix), temporary)
     return [there for _, there in pairs]
 
 

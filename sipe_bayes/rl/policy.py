@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from sipe_bayes.atomic import write_bytes
+
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 Controller = Callable[[FloatArray], FloatArray]
@@ -98,9 +100,7 @@ class Policy:
         }
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        temporary.write_bytes(save(arrays, {"policy": json.dumps(header)}))
-        os.replace(temporary, path)
+        write_bytes(path, save(arrays, {"policy": json.dumps(header)}))
 
     def _arrays(self) -> dict[str, Float32Array]:
         arrays = {}

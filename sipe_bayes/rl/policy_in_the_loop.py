@@ -43,10 +43,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from sipe_bayes.atomic import write_text
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.gaussian_search import Search
 from sipe_bayes.inference.state import load_state, save_state
-from sipe_bayes.output import to_json, write_text
+from sipe_bayes.output import to_json
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
 from sipe_bayes.rl.settings import Settings

@@ -16,7 +16,6 @@ for the policy having changed since.
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.atomic import replacing
 from sipe_bayes.episodes import Step
 from sipe_bayes.trajectory import Trajectories
 
@@ -165,13 +165,8 @@ class Replay:
         used = min(self.head + 1, self.rows)
         arrays: dict[str, Any] = {name: getattr(self, name)[:used] for name in _STORED}
         arrays |= {"head": np.array(self.head), "starts": self._starts, "over": self._over, "rows": np.array(self.rows)}
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            with temporary.open("wb") as file:
-                np.savez(file, **arrays)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **arrays)
 
     def load(self, path: Path) -> None:
         """Read what ``save`` wrote into a buffer of the same shape; raises ReplayError for anything else."""

@@ -21,10 +21,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sipe_bayes.atomic import replacing, write_text
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.inference.state import load_state, save_state
-from sipe_bayes.output import write_text
 from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.policy import Policy, load_policy
 from sipe_bayes.rl.settings import Settings
@@ -167,8 +167,8 @@ class _Log:
         self._writer.close()
         chosen = choose(self.rows, steps)
         for name, step in chosen.items():
-            shutil.copyfile(self._policy(step), self._folder / f".{name}.tmp")
-            (self._folder / f".{name}.tmp").replace(self._folder / f"{name}.safetensors")
+            with replacing(self._folder / f"{name}.safetensors") as temporary:
+                shutil.copyfile(self._policy(step), temporary)
         return load_policy(self._folder / "expert.safetensors", task.name)
 
     def _policy(self, step: float) -> Path:
