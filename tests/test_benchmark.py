@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from sipe_bayes import atomic
-from sipe_bayes.benchmark import bank, cells, measure, run
+from sipe_bayes.benchmark import bank, cells, measure, records, run
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import NINE, SUITES, Cell, matches, select, suite
 from sipe_bayes.benchmark.log import recorded
@@ -394,7 +394,7 @@ def test_shards_merge_resume_and_verify(tmp_path: Path) -> None:
     assert bank.place(PENDULUM_BANK, tmp_path / "a") == bank.known_place(PENDULUM_BANK, tmp_path / "a")
     assert [u.arguments["blocks"] for u in units] == [[(4, 50), (5, 50), (6, 50), (7, 50)], [(8, 30)]]
     for name, data in [*units[0]().files, *units[1]().files]:  # made elsewhere
-        records.write_bytes(tmp_path / "b" / name, data)
+        atomic.write_bytes(tmp_path / "b" / name, data)
     (made,) = (tmp_path / "b" / bank.FOLDER).iterdir()
     for path in made.iterdir():
         (tmp_path / "a" / bank.FOLDER / made.name / path.name).write_bytes(path.read_bytes())
