@@ -140,5 +140,4 @@ def _save(figure: Figure, path: Path) -> None:
     """Write a PNG file atomically."""
     from sipe_bayes.diagnostics.plots import png
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, png(figure))

@@ -157,7 +157,6 @@ def write(
     np.savez_compressed(buffer, **arrays)
     content = buffer.getvalue()
     path = folder / name.file
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, content)
     entry = {
         "sha256": hashlib.sha256(content).hexdigest(),

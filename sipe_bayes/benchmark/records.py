@@ -76,7 +76,6 @@ class Record:
     def write(self, folder: Path) -> Path:
         """Write ``records/ID.json`` in a folder of results, atomically."""
         path = record_path(folder, self.id)
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, self.to_json())
         return path
 

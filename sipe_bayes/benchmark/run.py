@@ -151,9 +151,7 @@ def _carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor],
 
 def _write(unit: Unit, done: Done, folder: Path) -> None:
     for name, data in done.files:
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, data)
+        write_bytes(folder / name, data)
     checkpoint = folder / measure.POLICIES / file_name(unit.name) / "checkpoint"
     if checkpoint.is_dir() and not done.failed:
         shutil.rmtree(checkpoint)  # a replay buffer that nothing needs any more

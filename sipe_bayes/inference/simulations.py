@@ -122,7 +122,6 @@ class Cache:
     def _write(self, block: int, simulations: Simulations) -> None:
         if self.folder is None:
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(self.folder / f"block-{block:06d}.npz") as temporary, temporary.open("wb") as file:
             np.savez(file, theta=simulations.theta, observations=simulations.observations, valid=simulations.valid)
 

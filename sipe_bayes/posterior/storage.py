@@ -36,7 +36,6 @@ def write_pair(path: str | os.PathLike[str], header: dict[str, Any], tensors: di
     content = safetensors.torch.save({k: v.detach().clone().contiguous() for k, v in tensors.items()})
     header = {"format": FORMAT, **header, "sha256": hashlib.sha256(content).hexdigest()}
     text = json.dumps(header, indent=1, default=float)
-    tensor_path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(tensor_path, content)
     write_bytes(header_path, text.encode())
 

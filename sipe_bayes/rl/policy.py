@@ -98,9 +98,7 @@ class Policy:
             "goal_size": self.goal_size,
             "sha256": _checksum(arrays),
         }
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, save(arrays, {"policy": json.dumps(header)}))
+        write_bytes(Path(path), save(arrays, {"policy": json.dumps(header)}))
 
     def _arrays(self) -> dict[str, Float32Array]:
         arrays = {}
