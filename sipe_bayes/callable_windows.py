@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
+from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows, fitted_channels
 from sipe_bayes.noise import sequences
 from sipe_bayes.trajectory import Trajectories
 
@@ -27,7 +27,7 @@ class CallableWindows(Windows):
             raise ValueError(
                 f"trajectories: expected an x ({size},), got observations {trajectories.observations.shape}"
             )
-        self.channels = self._fitted(simulator.environment.channels)
+        self.channels = fitted_channels(simulator.environment.channels, settings.fit)
         count = len(trajectories)
         self.log, self.start, self.steps = np.arange(count), np.zeros(count, int), np.ones(count, int)
         self.dt, self.names, self.goals = trajectories.dt, list(trajectories.names), None

@@ -7,7 +7,7 @@ away the noise of the measurement: both cost coverage. The residuals are white o
 on across windows (``sipe_bayes.noise``).
 
 A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior whose sd is
-``_START_SD``, far wider than any measurement, so that what is never measured does not make the equations singular.
+``START_SD``, far wider than any measurement, so that what is never measured does not make the equations singular.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,7 +33,7 @@ FloatArray = NDArray[np.float64]
 
 _THETA_STEP = (1e-5, 1e-3)  # finite differences, of the unit cube: least, and for windows of one control step
 _START_STEP = 1e-5  # rad or m, rad/s or m/s
-_START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
+START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
 _ROUNDING = 1e-7  # of a channel's size: what the tolerance of MuJoCo's contact solver leaves, in its rare worst steps
 _SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
 
@@ -127,6 +128,62 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
     return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
 
 
+def chosen_channels(
+    simulator: Simulator | CallableSimulator, trajectories: Trajectories, fit: tuple[str, ...] | None
+) -> list[int]:
+    """Which channels ``fit`` names, default all; raises ValueError for unknown ones and for trajectories of other sizes."""
+    environment = simulator.environment
+    if trajectories.observations.shape[2] != len(environment.channels):
+        raise ValueError(
+            f"trajectories: expected observations of the {len(environment.channels)} channels "
+            f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
+        )
+    if trajectories.actions.shape[2] != environment.num_actions:
+        raise ValueError(
+            f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
+        )
+    return fitted_channels(environment.channels, fit)
+
+
+def fitted_channels(names: SequenceOf[str], fit: tuple[str, ...] | None) -> list[int]:
+    """Places among ``names`` of those in ``fit``, default all; raises ValueError for unknown ones."""
+    fit = fit or tuple(names)
+    unknown = [n for n in fit if n not in names]
+    if unknown:
+        raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
+    return [list(names).index(n) for n in fit]
+
+
+def moved(model: Any, states: FloatArray, tangent: FloatArray) -> FloatArray:
+    """States (..., S) moved by tangents (..., 2 nv + na); either may have fewer leading dimensions."""
+    shape = np.broadcast_shapes(states.shape[:-1], tangent.shape[:-1])
+    out = np.broadcast_to(states, (*shape, states.shape[-1])).copy()
+    tangent = np.broadcast_to(tangent, (*shape, tangent.shape[-1]))
+    nq, nv = model.nq, model.nv
+    if nq == nv:
+        out[..., 1 : 1 + nq] += tangent[..., :nv]
+    else:
+        flat, turns = out.reshape(-1, out.shape[-1]), tangent.reshape(-1, tangent.shape[-1])
+        for state, turn in zip(flat, turns, strict=True):
+            position = state[1 : 1 + nq].copy()
+            mujoco.mj_integratePos(model, position, np.ascontiguousarray(turn[:nv]), 1.0)
+            state[1 : 1 + nq] = position
+    out[..., 1 + nq : 1 + nq + nv + model.na] += tangent[..., nv:]
+    return out
+
+
+def past_commands(
+    simulator: Simulator, trajectories: Trajectories, log: NDArray[np.int64], start: NDArray[np.int64], dt: FloatArray
+) -> list[FloatArray]:
+    """The commands before each (log, start sample), one row a physics step; before the log its first command."""
+    past = []
+    for k, first, seconds in zip(log, start, dt, strict=True):
+        skip = simulator.physics_steps(float(seconds))[0]
+        rows = trajectories.actions[k, max(0, first - 2000) : first]
+        past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
+    return past
+
+
 @dataclass(frozen=True)
 class Linearisation:
     """residual (W, L, C) = measured - predicted; jacobian (W, L, C, N + D) of the prediction; valid: all simulated."""
@@ -143,28 +200,11 @@ class Windows:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
         self.rollouts, self.budget = 0, math.inf
         self._glimpse: Windows | None = None
-        environment = simulator.environment
-        if trajectories.observations.shape[2] != len(environment.channels):
-            raise ValueError(
-                f"trajectories: expected observations of the {len(environment.channels)} channels "
-                f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
-            )
-        if trajectories.actions.shape[2] != environment.num_actions:
-            raise ValueError(
-                f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
-            )
+        self.channels = chosen_channels(simulator, trajectories, settings.fit)
         if settings.starts == "recorded" and trajectories.states is None:
             raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
-        self.channels = self._fitted(environment.channels)
         self._cut(trajectories)
         self._read_samples(trajectories)
-
-    def _fitted(self, names: SequenceOf[str]) -> list[int]:
-        fit = self.settings.fit or tuple(names)
-        unknown = [n for n in fit if n not in names]
-        if unknown:
-            raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
-        return [list(names).index(n) for n in fit]
 
     @property
     def fitted(self) -> list[str]:
@@ -208,24 +248,16 @@ class Windows:
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
         reference[:, 0] = 0.0
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
-        self.reference = environment.history(simulator.model, reference, self._past(trajectories), self._timestep())
+        past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
+        self.reference = environment.history(simulator.model, reference, past, self._timestep())
         model = simulator.model
         free = np.array([model.nv, model.nv, model.na]) * (self.settings.starts == "estimated")
         self.num_start = int(free.sum())
-        sd = np.repeat(_START_SD, free)
+        sd = np.repeat(START_SD, free)
         self.start_precision = sd**-2.0
 
     def _timestep(self) -> FloatArray:
         return np.array([self.simulator.physics_steps(float(d))[1] for d in self.dt])
-
-    def _past(self, trajectories: Trajectories) -> list[FloatArray]:
-        """The commands before each window, one row a physics step; before the log its first command."""
-        past = []
-        for k, start, dt in zip(self.log, self.start, self.dt, strict=True):
-            skip = self.simulator.physics_steps(float(dt))[0]
-            rows = trajectories.actions[k, max(0, start - 2000) : start]
-            past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
-        return past
 
     def glimpse(self) -> Windows:
         """Every other window, for a rough search; the windows themselves where a log has fewer than four. Its rollouts are
@@ -275,22 +307,9 @@ class Windows:
 
     def states(self, starts: FloatArray) -> FloatArray:
         """Starting states (..., W, S) of starts (..., W, D)."""
-        model = self.simulator.model
-        out = np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
         if not self.num_start:
-            return out
-        nq, nv = model.nq, model.nv
-        if nq == nv:
-            out[..., 1 : 1 + nq] += starts[..., :nv]
-        else:
-            for position, tangent in zip(
-                out[..., 1 : 1 + nq].reshape(-1, nq), starts[..., :nv].reshape(-1, nv), strict=True
-            ):
-                moved = position.copy()
-                mujoco.mj_integratePos(model, moved, np.ascontiguousarray(tangent), 1.0)
-                position[:] = moved
-        out[..., 1 + nq : 1 + nq + nv + model.na] += starts[..., nv:]
-        return out
+            return np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
+        return moved(self.simulator.model, self.reference, starts)
 
     def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid throughout.

@@ -25,6 +25,7 @@ from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulator import Simulator
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories, Trajectory
 
 AT_BOUND = 0.02  # of the range: a posterior whose median is nearer to a bound than that sits on it
@@ -93,7 +94,7 @@ class Estimator(ABC):
         prior: Posterior | None = None,
         budget: int | None = None,
         seed: int = 0,
-        likelihood: Segments | None = None,
+        likelihood: Segments | StateSpace | None = None,
         checkpoint: str | Path | None = None,
         progress: Progress | None = None,
     ) -> None:
@@ -109,11 +110,16 @@ class Estimator(ABC):
         if self.prior.space.names != self.space.names or not self.prior.has_density:
             raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
-        if likelihood is not None and not isinstance(likelihood, Segments):
-            raise ValueError(f"likelihood: expected sipe.Segments(...), got {likelihood!r}")
+        if likelihood is not None and not isinstance(likelihood, Segments | StateSpace):
+            raise ValueError(
+                f"likelihood: expected sipe.Segments(...), got {likelihood!r}; or give sipe.StateSpace(...)"
+            )
+        if isinstance(likelihood, StateSpace) and not self.searches:
+            raise ValueError(f"likelihood: StateSpace is for laplace and mcmc; give {self.name} sipe.Segments(...)")
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: expected a function (what, rollouts, budget), got {progress!r}")
-        self.seed, self.likelihood = whole("seed", seed, 0), likelihood or _default_likelihood(simulator)
+        self.seed = whole("seed", seed, 0)
+        self.likelihood: Any = likelihood or _default_likelihood(simulator)  # StateSpace only where it ``searches``
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts = 0
         self.warnings: list[str] = []

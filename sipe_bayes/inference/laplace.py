@@ -13,6 +13,8 @@ noise and may leave the parameters behind it undetermined; plain least squares k
 Several starting points (the model as given and the best of a few draws from the prior) are followed; optima that are
 not the same become components of a mixture, weighted by their restricted likelihood.
 
+With ``StateSpace`` every sample's state is unknown and the search is that of ``state_space_search``.
+
 Simulations are what a fit costs, so they are spared where they add nothing. Where the log tells the windows' starts, theta
 moves alone first, on every other window, until a step gains little. The Jacobian of the starts is kept as long as it foretells the gain of a step
 to a fifth; an optimum is only accepted where what was foretold since it was taken is wrong by less than half a nat. A later starting point is dropped once
@@ -36,8 +38,9 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
+from sipe_bayes.inference import state_space_search
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.least_squares import Fit, QuadraticPrior, energy_of, step
+from sipe_bayes.inference.least_squares import FLAT_PRECISION, Fit, QuadraticPrior, energy_of, step
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import Linearisation, Windows
 from sipe_bayes.noise import (
@@ -52,11 +55,11 @@ from sipe_bayes.noise import (
     sandwich,
 )
 from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_FLAT_PRECISION = 0.01  # sd 10 in units of the cube
 _TOLERANCE = 0.02  # nats
 _ROUGH = 1e-4  # of the energy
 _SAME_NOISE = 0.03  # relative
@@ -111,6 +114,8 @@ class Laplace(Estimator):
 
     def start(self, trajectories: Trajectories) -> State:
         windows = self.windows(trajectories)
+        if isinstance(windows, Chain):
+            return state_space_search.start(self, windows)
         starts = screen(self, windows, trajectories) if self.initial is None else self.initial
         n, w, d, c = len(self.space), windows.num_windows, windows.num_start, len(windows.channels)
         fresh = _begin(windows, starts[0])
@@ -137,6 +142,8 @@ class Laplace(Estimator):
 
         Rough search first: white noise with the sd of the present residuals, to a relative tolerance."""
         windows, prior = self.windows(trajectories), self.quadratic_prior
+        if isinstance(windows, Chain):
+            return state_space_search.step(self, windows, state)
         if state["held"]:
             return self._held_step(state, windows, prior)
         theta, starts, rough = state["theta"], state["starts"], state["rough"]
@@ -265,10 +272,10 @@ class Laplace(Estimator):
         for weight, point in noise_cloud(moments, noise, here, free_noise(windows), longest_tau(windows)):
             if self.likelihood.noise == "sandwich":
                 middle = sandwich(jacobian, arrow.start_slope, white, windows.sequences, point)
-                centre, spread = self._normal(theta, *_sandwiched(arrow, middle))
+                centre, spread = self.normal(theta, *_sandwiched(arrow, middle))
             else:
                 inner = eliminate(moments.normal(point), moments.num_theta, windows.start_precision, pull)
-                centre, spread = self._normal(theta, inner.precision, inner.gradient)
+                centre, spread = self.normal(theta, inner.precision, inner.gradient)
             mean += weight * centre
             covariance += weight * spread
             centres.append((weight, centre))
@@ -330,16 +337,18 @@ class Laplace(Estimator):
             "noise_sd": state["mode_sd"][kept[0]].tolist(),
             "noise_tau": state["mode_tau"][kept[0]].tolist(),
         }
+        if "mode_process" in state:
+            self.diagnostics["process_noise"] = state["mode_process"][kept[0]].tolist()
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         weights = torch.tensor(np.array(evidence) - np.max(evidence))
         return GaussianMixture(weights, np.stack(means), np.stack(covariances), self.space)
 
-    def _normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance, before truncation, of the quadratic model of data and prior at theta."""
         prior = self.quadratic_prior
-        covariance = _inverse(precision + prior.precision + _FLAT_PRECISION * np.eye(len(theta)))
-        pull = gradient + prior.pull(theta) + _FLAT_PRECISION * (0.5 - theta)
+        covariance = _inverse(precision + prior.precision + FLAT_PRECISION * np.eye(len(theta)))
+        pull = gradient + prior.pull(theta) + FLAT_PRECISION * (0.5 - theta)
         return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
 
     def information(self) -> tuple[FloatArray, FloatArray]:
@@ -348,7 +357,7 @@ class Laplace(Estimator):
             raise ValueError("information: nothing has been fitted yet; call fit first")
         best, prior = distinct_modes(self._state)[0], self.quadratic_prior
         mean, total = self._state["mode_mean"][best], np.linalg.inv(self._state["mode_covariance"][best])
-        flat = _FLAT_PRECISION * np.eye(len(mean))
+        flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
@@ -431,7 +440,7 @@ def fixed_sd(windows: Windows) -> FloatArray:
 
 def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
     """Prior and bounds at (theta, starts); ``force`` (N,): the data's pull on theta, which holds it at a bound."""
-    flat = _FLAT_PRECISION * np.eye(len(theta))
+    flat = FLAT_PRECISION * np.eye(len(theta))
     total = force + prior.pull(theta)
     held = ((theta <= 0) & (total < 0)) | ((theta >= 1) & (total > 0))
     return Pulls(
@@ -469,7 +478,9 @@ def _noise(
 
 
 def free_noise(windows: Windows) -> NDArray[np.int64]:
-    """Which of (log sd (C), log tau (C)) are unknown."""
+    """Which of (log sd (C), log tau (C)) are unknown; none of a chain of states, whose noise stays at its optimum."""
+    if isinstance(windows, Chain):
+        return np.empty(0, int)
     free = np.isnan(fixed_sd(windows))
     return np.flatnonzero(np.concatenate([free, np.full(len(free), windows.settings.noise != "white")]))
 

@@ -18,6 +18,7 @@ from sipe_bayes.noise import Moments, Noise, eliminate
 
 FloatArray = NDArray[np.float64]
 
+FLAT_PRECISION = 0.01  # sd 10 in units of the cube: closes the directions that the data leave open
 _DAMPING_UP, _DAMPING_DOWN = 8.0, 0.2
 _DAMPING_MIN, _DAMPING_MAX = 1e-9, 1e6
 

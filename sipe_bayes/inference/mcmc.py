@@ -14,6 +14,8 @@ which is the likelihood with the starts integrated out, exact where the predicti
 comes first and also places the walkers; that saves D of D + 1 simulations. How far a fresh J_x would move the target
 is measured on draws of the final chain and reported as ``linearisation_error`` (sd in nats).
 
+With ``StateSpace`` the target is that of ``state_space_target``, over theta alone, with the noise of the ``laplace`` fit.
+
 Priors of the noise: log sigma and log tau uniform within wide bounds.
 
 Deviations: R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do;
@@ -33,9 +35,11 @@ from sipe_bayes.checks import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace import Laplace, distinct_modes, free_noise, longest_tau
 from sipe_bayes.inference.state import State
+from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.likelihood import BudgetExhausted, Windows
 from sipe_bayes.noise import Marginal, Noise, Pulls, noise_covariance
 from sipe_bayes.posterior import GaussianMixture, Particles
+from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -101,18 +105,14 @@ class MCMC(Estimator):
         if not first._state or not len(first._state["mode_theta"]):
             raise BudgetExhausted("the budget did not suffice for the first laplace fit")
         best = distinct_modes(first._state)[0]
-        picked = {k: first._state[f"mode_{k}"][best] for k in ("theta", "starts", "slope", "sd", "tau")}
-        linearisation = windows.linearise(picked["theta"], picked["starts"])
-        noise, held = Noise(picked["sd"], picked["tau"]), (picked["theta"] <= 0) | (picked["theta"] >= 1)
-        prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
-        start_pull = -windows.start_precision * picked["starts"]
-        here = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
-        spread = noise_covariance(windows.moments(linearisation), noise, here, free_noise(windows))
+        conditioned = self._on_states if isinstance(windows, Chain) else self._on_starts
+        picked, spread = conditioned(
+            windows, {k[5:]: v[best] for k, v in first._state.items() if k.startswith("mode_")}
+        )
         random = np.random.RandomState(self.seed)
         state = {
             "done": False,
-            **{f"fit_{k}": v for k, v in picked.items()},
-            "fit_jacobian": np.ascontiguousarray(linearisation.jacobian[..., len(self.space) :]),
+            **picked,
             "proposal_weights": found.log_weights.numpy(),
             "proposal_means": found.means.numpy(),
             "proposal_covariances": _WIDER**2 * found.covariances.numpy(),
@@ -121,24 +121,47 @@ class MCMC(Estimator):
         dimensions = len(self.space) + len(spread)
         count = self.walkers or max(24, 2 * dimensions + 2)
         walkers, log_prob = self._place(windows, state, count, random)
-        centre = np.concatenate([picked["theta"], _Proposal(self, windows, state).centre])
+        centre = np.concatenate([state["fit_theta"], _Proposal(self, windows, state).centre])
         return {
             **state,
             "walkers": walkers,
             "log_prob": log_prob,
-            "best": picked["theta"],
-            "best_log_prob": float(_Target(self, windows, state)(centre[None])[0]),
+            "best": state["fit_theta"],
+            "best_log_prob": float(self._target(windows, state)(centre[None])[0]),
             "chain": np.empty((0, *walkers.shape)),
             "chain_log_prob": np.empty((0, count)),
             "accepted": np.zeros(count),
             **_random_state(random),
         }
 
+    def _on_starts(self, windows: Windows, mode: State) -> tuple[State, FloatArray]:
+        """What the target takes from the laplace optimum, and the covariance of the free noise there."""
+        picked = {k: mode[k] for k in ("theta", "starts", "slope", "sd", "tau")}
+        linearisation = windows.linearise(picked["theta"], picked["starts"])
+        noise, held = Noise(picked["sd"], picked["tau"]), (picked["theta"] <= 0) | (picked["theta"] >= 1)
+        prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
+        start_pull = -windows.start_precision * picked["starts"]
+        here = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
+        spread = noise_covariance(windows.moments(linearisation), noise, here, free_noise(windows))
+        jacobian = np.ascontiguousarray(linearisation.jacobian[..., len(self.space) :])
+        return {**{f"fit_{k}": v for k, v in picked.items()}, "fit_jacobian": jacobian}, spread
+
+    def _on_states(self, chain: Chain, mode: State) -> tuple[State, FloatArray]:
+        """The same of a chain of states, whose noise is not free."""
+        picked = {f"fit_{k}": mode[k] for k in ("theta", "states", "slope", "sd", "tau", "process")}
+        return {**picked, **at_optimum(chain, mode["theta"], mode["states"])}, np.empty((0, 0))
+
+    def _target(self, windows: Windows | Chain, state: State) -> Any:
+        """log p(theta, noise | y) of walkers, of either likelihood."""
+        if isinstance(windows, Chain):
+            return ChainTarget(self.prior, windows, state)
+        return _Target(self, windows, state)
+
     def _place(
         self, windows: Windows, state: State, count: int, random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
         """Walkers (count, N + noise) drawn from the proposal, each where the target is finite, and its values there."""
-        proposal, target = _Proposal(self, windows, state), _Target(self, windows, state)
+        proposal, target = _Proposal(self, windows, state), self._target(windows, state)
         walkers = proposal.draw(count, random)
         log_prob = target(walkers)
         for _ in range(_PLACINGS):
@@ -175,7 +198,7 @@ class MCMC(Estimator):
         sampler = emcee.EnsembleSampler(
             walkers,
             dimensions,
-            _Target(self, windows, state),
+            self._target(windows, state),
             vectorize=True,
             moves=[
                 (emcee.moves.MHMove(proposal), 0.6),
@@ -258,7 +281,7 @@ class MCMC(Estimator):
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
 
     def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
-        target = _Target(self, self.windows(trajectories), state)
+        target = self._target(self.windows(trajectories), state)
         sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
         return {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
 
@@ -269,7 +292,7 @@ class MCMC(Estimator):
         windows = self.windows(trajectories)
         used, budget = windows.rollouts, windows.budget
         windows.budget = np.inf
-        target = _Target(self, windows, state)
+        target = self._target(windows, state)
         flat = self._kept(state).reshape(-1, state["chain"].shape[2])
         points = flat[np.linspace(0, len(flat) - 1, _CHECKED).astype(int)]
         difference = [float(target(p[None])[0]) - target.refreshed(p) for p in points]

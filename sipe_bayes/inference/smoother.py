@@ -1,0 +1,222 @@
+"""The search for theta, states and noise of ``StateSpace``: an iterated Kalman smoother with theta on its border.
+
+Given the noise, theta and all states minimise half the whitened squares of residuals and jumps plus the priors, by damped
+Gauss-Newton steps on the block-tridiagonal normal equations (``sipe_bayes.tridiagonal``), theta within the unit cube. Given
+the linearisation, the noise sds maximise the likelihood with states and theta integrated out (restricted likelihood),
+found by L-BFGS with Fisher's gradient. The two alternate; where the model is right the process noise shrinks until the
+likelihood no longer cares.
+
+Contacts make the energy many-valleyed: a state smoothed from its own noisy measurement settles on the wrong side of a
+contact, and little process noise then keeps it there, with an estimate that is overconfident. What the past says of a
+state is sharper than its measurement, so after each of the first few estimates of the noise an extended Kalman filter
+(B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 1979) runs through the logs and linearises each step where it stands;
+Gauss-Newton goes on from its states where that ends lower.
+
+It begins with states as measured and, where every coordinate is, theta by reweighted least squares of the jumps, weights of
+a Student t with four degrees of freedom: contacts amplify the noise of a measurement manyfold.
+
+Deviations: the noise is held at its optimum, the posterior of theta does not widen for it; in the filter, channels that are
+read late are left out; it only proposes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.least_squares import FLAT_PRECISION, QuadraticPrior, box_step
+from sipe_bayes.likelihood import START_SD
+from sipe_bayes.state_space import Chain
+from sipe_bayes.tridiagonal import (
+    Border,
+    ChainLinearisation,
+    ChainNoise,
+    eliminate,
+    energy,
+    neighbours,
+    restricted,
+)
+
+FloatArray = NDArray[np.float64]
+
+_DAMPING_UP, _DAMPING_DOWN, _DAMPING_MIN, _DAMPING_MAX = 8.0, 0.2, 1e-9, 1e6
+_SPAN, _SEARCH = np.log(10.0), 12  # how far a noise sd may move at a time, steps of its search
+_FREEDOM = 4.0  # of the Student t
+_WIDER = 4.0  # of the first state's covariance, where the filter begins
+_FILTER_STEP = 1e-5
+_FREE = 0.1  # of the first state's prior sd: process noise of coordinates that nothing measures, a second for positions
+
+
+@dataclass(frozen=True)
+class Point:
+    """theta (N,), states (K, S), energy with the priors of theta, and damping of the next step."""
+
+    theta: FloatArray
+    states: FloatArray
+    energy: float
+    damping: float
+
+
+def penalty(prior: QuadraticPrior, theta: FloatArray) -> float:
+    """-log prior of theta, with the flat normal that closes open directions."""
+    return prior.energy(theta) + 0.5 * FLAT_PRECISION * float(((theta - 0.5) ** 2).sum())
+
+
+def border(prior: QuadraticPrior, theta: FloatArray, gradient: FloatArray) -> Border:
+    """The prior at theta; a parameter that ``gradient`` (N,) presses against a bound may not move."""
+    flat = FLAT_PRECISION * np.eye(len(theta))
+    pull = prior.pull(theta) + FLAT_PRECISION * (0.5 - theta)
+    total = gradient + pull
+    held = ((theta <= 0) & (total < 0)) | ((theta >= 1) & (total > 0))
+    return Border(prior.precision + flat, pull, ~held)
+
+
+def descend(
+    chain: Chain, found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, here: Point, tolerance: float
+) -> tuple[Point, bool]:
+    """The first of ever shorter damped steps that lowers the energy; True where it would by less than ``tolerance``, or
+    none does."""
+    value, damping = energy(found, noise) + penalty(prior, here.theta), here.damping
+    hold = border(prior, here.theta, np.zeros_like(here.theta))
+    while damping <= _DAMPING_MAX:
+        solved = eliminate(found, noise, damping)
+        hessian, gradient = solved.precision + hold.precision, solved.gradient + hold.pull
+        move = box_step(hessian, gradient, here.theta, damping)
+        expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * solved.explained
+        if expected < tolerance:
+            return replace(here, energy=value), True
+        theta = np.clip(here.theta + move, 0.0, 1.0)
+        states = chain.moved(here.states, solved.states(move))
+        there = chain.compare(theta[None], states[None])[0]
+        after = np.inf if there is None else energy(there, noise) + penalty(prior, theta)
+        if after < value:
+            return Point(theta, states, after, max(_DAMPING_MIN, damping * _DAMPING_DOWN)), False
+        damping = max(damping, 1e-4) * _DAMPING_UP
+    return replace(here, energy=value), True
+
+
+def infer_noise(
+    chain: Chain, found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray
+) -> tuple[ChainNoise, float]:
+    """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten, and the nats
+    that it gains."""
+    channels, fixed = len(noise.sd), chain.fixed_sd
+    hold = border(prior, theta, eliminate(found, noise).gradient)
+    least = np.log(np.concatenate(chain.least))
+    start = np.maximum(np.log(np.concatenate([noise.sd, noise.process])), least)
+    free = np.concatenate([np.isnan(fixed), np.full(len(noise.process), True)])
+
+    def split(logs: FloatArray) -> ChainNoise:
+        everything = start.copy()
+        everything[free] = logs
+        sd = np.where(np.isnan(fixed), np.exp(everything[:channels]), noise.sd)
+        return ChainNoise(sd, np.exp(everything[channels:]))
+
+    def objective(logs: FloatArray) -> tuple[float, FloatArray]:
+        value, by_sd, by_process = restricted(found, split(logs), hold)
+        return -value, -np.concatenate([by_sd, by_process])[free]
+
+    bounds = [(max(low, s - _SPAN), s + _SPAN) for low, s in zip(least[free], start[free], strict=True)]
+    before = objective(start[free])[0]
+    limits = {"maxiter": _SEARCH, "maxfun": _SEARCH + 4}
+    best = scipy.optimize.minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds, options=limits)
+    return split(best.x), float(before - best.fun)
+
+
+def regress(found: ChainLinearisation, prior: QuadraticPrior, theta: FloatArray) -> FloatArray:
+    """One reweighted least-squares step of theta (N,) on the jumps, the states as they are."""
+    weights = found.linked[:, None] / (scale(found) ** 2 * (1 + (found.jump / scale(found)) ** 2 / _FREEDOM))
+    slopes, hold = found.transition_theta, border(prior, theta, np.zeros_like(theta))
+    hessian = np.einsum("kdn,kd,kdm->nm", slopes, weights, slopes, optimize=True) + hold.precision
+    gradient = np.einsum("kdn,kd->n", slopes, weights * found.jump) + hold.pull
+    return np.asarray(np.clip(theta + box_step(hessian, gradient, theta, 1e-6), 0.0, 1.0))
+
+
+def scale(found: ChainLinearisation) -> FloatArray:
+    """Robust sd (D,) of the jumps, from their median size; never zero."""
+    size = 1.4826 * np.median(np.abs(found.jump[found.linked]), axis=0)
+    return np.asarray(np.maximum(size, 1e-9 * max(float(size.max()), 1e-300)))
+
+
+def first_noise(chain: Chain, found: ChainLinearisation) -> ChainNoise:
+    """A guess from the first guess of the states. Measurement noise: what third differences of a channel leave, at most a
+    third of the jumps of the coordinate that it measures. Process noise: as large as the jumps, or for coordinates that no
+    channel measures so large that they can follow."""
+    jumps, fixed = scale(found), chain.fixed_sd
+    least_sd, least_process = chain.least
+    direct = np.array([np.inf if c is None else jumps[c] / 3 for c in chain.coordinates])
+    sd = np.where(np.isnan(fixed), np.maximum(np.minimum(_roughness(chain), direct), least_sd), fixed)
+    free = (
+        _FREE * np.repeat(START_SD, chain.sizes) * np.where(np.arange(len(jumps)) < chain.sizes[0], chain.dt.max(), 1.0)
+    )
+    return ChainNoise(sd, np.where(chain.placed, np.maximum(jumps, least_process), free))
+
+
+def _roughness(chain: Chain) -> FloatArray:
+    """Robust sd (C,) of what third differences of each channel leave of a smooth motion; their spread where too few
+    samples follow each other."""
+    series = np.where(chain.observed, chain.measured, np.nan)
+    within = chain.linked[2:] & chain.linked[1:-1] & chain.linked[:-2]
+    third = np.diff(series, n=3, axis=0)[within]
+    found = np.full(series.shape[1], np.inf)
+    for c, values in enumerate(third.T):
+        there = np.abs(values[np.isfinite(values)])
+        if len(there):
+            found[c] = 1.4826 * np.median(there) / np.sqrt(20)
+    spread = np.nanstd(series, axis=0)
+    return np.where(np.isfinite(found), found, np.where(spread > 0, spread, 1.0))
+
+
+def filtered(
+    chain: Chain, found: ChainLinearisation, noise: ChainNoise, theta: FloatArray, states: FloatArray
+) -> FloatArray | None:
+    """States (K, S) by an extended Kalman filter through every log at once; None where its simulation diverges.
+
+    Measurements are linear about ``states``, where ``found`` was taken; each control step is linearised where the filter
+    stands."""
+    size, timed = chain.num_start, ~chain.late
+    covariance = neighbours(eliminate(found, noise).factor, size)[0][chain.first] * _WIDER
+    at, out = np.flatnonzero(chain.first), states.copy()
+    here, thetas = states[at], np.tile(theta, (1 + size, 1))
+    steps = np.concatenate([np.zeros((1, size)), _FILTER_STEP * np.eye(size)])
+    while True:
+        here, covariance = _update(chain, found, noise, timed, at, here, covariance, states)
+        out[at] = here
+        on = np.append(chain.linked, False)[at]
+        if not on.any():
+            return out
+        at, here, covariance = at[on], here[on], covariance[on]
+        lanes = chain.moved(here[None], steps[:, None])
+        _, ends, valid = chain.simulate(thetas, lanes, at)
+        if not valid[0].all():
+            return None
+        turned = chain.difference(ends[1:], ends[0]) / _FILTER_STEP
+        transition = np.moveaxis(np.where(valid[1:, :, None], turned, 0.0), 0, -1)
+        covariance = transition @ covariance @ np.swapaxes(transition, 1, 2) + np.diag(noise.process**2)
+        at = at + 1
+        here = chain.moved(chain.reference[at], chain.difference(ends[0], chain.reference[at]))
+
+
+def _update(
+    chain: Chain,
+    found: ChainLinearisation,
+    noise: ChainNoise,
+    timed: NDArray[np.bool_],
+    at: NDArray[np.int64],
+    here: FloatArray,
+    covariance: FloatArray,
+    states: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Means (R, S) and covariances (R, D, D) after the measurements of the chain's states ``at`` (R,)."""
+    rows = found.measurement[at][:, timed]
+    away = chain.difference(here, states[at])
+    surprise = found.residual[at][:, timed] - np.einsum("rcd,rd->rc", rows, away) * found.observed[at][:, timed]
+    cross = rows @ covariance
+    spread = cross @ np.swapaxes(rows, 1, 2) + np.diag(noise.sd[timed] ** 2)
+    gain = np.swapaxes(np.linalg.solve(spread, cross), 1, 2)
+    covariance = covariance - gain @ cross
+    moved = chain.moved(here, np.einsum("rdc,rc->rd", gain, surprise))
+    return moved, 0.5 * (covariance + np.swapaxes(covariance, 1, 2))

@@ -1,0 +1,215 @@
+"""What ``laplace`` does step by step with a ``StateSpace``: from starting point to recorded optimum, in a flat state.
+
+A search regresses theta on the measured states, then smooths and infers the noise in turn (``inference.smoother``). The
+optimum's normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of. A later
+starting point is dropped once its regression ends where an earlier one did.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.least_squares import QuadraticPrior
+from sipe_bayes.inference.smoother import (
+    Point,
+    border,
+    descend,
+    filtered,
+    first_noise,
+    infer_noise,
+    penalty,
+    regress,
+    scale,
+)
+from sipe_bayes.inference.state import State
+from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.state_space import Chain
+from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
+
+FloatArray = NDArray[np.float64]
+
+_STILL, _REGRESSIONS = 0.01, 6  # a move of theta below which the regression ends, and its steps at most
+_TOLERANCE = 0.5  # nats that a step must promise
+_SETTLED = 1.0  # nats below which a new noise does not matter
+_ROUNDS, _FILTERS = 10, 3  # estimates of the noise at most, and after how many at most the filter runs:
+_DROPPED = 0.5  # where the process noise dropped by more than this, in logs
+_INNER = (3, 2)  # steps between them: before the first, later
+_AFTER_FILTER = 4
+_SAME = 0.02  # distance of regressed thetas that is none
+
+
+class Search(Protocol):
+    """What is needed of ``Laplace``."""
+
+    space: ParameterSpace
+    prior: Posterior
+    seed: int
+    restarts: int
+    candidates: int
+    initial: FloatArray | None
+
+    @property
+    def quadratic_prior(self) -> QuadraticPrior: ...
+
+    def warn(self, sentence: str | None) -> None: ...
+
+    def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of the quadratic model of data and prior at theta."""
+
+
+def start(search: Search, chain: Chain) -> State:
+    """The first state of a fit."""
+    points = _screened(search, chain) if search.initial is None else search.initial
+    n, (k, d), c = chain.num_theta, chain.prior_precision.shape, len(chain.channels)
+    shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
+    shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "evidence": ()}
+    return {
+        "done": False,
+        "points": points,
+        "point": 0,
+        "regressed": np.empty((0, n)),
+        **_begin(chain, points[0]),
+        **{f"mode_{name}": np.empty((0, *shape)) for name, shape in shapes.items()},
+    }
+
+
+def _begin(chain: Chain, theta: FloatArray) -> State:
+    return {
+        "theta": theta,
+        "states": chain.reference,
+        "sd": np.ones(len(chain.channels)),
+        "process": np.ones(chain.num_start),
+        "damping": 1e-4,
+        "iteration": 0,
+        "round": 0,
+        "inner": 0,
+        "due": False,
+        "held": True,  # states as measured
+    }
+
+
+def _screened(search: Search, chain: Chain) -> FloatArray:
+    """Starting points (R, N): the model as given and the best of a few draws from the prior, by the jumps that they leave
+    between states as measured; raises ValueError where all diverge."""
+    generator = torch.Generator().manual_seed(search.seed)
+    draws = search.prior.sample((search.candidates,), generator=generator).numpy()
+    points = np.concatenate([search.space.default_theta[None], draws])
+    found = chain.compare(points, np.tile(chain.reference, (len(points), 1, 1)))
+    good = [k for k, one in enumerate(found) if one is not None]
+    if not good:
+        raise ValueError(
+            f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
+            "or shorten the model's timestep"
+        )
+    if good[0] != 0:
+        search.warn("the model as given diverges on these logs; the search started elsewhere")
+    sizes = np.array([scale(one) for one in found if one is not None])
+    order = np.argsort(np.log(sizes).sum(1), kind="stable")
+    chosen = [good[k] for k in order if good[k] != 0]
+    return points[([0] if good[0] == 0 else []) + chosen][: search.restarts]
+
+
+def step(search: Search, chain: Chain, state: State) -> State:
+    """One linearisation and what follows from it: a step of the regression or the smoother, or a new noise."""
+    held = bool(state["held"])
+    found = chain.linearise(state["theta"], state["states"], with_states=not held)
+    if found is None:
+        if state["point"] + 1 == len(state["points"]) and not len(state["mode_theta"]):
+            raise ValueError(
+                "trajectories: the simulation diverges from the measured states at every starting point; look at the log's "
+                "channels and units, or shorten the model's timestep"
+            )
+        return _next(chain, state)
+    if held:
+        return _regressed(search, chain, state, found)
+    prior, noise = search.quadratic_prior, ChainNoise(state["sd"], state["process"])
+    here = Point(state["theta"], state["states"], np.inf, state["damping"])
+    state = {**state, "iteration": state["iteration"] + 1, "inner": state["inner"] + 1}
+    still = False
+    if not state["due"]:
+        here, still = descend(chain, found, noise, prior, here, _TOLERANCE)
+        if not still:
+            return {**state, **_at(here), "due": state["inner"] >= _INNER[min(state["round"], 1)]}
+    better, gain = infer_noise(chain, found, noise, prior, here.theta)
+    last = state["round"] >= _ROUNDS
+    if state["round"] and ((gain < _SETTLED and still) or last):
+        if last:
+            search.warn(
+                f"the noise had not settled after {_ROUNDS} estimates: compare with mcmc before you trust the intervals"
+            )
+        return _finish(search, chain, state, found, noise)
+    here, _ = descend(chain, found, better, prior, here, _TOLERANCE)
+    dropped = np.log(noise.process / better.process).mean() > _DROPPED
+    if state["round"] == 0 or (state["round"] < _FILTERS and dropped):
+        here = _refiltered(chain, found, better, prior, state, here)
+    return {
+        **state,
+        **_at(here),
+        "sd": better.sd,
+        "process": better.process,
+        "round": state["round"] + 1,
+        "inner": 0,
+        "due": False,
+    }
+
+
+def _at(point: Point) -> State:
+    return {"theta": point.theta, "states": point.states, "damping": point.damping}
+
+
+def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisation) -> State:
+    if not chain.placed.all():
+        noise = first_noise(chain, found)
+        return {**state, "held": False, "sd": noise.sd, "process": noise.process}
+    theta = regress(found, search.quadratic_prior, state["theta"])
+    still = np.abs(theta - state["theta"]).max() < _STILL or state["iteration"] + 1 >= _REGRESSIONS
+    state = {**state, "theta": theta, "iteration": state["iteration"] + 1, "held": not still}
+    if not still:
+        return state
+    if any(np.abs(theta - earlier).max() < _SAME for earlier in state["regressed"]):
+        return _next(chain, state)
+    noise = first_noise(chain, found)
+    regressed = np.concatenate([state["regressed"], theta[None]])
+    return {**state, "sd": noise.sd, "process": noise.process, "regressed": regressed}
+
+
+def _refiltered(
+    chain: Chain, found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, state: State, here: Point
+) -> Point:
+    """The lower of ``here`` and where Gauss-Newton comes from the filter's states."""
+    states = filtered(chain, found, noise, here.theta, state["states"])
+    if states is None:
+        return here
+    there = Point(here.theta, states, np.inf, 1e-4)
+    for _ in range(_AFTER_FILTER):
+        taken = chain.linearise(there.theta, there.states)
+        if taken is None:
+            return here
+        there, still = descend(chain, taken, noise, prior, there, _TOLERANCE)
+        if still:
+            break
+    return there if there.energy < here.energy else here
+
+
+def _finish(search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
+    """Record the optimum at its linearisation and turn to the next starting point."""
+    theta, prior, solved = state["theta"], search.quadratic_prior, eliminate(found, noise)
+    mean, covariance = search.normal(theta, solved.precision, solved.gradient)
+    evidence = restricted(found, noise, border(prior, theta, solved.gradient))[0] - penalty(prior, theta)
+    here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
+    here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "evidence": np.array(evidence)}
+    modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in here.items()}
+    return _next(chain, {**state, **modes})
+
+
+def _next(chain: Chain, state: State) -> State:
+    """Turn to the next starting point, or end."""
+    point = state["point"] + 1
+    if point >= len(state["points"]):
+        return {**state, "done": True}
+    return {**state, "point": point, **_begin(chain, state["points"][point])}

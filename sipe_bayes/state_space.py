@@ -1,0 +1,287 @@
+"""log p(trajectory | theta) of noisy, partly observed trajectories whose states are unknown at every sample.
+
+    x_k+1 = f(x_k, a_k, theta) + w_k,     y_k = h(x_k, theta) + v_k,
+
+with independent normal process noise w (a sd per state coordinate) and measurement noise v (a sd per channel), both
+inferred, and all states marginalised. f is the simulation of a whole control step; it is linearised by finite
+differences, all of them, of every sample and every log, in one batch (``Chain.linearise``); the algebra is in
+``sipe_bayes.tridiagonal``, the search in ``sipe_bayes.inference.smoother``. This is the weak-constraint formulation of
+data assimilation (Y. Tremolet, "Accounting for an imperfect model in 4D-Var", 2006, https://doi.org/10.1256/qj.05.224)
+and the iterated Kalman smoother (B. M. Bell, "The iterated Kalman smoother as a Gauss-Newton method", 1994,
+https://doi.org/10.1137/0804035).
+
+The state's coordinates are tangents (dq (nv), dv (nv), dact (na)), so quaternions stay of length one; a difference of two
+states is MuJoCo's mj_differentiatePos. The first state of a log has a normal prior about the measured one whose sd is far
+wider than any measurement; command histories of delayed actuators are taken as commanded.
+
+Deviations from the textbooks: measurement channels that the environment reads one physics step late (``derived_late``)
+are predicted by the step that led to the sample, so that process noise does not reach them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.likelihood import START_SD, BudgetExhausted, chosen_channels, estimate_states, moved, past_commands
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.tridiagonal import ChainLinearisation
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_THETA_STEP = 1e-4  # finite differences, of the unit cube
+_STATE_STEP = 1e-5  # rad or m, rad/s or m/s
+_LEAST_SD = 1e-6  # of a channel's or coordinate's size: noise below it is not told from rounding
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """States unknown at every sample; measurement and process noise inferred. For ``laplace`` and ``mcmc``.
+
+    fit: names of the channels that count, default all. noise_sd: given sd per channel in its unit, None where it is
+    inferred.
+    """
+
+    fit: tuple[str, ...] | None = None
+    noise_sd: tuple[float | None, ...] | None = None
+    noise: ClassVar[str] = "white"
+
+    def bind(self, simulator: Any, trajectories: Trajectories) -> Any:
+        """The Chain of the trajectories; raises ValueError for logs or simulators that do not fit."""
+        if not isinstance(simulator, Simulator):
+            raise ValueError("likelihood: StateSpace needs a MuJoCo simulator with states; use sipe.Segments")
+        if simulator.environment.memory_size:
+            raise ValueError(
+                f"likelihood: StateSpace does not know the controller's memory of {type(simulator.environment).__name__}; "
+                "use sipe.Segments"
+            )
+        return Chain(self, simulator, trajectories)
+
+
+class Chain:
+    """Recorded trajectories as K unknown states in a row, T + 1 of each log; states of different logs are not linked.
+
+    log, sample (K,): where a state belongs. measured, observed (K, C): what the simulation that starts there predicts.
+    rollouts, budget: as ``likelihood.Windows`` counts them."""
+
+    def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
+        self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
+        self.rollouts, self._part, self.budget = 0, 0.0, math.inf
+        self.channels = chosen_channels(simulator, trajectories, settings.fit)
+        steps = trajectories.length
+        self.log = np.repeat(np.arange(len(trajectories)), steps + 1)
+        self.sample = np.concatenate([np.arange(n + 1) for n in steps])
+        self.first, self.linked = self.sample == 0, self.log[1:] == self.log[:-1]
+        self.dt = trajectories.dt[self.log]
+        self.names = [trajectories.names[k] for k in self.log]
+        last = np.minimum(self.sample, steps[self.log] - 1)
+        self.actions = trajectories.actions[self.log, last][:, None]
+        self._read(trajectories)
+        environment, model = simulator.environment, simulator.model
+        self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
+        reference = np.concatenate([_measured_states(simulator, t) for t in trajectories])
+        reference[:, 0] = 0.0
+        timestep = np.array([simulator.physics_steps(float(d))[1] for d in self.dt])
+        past = past_commands(simulator, trajectories, self.log, self.sample, self.dt) if model.nhistory else []
+        self.reference = environment.history(model, reference, past, timestep)
+        self.sizes = (model.nv, model.nv, model.na)
+        self.prior_precision = np.where(self.first[:, None], np.repeat(START_SD, self.sizes) ** -2.0, 0.0)
+
+    def _read(self, trajectories: Trajectories) -> None:
+        environment = self.simulator.environment
+        columns = environment.state_columns(self.simulator.model)
+        late = np.array([environment.derived_late and columns[c] is None for c in self.channels])
+        rows = trajectories.observations[self.log, self.sample][:, self.channels]
+        ahead = np.concatenate([rows[1:], np.full((1, len(late)), np.nan)])
+        ahead[:-1][~self.linked] = np.nan
+        self.late, self.measured = late, np.where(late, ahead, rows)
+        self.observed = np.isfinite(self.measured)
+        for name, seen in zip(self.fitted, self.observed.T, strict=True):
+            if not seen.any():
+                raise ValueError(
+                    f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`"
+                )
+
+    @property
+    def fitted(self) -> list[str]:
+        """Names of the C fitted channels."""
+        return [self.simulator.environment.channels[c] for c in self.channels]
+
+    @property
+    def num_theta(self) -> int:
+        return len(self.simulator.space)
+
+    @property
+    def num_start(self) -> int:
+        """D, coordinates of a state."""
+        return self.prior_precision.shape[1]
+
+    @property
+    def coordinates(self) -> list[int | None]:
+        """For each fitted channel the state coordinate that it measures directly, if it does; of a quaternion's numbers one
+        of its joint's turns."""
+        model = self.simulator.model
+        columns = self.simulator.environment.state_columns(model)
+        owner = np.searchsorted(model.jnt_qposadr, np.arange(model.nq), side="right") - 1
+        last = np.append(model.jnt_dofadr[1:], model.nv)[owner] - 1
+        turn = np.minimum(model.jnt_dofadr[owner] + np.arange(model.nq) - model.jnt_qposadr[owner], last)
+
+        def coordinate(column: int | None) -> int | None:
+            if column is None:
+                return None
+            return int(turn[column - 1]) if column <= model.nq else column - 1 - model.nq + model.nv
+
+        return [coordinate(columns[c]) for c in self.channels]
+
+    @property
+    def placed(self) -> BoolArray:
+        """Which coordinates (D,) belong to a degree of freedom or an activation that a channel or a recorded state tells."""
+        nv = self.sizes[0]
+        if self.trajectories.states is not None:
+            return np.full(self.num_start, True)
+        seen = np.isin(np.arange(self.num_start), [c for c in self.coordinates if c is not None])
+        either = seen[:nv] | seen[nv : 2 * nv]
+        return np.concatenate([either, either, seen[2 * nv :]])
+
+    @property
+    def fixed_sd(self) -> FloatArray:
+        """Given noise sd (C,) of the fitted channels, NaN where it is inferred."""
+        given = self.settings.noise_sd
+        if given is None:
+            return np.full(len(self.channels), np.nan)
+        return np.array([np.nan if given[c] is None else given[c] for c in self.channels], float)
+
+    @property
+    def least(self) -> tuple[FloatArray, FloatArray]:
+        """Noise sds (C,) and (D,) below which rounding rules."""
+        sizes = np.sqrt(np.nanmean(np.where(self.observed, self.measured, np.nan) ** 2, axis=0))
+        spread = self.difference(self.reference, self.reference[:1])
+        states = np.sqrt((spread**2).mean(0))
+        return _floor(sizes), _floor(states)
+
+    def moved(self, states: FloatArray, tangent: FloatArray) -> FloatArray:
+        """States (..., S) moved by tangents (..., D)."""
+        return moved(self.simulator.model, states, tangent)
+
+    def difference(self, after: FloatArray, before: FloatArray) -> FloatArray:
+        """Tangents (..., D) that lead from states ``before`` (..., S) to ``after``."""
+        model = self.simulator.model
+        nq, nv, end = model.nq, model.nv, 1 + model.nq + model.nv + model.na
+        after, before = np.broadcast_arrays(after, before)
+        rest = after[..., 1 + nq : end] - before[..., 1 + nq : end]
+        if nq == nv:
+            return np.concatenate([after[..., 1 : 1 + nq] - before[..., 1 : 1 + nq], rest], axis=-1)
+        turn = np.empty((*after.shape[:-1], nv))
+        rows = (turn.reshape(-1, nv), before.reshape(-1, before.shape[-1]), after.reshape(-1, after.shape[-1]))
+        for out, one, two in zip(*rows, strict=True):
+            mujoco.mj_differentiatePos(model, out, 1.0, one[1 : 1 + nq].copy(), two[1 : 1 + nq].copy())
+        return np.concatenate([turn, rest], axis=-1)
+
+    def simulate(
+        self, theta: FloatArray, states: FloatArray, at: NDArray[np.int64] | None = None
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """One control step from states (B, K, S) at theta (B, N): predictions (B, K, C), ends (B, K, S), and which are
+        valid (B, K). at (K,): which of the chain's states these are, default all."""
+        at = np.arange(len(self.log)) if at is None else at
+        batch = len(theta)
+        cost = self._part + batch * len(self.trajectories) * len(at) / len(self.log)
+        if self.rollouts + math.ceil(cost) > self.budget:
+            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost:.0f}")
+        self.rollouts, self._part = self.rollouts + int(cost), cost % 1.0
+        result = self.simulator.rollout(
+            np.repeat(theta, len(at), axis=0),
+            np.tile(self.actions[at], (batch, 1, 1)),
+            states.reshape(batch * len(at), -1),
+            np.tile(self.dt[at], batch),
+            [self.names[k] for k in at] * batch,
+            goals=None if self.goals is None else np.tile(self.goals[at], (batch, 1)),
+        )
+        shape = (batch, len(at))
+        seen = result.observations[..., self.channels]
+        assert result.states is not None
+        goes_on = np.append(self.linked, False)[at]
+        sound = result.valid[:, 0] & (result.valid[:, 1] | ~np.tile(goes_on, batch))
+        predicted = np.where(self.late, seen[:, 1], seen[:, 0]).reshape(*shape, -1)
+        return predicted, result.states[:, 1].reshape(*shape, -1), sound.reshape(shape)
+
+    def _compared(self, theta_states: FloatArray, predicted: FloatArray, ends: FloatArray) -> dict[str, Any]:
+        """Residual, jump and offset of states (K, S), and the masks."""
+        linked = self.linked[:, None]
+        return {
+            "residual": np.where(self.observed, self.measured - predicted, 0.0),
+            "jump": np.where(linked, self.difference(theta_states[1:], ends[:-1]), 0.0),
+            "offset": np.where(self.first[:, None], self.difference(theta_states, self.reference), 0.0),
+            "observed": self.observed,
+            "linked": self.linked,
+            "precision": self.prior_precision,
+        }
+
+    def compare(
+        self, theta: FloatArray, states: FloatArray, slopes: ChainLinearisation | None = None
+    ) -> list[ChainLinearisation | None]:
+        """What theta (B, N) and states (B, K, S) predict, compared with the log; None where a simulation diverged. The
+        Jacobians are those of ``slopes``, else empty."""
+        predicted, ends, valid = self.simulate(theta, states)
+        names = ("measurement", "measurement_theta", "transition", "transition_theta")
+        kept: dict[str, Any] = {n: np.empty(0) if slopes is None else getattr(slopes, n) for n in names}
+        return [
+            ChainLinearisation(**self._compared(s, p, e), **kept) if v.all() else None
+            for s, p, e, v in zip(states, predicted, ends, valid, strict=True)
+        ]
+
+    def linearise(self, theta: FloatArray, states: FloatArray, with_states: bool = True) -> ChainLinearisation | None:
+        """Everything at theta (N,), states (K, S), in one batch of 1 + N + D control steps a state; None where it diverged.
+
+        A finite difference whose simulation diverges counts as zero. with_states: else their Jacobians are zero."""
+        n, d = self.num_theta, self.num_start
+        count = 1 + n + d * with_states
+        sign = np.where(theta + _THETA_STEP <= 1, 1.0, -1.0)
+        thetas, all_states = np.tile(theta, (count, 1)), np.tile(states, (count, 1, 1))
+        thetas[np.arange(1, n + 1), np.arange(n)] += sign * _THETA_STEP
+        for j in range(count - 1 - n):
+            tangent = np.zeros(d)
+            tangent[j] = _STATE_STEP
+            all_states[1 + n + j] = self.moved(states, np.broadcast_to(tangent, (len(states), d)))
+        predicted, ends, valid = self.simulate(thetas, all_states)
+        if not valid[0].all():
+            return None
+        scale = np.concatenate([sign * _THETA_STEP, np.full(count - 1 - n, _STATE_STEP)])[:, None, None]
+        sound = valid[1:, :, None]
+        seen = np.where(sound & self.observed, (predicted[1:] - predicted[0]) / scale, 0.0)
+        reached = np.where(sound, self.difference(ends[1:], ends[0]) / scale, 0.0)[:, :-1]
+        reached = np.where(self.linked[:, None], reached, 0.0)
+        seen, reached = np.moveaxis(seen, 0, -1), np.moveaxis(reached, 0, -1)
+        by_state = (seen[..., n:], reached[..., n:])
+        if not with_states:
+            by_state = (np.zeros((*seen.shape[:-1], d)), np.zeros((*reached.shape[:-1], d)))
+        return ChainLinearisation(
+            **self._compared(states, predicted[0], ends[0]),
+            measurement=by_state[0],
+            measurement_theta=seen[..., :n],
+            transition=by_state[1],
+            transition_theta=reached[..., :n],
+        )
+
+
+def _floor(sizes: FloatArray) -> FloatArray:
+    usual = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
+    return np.asarray(_LEAST_SD * np.maximum(sizes, 1e-3 * usual))
+
+
+def _measured_states(simulator: Simulator, trajectory: Any) -> FloatArray:
+    """A first guess of the states (T+1, S): recorded ones, else what each sample measured, the rest as ``estimate_states``
+    has it. Unlike there nothing is smoothed: the chain does that."""
+    states = estimate_states(simulator, trajectory).copy()
+    if trajectory.states is None:
+        for channel, column in enumerate(simulator.environment.state_columns(simulator.model)):
+            seen = np.isfinite(trajectory.observations[:, channel])
+            if column is not None:
+                states[seen, column] = trajectory.observations[seen, channel]
+    return states
