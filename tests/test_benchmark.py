@@ -374,7 +374,7 @@ def test_full_disk_loses_nothing(monkeypatch: pytest.MonkeyPatch, undisturbed: P
 
 
 def test_two_runs_at_once_are_refused(tmp_path: Path) -> None:
-    with run._claimed(tmp_path):
+    with run.claimed(tmp_path):
         refused(measured(tmp_path, *PENDULUM), "another run is at work")
 
 

@@ -157,7 +157,7 @@ class Straying:
     """Of the first draws every other one is outside the cube; then none, or all of them."""
 
     def __init__(self, for_ever: bool) -> None:
-        self.calls, self.for_ever = 0, for_ever
+        self.calls, self.for_ever, self.space = 0, for_ever, task().space
 
     def sample(self, shape: tuple[int], generator: torch.Generator) -> torch.Tensor:
         self.calls += 1
@@ -168,12 +168,12 @@ class Straying:
 
 def test_impossible_draws_are_drawn_anew_and_counted() -> None:
     run = run_of(told())
-    run.source = Straying(for_ever=False)  # type: ignore[assignment]
+    run.draw.source = Straying(for_ever=False)  # type: ignore[assignment]
     theta = run.draw(np.random.default_rng(0), 7)
     assert theta.shape == (7, 3)
     assert ((theta >= 0) & (theta <= 1)).all()
-    assert run.redrawn == 4
-    run.source = Straying(for_ever=True)  # type: ignore[assignment]
+    assert run.draw.redrawn == 4
+    run.draw.source = Straying(for_ever=True)  # type: ignore[assignment]
     with pytest.raises(ValueError, match=r"100 draws of .* gave no model; narrow") as raised:
         run.draw(np.random.default_rng(0), 7)
     assert "\n" not in str(raised.value)

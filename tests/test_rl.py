@@ -17,10 +17,12 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli import app
+from sipe_bayes.posterior import prior
 from sipe_bayes.rl.ddpg import Agent
 from sipe_bayes.rl.evaluation import check_agents, evaluate, install, write_card
 from sipe_bayes.rl.normaliser import Normaliser
 from sipe_bayes.rl.policy import Policy, PolicyError, load_policy
+from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.replay import Batch
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import CHECKPOINT, choose, read_curve, train
@@ -246,10 +248,8 @@ def contents(path: Path) -> dict[str, Any]:
     ids=["published", "every option", "goals and hindsight"],
 )
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, settings: Settings) -> None:
-    def draw(rng: np.random.Generator, count: int) -> np.ndarray:
-        return rng.uniform(size=(count, len(sipe.make_task(task).space)))
-
-    run = {"evaluate_every": 90, "evaluation_episodes": 2, "checkpoint_every": 75, "draw": draw}
+    drawn = Randomization(prior(sipe.make_task(task).space), observation_noise=0.01, action_delay=2)
+    run = {"evaluate_every": 90, "evaluation_episodes": 2, "checkpoint_every": 75, "randomization": drawn}
     whole = train(task, 270, 3, tmp_path / "whole", settings, **run)  # type: ignore[arg-type]
     short = tmp_path / "short"
 
@@ -280,22 +280,16 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, setti
 
 
 def test_every_episode_gets_a_theta_of_its_own() -> None:
-    drawn: list[np.ndarray] = []
-
-    def draw(rng: np.random.Generator, count: int) -> np.ndarray:
-        drawn.append(rng.uniform(size=(count, 2)))
-        return drawn[-1]
-
-    settings = Settings(hidden=(8,), start_steps=10**6, lanes=2)
-    trainer = Trainer(sipe.make_task("FetchPush"), settings, 0, draw)
+    task = sipe.make_task("FetchPush")
+    trainer = Trainer(task, Settings(hidden=(8,), start_steps=10**6, lanes=2), 0, Randomization(prior(task.space)))
     used = []
     for _ in range(152):  # three episodes of 50 steps, the two later ones with a step that only begins them
         trainer.advance()
         used.append(trainer.episodes.theta.copy())
     assert trainer.steps == 2 * 150
-    assert len(drawn) == 3
-    expected = np.repeat(drawn, [50, 51, 51], axis=0)
-    np.testing.assert_array_equal(used, expected)
+    drawn = [used[0], used[50], used[101]]
+    np.testing.assert_array_equal(used, np.repeat(drawn, [50, 51, 51], axis=0))
+    assert len(np.unique(np.concatenate(drawn), axis=0)) == 6
 
 
 def test_demonstrations_fill_their_share_of_a_batch() -> None:

@@ -30,7 +30,7 @@ Address = Annotated[str | None, typer.Option(help="HOST:PORT of a Ray cluster; d
 
 
 @contextmanager
-def _refusing(then: str = "") -> Iterator[None]:
+def refusing(then: str = "") -> Iterator[None]:
     """Input errors are one line on standard error and exit code 2; an interruption says what to do ``then``."""
     try:
         yield
@@ -60,13 +60,13 @@ def run(
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")] = False,
 ) -> None:
     """Measure the cells of a suite that have no record yet; exit code 1 if one failed."""
-    with _refusing("; the same command goes on"):
+    with refusing("; the same command goes on"):
         from sipe_bayes.benchmark import run as runs
         from sipe_bayes.benchmark.cells import select as chosen
 
-        _at_least_one(budget=budget, steps=steps, training=training, jobs=jobs)
+        at_least_one(budget=budget, steps=steps, training=training, jobs=jobs)
         cells = runs.changed(chosen(suite, select or ()), budget=budget, steps=steps, training=training)
-        failed = runs.run(cells, out, _executor(executor, jobs, address), _command(), retry_failed, _say)
+        failed = runs.run(cells, out, executor_of(executor, jobs, address), command_line(), retry_failed, say)
     if failed:
         print(f"sipe: {failed} cells failed; `sipe benchmark status {out}` shows why", file=sys.stderr)
         raise typer.Exit(1)
@@ -78,7 +78,7 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
     """How far a run is, what failed, and what it took."""
-    with _refusing():
+    with refusing():
         from sipe_bayes.benchmark.status import lines, summary
         from sipe_bayes.output import to_json
 
@@ -92,7 +92,7 @@ def cells(
     select: Annotated[list[str] | None, typer.Option(help="As of `sipe benchmark run`.")] = None,
 ) -> None:
     """The suites, or the ids of a suite's cells."""
-    with _refusing():
+    with refusing():
         from sipe_bayes.benchmark.cells import SUITES
         from sipe_bayes.benchmark.cells import select as chosen
 
@@ -118,19 +118,19 @@ def simulate(
     address: Address = None,
 ) -> None:
     """Simulate the prior for the estimators that learn from it, in shards, which `sipe benchmark run --out` finds."""
-    with _refusing("; the same command goes on"):
+    with refusing("; the same command goes on"):
         from sipe_bayes.benchmark import bank
         from sipe_bayes.benchmark import run as runs
         from sipe_bayes.benchmark.cells import Cell
         from sipe_bayes.envs.task import VARIANTS
 
-        _at_least_one(budget=budget, steps=steps, jobs=jobs)
+        at_least_one(budget=budget, steps=steps, jobs=jobs)
         if variant not in VARIANTS:
             raise ValueError(f"--variant {variant}: expected one of {', '.join(VARIANTS)}")
         cell: Any = Cell(environment, "prior", variant=variant, seed=seed, steps=steps)
         which = bank.Bank(environment, cell.variant, seed, cell.horizon)
         if not verify:
-            runs.simulate(which, budget, out, _executor(executor, jobs, address), _command(), _say)
+            runs.simulate(which, budget, out, executor_of(executor, jobs, address), command_line(), say)
         wrong = bank.verify(which, budget, out)
     for line in wrong:
         print(f"sipe: {line}", file=sys.stderr)
@@ -139,7 +139,7 @@ def simulate(
     print(f"{which.id}: {budget} simulations in {out / bank.FOLDER}, verified")
 
 
-def _executor(name: str, jobs: int | None, address: str | None) -> Callable[[], Executor]:
+def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[], Executor]:
     """What makes the executor; raises ValueError for options that do not go together."""
     import os
 
@@ -158,15 +158,15 @@ def _executor(name: str, jobs: int | None, address: str | None) -> Callable[[], 
     return Inline if name == "inline" else lambda: Pool(jobs or os.cpu_count() or 1)
 
 
-def _at_least_one(**options: int | None) -> None:
+def at_least_one(**options: float | None) -> None:
     for option, value in options.items():
         if value is not None and value < 1:
-            raise ValueError(f"--{option} {value}: expected at least 1; raise it or leave it out")
+            raise ValueError(f"--{option.replace('_', '-')} {value}: expected at least 1; raise it or leave it out")
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
     print(line, flush=True)
 
 
-def _command() -> str:
+def command_line() -> str:
     return shlex.join(["sipe", *sys.argv[1:]])

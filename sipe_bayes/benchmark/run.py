@@ -40,29 +40,28 @@ def run(
     """Measure the cells that have no record in ``folder`` yet; returns how many failed. start: makes the executor, once the folder
     is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
     budgets or lengths, or that another run is at work in, and OSError where it cannot be written."""
-    with _claimed(folder):
-        left = [cell for cell in cells if not _finished(cell, folder, retry_failed)]
+    with claimed(folder):
+        left = [cell for cell in cells if not finished(cell, folder, retry_failed)]
         plan(folder, [cell.id for cell in cells])
         report(f"{len(cells)} cells, {len(cells) - len(left)} of them there already")
         if not left:
             return 0
-        units = _units(left, folder, command)
-        return _carried_out(units, folder, start, command, report)
+        return carried_out(units_of(left, folder, command), folder, start, command, report)
 
 
 def simulate(
     which: Bank, budget: int, folder: Path, start: Callable[[], Executor], command: str, report: Report
 ) -> int:
     """Fill the first ``budget`` rows of a bank; returns how many shards there were to make. Raises as ``run``."""
-    with _claimed(folder):
+    with claimed(folder):
         units = bank.shards(which, budget, bank.place(which, folder))
         if units:
-            _carried_out(units, folder, start, command, report)
+            carried_out(units, folder, start, command, report)
         return len(units)
 
 
 @contextmanager
-def _claimed(folder: Path) -> Iterator[None]:
+def claimed(folder: Path) -> Iterator[None]:
     """The folder, made if need be, for one run at a time."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
@@ -77,12 +76,18 @@ def _claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def _finished(cell: Cell, folder: Path, retry_failed: bool) -> bool:
+def finished(cell: Cell, folder: Path, retry_failed: bool) -> bool:
     path = record_path(folder, cell.id)
     if not path.is_file():
         return False
     found = Record.read(path)
     mine: dict[str, Any] = {"budget": cell.budget, "steps": cell.horizon, "versions": measure.versions()}
+    check_alike(cell, folder, found, mine)
+    return found.done or not retry_failed
+
+
+def check_alike(cell: Cell, folder: Path, found: Record, mine: dict[str, Any]) -> None:
+    """Raises OutputError for a cell's record with other entries than ``mine``."""
     for name, value in mine.items():
         there = getattr(found, name)
         if there != value:
@@ -90,7 +95,6 @@ def _finished(cell: Cell, folder: Path, retry_failed: bool) -> bool:
                 f"--out {folder}: holds {cell.id} with {name} {_differing(there, value)} and not {_differing(value, there)}; "
                 "choose another folder"
             )
-    return found.done or not retry_failed
 
 
 def _differing(one: Any, other: Any) -> Any:
@@ -100,7 +104,7 @@ def _differing(one: Any, other: Any) -> Any:
     return ", ".join(f"{k} {v}" for k, v in one.items() if other.get(k) != v) or "fewer packages"
 
 
-def _units(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:
+def units_of(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:
     """Shards of simulations first, and then the cells, which wait for theirs."""
     banks: dict[Bank, int] = {}
     for cell in cells:
@@ -128,7 +132,7 @@ def _bank(cell: Cell) -> Bank | None:
     return Bank(cell.task, cell.variant, cell.seed, cell.horizon)
 
 
-def _carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor], command: str, report: Report) -> int:
+def carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor], command: str, report: Report) -> int:
     """Submit what needs nothing more, write what comes back, until nothing is left; returns the number of failures."""
     waiting, written, failed = {unit.name: unit for unit in units}, set[str](), 0
     with start() as executor:

@@ -64,6 +64,10 @@ def train(
         Path | None,
         typer.Option(help="npz of `sipe data demonstrate`, or others with rewards, for --demonstration-share."),
     ] = None,
+    randomization: Annotated[
+        Path | None,
+        typer.Option(help="domain_randomization.json of `sipe calibrate`: every episode runs under a draw of it."),
+    ] = None,
     evaluate_every: Annotated[int, typer.Option(help="Steps between the points of the learning curve.")] = 5_000,
     evaluation_episodes: Annotated[int, typer.Option(help="Episodes of each point.")] = 10,
     checkpoint_every: Annotated[int, typer.Option(help="Steps between checkpoints.")] = 25_000,
@@ -76,6 +80,7 @@ def train(
         import torch
 
         from sipe_bayes.cli import Progress
+        from sipe_bayes.rl.randomization import load_randomization
         from sipe_bayes.rl.train import train as run
         from sipe_bayes.trajectory import Trajectories
 
@@ -84,10 +89,12 @@ def train(
         torch.set_num_threads(threads)
         folder, chosen = out or Path("runs") / f"{task}-ddpg-{seed}", Settings(**settings)
         shown = None if demonstrations is None else Trajectories.load(demonstrations)
+        drawn = None if randomization is None else load_randomization(randomization)
         with Progress(unit="steps") as progress:
             run(
                 *(task, steps, seed, folder, chosen),
                 resume=resume,
+                randomization=drawn,
                 demonstrations=shown,
                 evaluate_every=evaluate_every,
                 evaluation_episodes=evaluation_episodes,

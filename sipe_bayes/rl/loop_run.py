@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
@@ -20,6 +19,7 @@ from sipe_bayes.inference.gaussian_search import Search
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.policy import Policy
+from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report
 from sipe_bayes.rl.trainer import Trainer
@@ -31,7 +31,6 @@ Row = dict[str, Any]
 """Of the history; ``train_in_the_loop`` says what is in it."""
 
 _EVALUATION_SEED = 3_000_000  # of the history's starts: other ones than a card's or a curve's
-_DRAWS = 100  # times that theta are drawn anew
 
 
 @dataclass(frozen=True)
@@ -126,11 +125,12 @@ class LoopRun:
         self.fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode()).hexdigest()
         self.simulator = Simulator(task, threads)  # of the reference and of evaluations
         self.posterior: Posterior = estimator.prior
-        self.source = self.posterior  # what theta are drawn from
-        self.spent = self.reference_rollouts = self.redrawn = 0
+        self.spent = self.reference_rollouts = 0
         self.idle = False  # a search that is over
         self.history: list[Row] = []
-        self.trainer = Trainer(task, plan.settings, estimator.seed, self.draw, threads=threads)
+        self.trainer = Trainer(task, plan.settings, estimator.seed, Randomization(self.posterior), threads=threads)
+        assert self.trainer.draws is not None
+        self.draw = self.trainer.draws
 
     def iterate(self, report: Report | None) -> None:
         """Train, estimate, and add a row to the history."""
@@ -159,26 +159,6 @@ class LoopRun:
             warnings=(*dict.fromkeys(self.estimator.warnings), *failures),
         )
 
-    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """theta (count, N) of the present estimate that a model can have; others are drawn anew and counted."""
-        found = np.empty((0, len(self.task.space)))
-        for _ in range(_DRAWS):
-            generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-            theta = self.source.sample((count - len(found),), generator=generator).numpy()
-            possible = np.array([self._possible(row) for row in theta])
-            self.redrawn += int((~possible).sum())
-            found = np.concatenate([found, theta[possible]])
-            if len(found) == count:
-                return found
-        raise ValueError(f"theta: {_DRAWS} draws of {self.source!r} gave no model; narrow the parameters' bounds")
-
-    def _possible(self, theta: FloatArray) -> bool:
-        try:
-            self.simulator.check_physical(self.simulator.check_theta(theta, allow_outside=False))
-        except ValueError:
-            return False
-        return True
-
     def _estimate(self, episodes: list[_Begun], allowed: int) -> str | None:
         """Update the estimate with ``allowed`` rollouts; returns why there is none."""
         recorded = self._replayed(episodes)
@@ -205,13 +185,13 @@ class LoopRun:
             self.spent = estimator.rollouts
         self.posterior = estimator.get_parameter_estimate(given)
         proposal = getattr(estimator, "proposal", None)
-        self.source = self.posterior if proposal is None else proposal
+        self.draw.source = self.posterior if proposal is None else proposal
 
     def _fitted(self, given: Trajectories, allowed: int) -> None:
         """A new fit with a budget of ``allowed`` rollouts; what it leaves is for the next one."""
         self.estimator.budget = allowed
         try:
-            self.posterior = self.source = self.estimator.fit(given)
+            self.posterior = self.draw.source = self.estimator.fit(given)
         finally:
             self.estimator.budget = self.budget
             self.spent += self.estimator.rollouts
@@ -246,7 +226,7 @@ class LoopRun:
             "simulation_success": inside["success_rate"],
             "reference_return": outside["mean"],
             "reference_success": outside["success_rate"],
-            "redrawn": self.redrawn,
+            "redrawn": self.draw.redrawn,
             "diverged": self.trainer.episodes.simulator.diverged,
             "failure": failure,
             "mean": mean.tolist(),

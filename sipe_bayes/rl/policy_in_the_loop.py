@@ -104,7 +104,7 @@ class _Folder:
     """What a run keeps on disk. The checkpoint names its replay buffer and posteriors, which are written before it, and those of the
     one before go after it: an interruption leaves a whole set."""
 
-    _COUNTS = ("spent", "reference_rollouts", "redrawn", "idle")
+    _COUNTS = ("spent", "reference_rollouts", "idle")
 
     def __init__(self, folder: Path, run: LoopRun, resume: bool) -> None:
         self._folder, self._kept = folder, (folder / CHECKPOINT).parent
@@ -121,14 +121,13 @@ class _Folder:
         number = len(run.history)
         run.trainer.replay.save(self._kept / f"replay-{number}.npz")
         run.posterior.save(self._kept / f"posterior-{number}")
-        run.source.save(self._kept / f"proposal-{number}")
+        run.draw.source.save(self._kept / f"proposal-{number}")
         searched = run.estimator._state if isinstance(run.estimator, Search) else None
         counts = {name: getattr(run, name) for name in self._COUNTS}
         state = {
             **{f"trainer.{k}": v for k, v in run.trainer.state().items()},
             **{f"estimator.{k}": v for k, v in (searched or {}).items()},
             **counts,
-            "diverged": run.trainer.episodes.simulator.diverged,
             "history": json.dumps(run.history),
             "warnings": list(run.estimator.warnings),
         }
@@ -161,9 +160,8 @@ class _Folder:
         number = len(run.history)
         run.trainer.replay.load(self._kept / f"replay-{number}.npz")
         run.trainer.restore(_part(state, "trainer."))
-        run.trainer.episodes.simulator.diverged = int(state["diverged"])
         run.posterior = load_posterior(self._kept / f"posterior-{number}")
-        run.source = load_posterior(self._kept / f"proposal-{number}")
+        run.draw.source = load_posterior(self._kept / f"proposal-{number}")
         for name in self._COUNTS:
             setattr(run, name, state[name])
         run.estimator.warnings = list(state["warnings"])

@@ -2,9 +2,11 @@
 
 A policy is kept at every evaluation. ``suboptimal.safetensors`` is the one kept first at or after half of the steps;
 ``expert.safetensors`` the one of the highest mean return among those after it, since DDPG does not end on its best.
-It is chosen by few episodes, so its return there flatters it: a card evaluates it on others.
+It is chosen by few episodes, so its return there flatters it: a card evaluates it on others. Under a randomisation these episodes run in
+simulators drawn from it, the same ones at every evaluation, undisturbed: nothing is chosen by what the agent does anywhere else.
 
-The folder holds ``curve.csv``, a TensorBoard log, ``policies/``, and ``checkpoint/``: networks, targets, optimisers,
+The folder holds ``curve.csv``, a TensorBoard log, ``policies/``, at the end ``counts.json`` (steps, updates, theta drawn anew because no
+model can have them, diverged simulations), and ``checkpoint/``: networks, targets, optimisers,
 normaliser, every random generator and the lanes' states in one safetensors file, with the replay buffer beside it. The
 checkpoint names its buffer, and both are written before the previous ones go, so an interruption leaves a whole pair.
 """
@@ -21,14 +23,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sipe_bayes.atomic import replacing, write_text
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.inference.state import load_state, save_state
+from sipe_bayes.output import to_json
 from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.policy import Policy, load_policy
+from sipe_bayes.rl.randomization import Draws, Randomization
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.rl.trainer import Draw, Trainer
+from sipe_bayes.rl.trainer import Trainer
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
 
@@ -36,6 +43,7 @@ Report = Callable[[str, int, int], None]
 """Called with a line of text, the steps taken and those to take."""
 
 CHECKPOINT = "checkpoint/state.safetensors"
+COUNTS = "counts.json"
 CURVE = ("step", "return_mean", "return_sd", "success_rate", "wall_seconds", "updates_per_second")
 _EVALUATION_SEED = 2_000_000  # of the curve's starts: other ones than a card's
 
@@ -48,7 +56,7 @@ def train(
     settings: Settings | None = None,
     *,
     resume: bool = False,
-    draw: Draw | None = None,
+    randomization: Randomization | None = None,
     demonstrations: Trajectories | None = None,
     evaluate_every: int = 5_000,
     evaluation_episodes: int = 10,
@@ -58,7 +66,7 @@ def train(
 ) -> Policy:
     """Train for ``steps`` control steps and return the expert; see the module for what ``folder`` holds then.
 
-    resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than before; the result is that
+    randomization: what each episode draws; without one all run in the published model. resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than before; the result is that
     of an uninterrupted run. Raises ValueError for arguments out of range, and for a folder that holds another run or,
     without ``resume``, any.
     """
@@ -75,19 +83,19 @@ def train(
         raise ValueError(
             f"--out {folder}: holds a run already; add --resume to go on with it, or choose another folder"
         )
-    trainer = Trainer(task, settings, seed, draw, demonstrations, threads)
+    trainer = Trainer(task, settings, seed, randomization, demonstrations, threads)
     described = {
         "task": task.name,
         "model": trainer.episodes.simulator.checksum(),
         "seed": seed,
         "settings": settings.to_dict(),
-        "drawn": draw is not None,
+        "drawn": randomization is not None and randomization.fingerprint,
         "demonstrations": _checksum(demonstrations),
         "evaluate_every": evaluate_every,
         "evaluation_episodes": evaluation_episodes,
     }
     fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
-    log = _Log(folder, evaluation_episodes)
+    log = _Log(folder, evaluation_episodes, randomization)
     if resume and (folder / CHECKPOINT).is_file():
         log.load(trainer, fingerprint)
     log.begin(trainer)
@@ -100,16 +108,18 @@ def train(
             log.save(trainer, fingerprint)
         if report is not None and trainer.steps // 100 > before // 100:
             report(log.line(trainer), trainer.steps, steps)
-    return log.finish(task, steps)
+    return log.finish(trainer, steps)
 
 
 class _Log:
     """What a run writes: the curve, the TensorBoard log, the policies and the checkpoint."""
 
-    def __init__(self, folder: Path, episodes: int) -> None:
+    def __init__(self, folder: Path, episodes: int, randomization: Randomization | None) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         self._folder, self._episodes, self._board = folder, episodes, SummaryWriter
+        self._randomization = randomization
+        self._theta: NDArray[np.float64] | None = None
         self._writer: Any = None
         self._evaluator: Simulator | None = None
         self.rows: list[list[float | None]] = []
@@ -135,7 +145,10 @@ class _Log:
         policy, now = trainer.policy(), time.perf_counter()
         rate = (trainer.agent.updates - self._last[1]) / (now - self._last[0])
         self._evaluator = self._evaluator or Simulator(trainer.task, trainer.episodes.simulator.num_threads)
-        found = evaluate(policy, self._evaluator, self._episodes, _EVALUATION_SEED)
+        if self._randomization is not None and self._theta is None:
+            draws = Draws(self._evaluator, self._randomization.posterior)
+            self._theta = draws(np.random.default_rng(_EVALUATION_SEED), self._episodes)
+        found = evaluate(policy, self._evaluator, self._episodes, _EVALUATION_SEED, self._theta)
         policy.save(self._policy(trainer.steps))
         measured = (found["mean"], found["sd"], found["success_rate"], self.seconds(), rate)
         self.rows.append([trainer.steps, *measured])
@@ -162,14 +175,21 @@ class _Log:
         self.rows, self._spent = json.loads(state["curve"]), float(state["seconds"])
         self._write_curve()
 
-    def finish(self, task: Task, steps: int) -> Policy:
-        """Copy the two agents to their names."""
+    def finish(self, trainer: Trainer, steps: int) -> Policy:
+        """Copy the two agents to their names, and say what it took."""
         self._writer.close()
         chosen = choose(self.rows, steps)
         for name, step in chosen.items():
             with replacing(self._folder / f"{name}.safetensors") as temporary:
                 shutil.copyfile(self._policy(step), temporary)
-        return load_policy(self._folder / "expert.safetensors", task.name)
+        counts = {
+            "steps": trainer.steps,
+            "updates": trainer.agent.updates,
+            "redrawn": 0 if trainer.draws is None else trainer.draws.redrawn,
+            "diverged": trainer.episodes.simulator.diverged,
+        }
+        write_text(self._folder / COUNTS, to_json(counts) + "\n")
+        return load_policy(self._folder / "expert.safetensors", trainer.task.name)
 
     def _policy(self, step: float) -> Path:
         return self._folder / "policies" / f"{int(step)}.safetensors"

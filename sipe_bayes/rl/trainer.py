@@ -1,36 +1,36 @@
 """An agent at work: lanes of a task that act, remember and learn, in small steps that can be stopped and gone on with.
 
-The lanes are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta.
+The lanes are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta, noise and delay
+(``sipe_bayes.rl.randomization``).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.envs.task import Task
-from sipe_bayes.episodes import Episodes
+from sipe_bayes.episodes import Episodes, Step
 from sipe_bayes.inference.state import State
 from sipe_bayes.rl.ddpg import Agent
 from sipe_bayes.rl.policy import Policy
+from sipe_bayes.rl.randomization import Draws, Randomization
 from sipe_bayes.rl.replay import Batch, Replay
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
-Draw = Callable[[np.random.Generator, int], FloatArray]
-"""Parameters theta (B, N) for B episodes that begin."""
 
 
 class Trainer:
     """An agent, its replay buffer and the lanes that it acts in. ``steps`` counts control steps, of all lanes together.
 
-    draw: theta of each episode, default the published model's. demonstrations: trajectories with rewards, from which
+    randomization: what each episode draws; without one it runs in the published model. demonstrations: trajectories with rewards, from which
     ``settings.demonstration_share`` of each batch is taken.
     """
 
@@ -39,7 +39,7 @@ class Trainer:
         task: Task,
         settings: Settings,
         seed: int = 0,
-        draw: Draw | None = None,
+        randomization: Randomization | None = None,
         demonstrations: Trajectories | None = None,
         threads: int = 1,
     ) -> None:
@@ -48,18 +48,24 @@ class Trainer:
                 f"demonstration_share: {settings.demonstration_share} with demonstrations "
                 f"{'missing' if demonstrations is None else 'given'}; give both or neither"
             )
-        self.task, self.settings, self.draw = task, settings, draw
-        streams = np.random.SeedSequence(seed).spawn(4 + settings.lanes)
-        initial, self._noise, self._picks, self._draws, *lanes = (np.random.default_rng(s) for s in streams)
+        self.task, self.settings = task, settings
+        streams = np.random.SeedSequence(seed).spawn(5 + settings.lanes)
+        initial, self._noise, self._picks, self._draws, *lanes, last = (np.random.default_rng(s) for s in streams)
         size = len(task.channels)
         self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial)
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
         self.episodes = Episodes(Simulator(task, threads), task.theta("default"), lanes, allow_outside=True)
-        if draw is not None:
-            self._redraw(np.ones(settings.lanes, bool))
-            self.episodes.begin(np.ones(settings.lanes, bool))
-        self.replay.begin(self.episodes.first())
+        self.draws = None if randomization is None else Draws(self.episodes.simulator, randomization.posterior)
+        self._disturbances = None
+        if randomization is not None and randomization.disturbs:
+            middle = np.full(task.num_actions, (task.action_low + task.action_high) / 2)
+            self._disturbances = randomization.disturbances(settings.lanes, size, task.goal_size, middle, last)
+        if randomization is not None:
+            every = np.ones(settings.lanes, bool)
+            self._redraw(every)
+            self.episodes.begin(every)
+        self.replay.begin(self._seen(self.episodes.first()))
         self._over = np.zeros(settings.lanes, bool)
         self.steps, self._owed = 0, 0.0
 
@@ -68,7 +74,8 @@ class Trainer:
         settings, fresh = self.settings, self._over
         actions = self._actions()
         self._redraw(fresh)
-        step = self.episodes.step(actions)
+        sent = actions if self._disturbances is None else self._disturbances.delayed(actions, fresh)
+        step = self._seen(self.episodes.step(sent))
         self.replay.add(actions, step)
         if self.agent.normaliser is not None:
             self.agent.normaliser.update(step.observations)
@@ -90,8 +97,12 @@ class Trainer:
         generators = [self._noise, self._picks, self._draws, *self.episodes.generators]
         arrays = {name: value.copy() for name, value in self._lanes().items()}
         states = json.dumps([g.bit_generator.state for g in generators])
-        counts = {"steps": self.steps, "owed": self._owed}
-        return {**self.agent.state(), **arrays, **counts, "generators": states, "over": self._over}
+        counts = {"steps": self.steps, "owed": self._owed, "diverged": self.episodes.simulator.diverged}
+        if self.draws is not None:
+            counts["redrawn"] = self.draws.redrawn
+        disturbed = {} if self._disturbances is None else self._disturbances.state()
+        more = {f"disturbances.{name}": value for name, value in disturbed.items()}
+        return {**self.agent.state(), **arrays, **counts, **more, "generators": states, "over": self._over}
 
     def restore(self, state: State) -> None:
         self.agent.restore(state)
@@ -102,6 +113,11 @@ class Trainer:
         for generator, found in zip(generators, json.loads(state["generators"]), strict=True):
             generator.bit_generator.state = found
         self.steps, self._owed, self._over = int(state["steps"]), float(state["owed"]), np.array(state["over"])
+        self.episodes.simulator.diverged = int(state.get("diverged", 0))  # earlier versions did not count
+        if self.draws is not None:
+            self.draws.redrawn = int(state.get("redrawn", 0))
+        if self._disturbances is not None:
+            self._disturbances.restore({name: state[f"disturbances.{name}"] for name in self._disturbances.state()})
 
     def _lanes(self) -> dict[str, NDArray[Any]]:
         """The arrays that say where the lanes are."""
@@ -124,7 +140,7 @@ class Trainer:
         if self.steps < settings.start_steps:
             return self._noise.uniform(task.action_low, task.action_high, size)
         half = (task.action_high - task.action_low) / 2
-        actions = self.agent.act(self.episodes.observations)
+        actions = self.agent.act((self._disturbances or self.episodes).observations)
         actions += settings.exploration * half * self._noise.standard_normal(size)
         if settings.random_share:
             chosen = self._noise.random(lanes) < settings.random_share
@@ -133,8 +149,16 @@ class Trainer:
 
     def _redraw(self, lanes: NDArray[np.bool_]) -> None:
         chosen = np.flatnonzero(lanes)
-        if self.draw is not None and len(chosen):
-            self.episodes.set_theta(chosen, self.draw(self._draws, len(chosen)))
+        if self.draws is not None and len(chosen):
+            self.episodes.set_theta(chosen, self.draws(self._draws, len(chosen)))
+            if self._disturbances is not None:
+                self._disturbances.begin(lanes)
+
+    def _seen(self, step: Step) -> Step:
+        """A step as the agent observes it."""
+        if self._disturbances is None:
+            return step
+        return replace(step, observations=self._disturbances.noisy(step.observations))
 
     def _batch(self) -> Batch:
         count = self.settings.batch

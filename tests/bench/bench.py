@@ -25,6 +25,7 @@ import mdn
 import mujoco
 import mujoco.rollout
 import numpy as np
+import transfer
 
 import sipe_bayes.inference.laplace as laplace_module
 from sipe_bayes.calibration import prepare
@@ -218,7 +219,7 @@ def chain() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    tables = ("engine", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg")
+    tables = ("engine", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "transfer")
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
     given = parser.parse_args()
@@ -240,6 +241,8 @@ def main() -> None:
             fits.table()
         elif name == "ddpg":
             ddpg.table(max(given.pairs, 7), side_by_side)
+        elif name == "transfer":
+            transfer.table(max(given.pairs, 7), side_by_side)
         elif name == "envs":
             envs.table(max(given.pairs, 7), side_by_side)
             envs.against_parsing(max(given.pairs, 7), side_by_side)

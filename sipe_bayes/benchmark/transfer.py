@@ -1,0 +1,176 @@
+"""Sim2sim transfer: what an agent earns in the target after training where an estimator believes the target to be.
+
+B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", Section 3.4 and Figure 6
+(https://arxiv.org/abs/2011.08985). The target is an environment whose theta is hidden. Each *randomisation* is a distribution over theta;
+an agent is trained by DDPG, every episode of it under a draw of its own (``sipe_bayes.rl.randomization``), and the agent is then
+evaluated in the target as it is, zero-shot:
+
+- truth: the target itself, the oracle, by whose return the others are measured;
+- prior: uniform domain randomisation, the baseline;
+- default: the published model, what one has without calibrating;
+- an estimator's name: the posterior that the benchmark's cell TASK/ESTIMATOR/direct/VARIANT/seedK came to, as the draws that its
+  record keeps, which are particles. The cell is measured first where it is not there.
+
+All of them train with equal settings, for equally many control steps, from the same seed. Of the second half of a training that policy
+is kept which earns most in episodes of its own randomisation; the target is never looked at for it, and its curve is made afterwards.
+
+Variations of a randomisation, the truth's excepted: ``wider`` (``Posterior.wider``), ``observation_noise`` and ``action_delay``.
+
+Deviations. The paper trains on the default model's variants, which it does not name; here the target is the default or the
+in-distribution variant, whose theta no prior mean guesses. It has neither the prior nor the default model in its figure. Agents on tasks with
+goals learn with the settings of hindsight experience replay (Andrychowicz et al. 2017, https://arxiv.org/abs/1707.01495), without
+demonstrations.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sipe_bayes.benchmark.cells import PAPER, Cell, matches
+from sipe_bayes.benchmark.records import Record
+from sipe_bayes.envs.registry import TASKS, make_task
+from sipe_bayes.envs.task import Task, Variant
+from sipe_bayes.inference.registry import ESTIMATORS
+from sipe_bayes.rl.settings import Settings
+from sipe_bayes.trajectory_sets import TASKS as NINE
+
+SETTING = "transfer"
+TRUTH, PRIOR, DEFAULT = "truth", "prior", "default"
+REFERENCES = (TRUTH, PRIOR, DEFAULT)
+EPISODES = 50
+POINTS = 20  # of a learning curve, at most one for as many control steps as an episode has
+POINT_EPISODES = 10
+_VARIANTS: tuple[Variant, ...] = ("default", "in_distribution")
+_SEEDS = range(3)
+_STEPS, _GOAL_STEPS, _SMALL_STEPS = 150_000, 400_000, 20_000
+_SMALL = ("Pendulum", "CartPole")
+_STUDY = ("HalfCheetahLinks", "HalfCheetahJoints", "FetchPush")
+_SMALL_AGENT: dict[str, Any] = {
+    "hidden": (64, 64),
+    "batch": 128,
+    "learning_rate": 1e-3,
+    "start_steps": 1_000,
+    "lanes": 4,
+    "updates_per_step": 0.5,
+}
+_GOAL_AGENT: dict[str, Any] = {
+    "discount": 0.95,
+    "tau": 0.05,
+    "learning_rate": 1e-3,
+    "exploration": 0.2,
+    "start_steps": 1_000,
+    "normalise": True,
+    "lanes": 16,
+    "updates_per_step": 0.4,
+    "clip_targets": True,
+    "action_penalty": 0.1,
+    "random_share": 0.3,
+}
+
+
+@dataclass(frozen=True)
+class TransferRecord(Record):
+    """Of one agent. As ``Record``, with: estimator: the randomisation; setting: "transfer" and its variations; values: the variations;
+    mean and sd: of the randomisation, in theta; seconds: of the training. training: control steps; agent: settings that are not DDPG's
+    defaults; evaluation: ``rl.evaluation.evaluate`` of EPISODES episodes in the target, and random: the same of a policy that acts at
+    random; curve: rows of step, own_return (in simulators drawn from the randomisation), target_return and target_success; kept: the step
+    of the evaluated policy; converged: whether it solves simulators drawn from the randomisation, solved_reference: whether it solves the
+    target; redrawn: theta that no model can have, diverged: episodes, in training.
+    """
+
+    training: int = 0
+    agent: dict[str, Any] = field(default_factory=dict)
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    random: dict[str, Any] = field(default_factory=dict)
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    kept: int = 0
+    redrawn: int = 0
+    diverged: int = 0
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Cells under one name."""
+
+    about: str
+    cells: Callable[[], Iterator[Cell]]
+
+
+def cells(
+    tasks: Iterable[str],
+    randomizations: Iterable[str],
+    variants: Iterable[Variant] = _VARIANTS,
+    seeds: Iterable[int] = _SEEDS,
+) -> Iterator[Cell]:
+    """The cells of these tasks; on the default variant the default model is the truth and stands there once."""
+    for task, variant, seed, name in itertools.product(tasks, variants, seeds, list(randomizations)):
+        if not (name == DEFAULT and variant == "default"):
+            yield Cell(task, name, SETTING, variant, seed, training=_steps(task))
+
+
+def _steps(task: str) -> int:
+    if task in _SMALL:
+        return _SMALL_STEPS
+    return _GOAL_STEPS if task.startswith("Fetch") else _STEPS
+
+
+def settings(task: Task, training: int) -> Settings:
+    """How an agent learns a task in ``training`` control steps; the same for every randomisation."""
+    chosen = _GOAL_AGENT if task.goal_size else _SMALL_AGENT if task.name in _SMALL else {"start_steps": 10_000}
+    lanes = int(chosen.get("lanes", 1))
+    return Settings(
+        **{
+            **chosen,
+            "start_steps": min(chosen["start_steps"], training // 4),
+            "capacity": max(training, 2 * lanes * (task.episode_steps + 1)) + lanes,
+        }
+    )
+
+
+SUITES = {
+    "quick": Suite(
+        "Pendulum's in-distribution variant, one seed: the references, laplace and regression",
+        lambda: cells(("Pendulum",), (*REFERENCES, "laplace", "regression"), ("in_distribution",), (0,)),
+    ),
+    "study": Suite(
+        f"{', '.join(_STUDY)}: the references, the paper's estimators, npe and laplace, three seeds",
+        lambda: cells(_STUDY, (*REFERENCES, *PAPER, "npe", "laplace")),
+    ),
+    "nine": Suite(
+        "the same on the paper's nine environments", lambda: cells(NINE, (*REFERENCES, *PAPER, "npe", "laplace"))
+    ),
+    "all": Suite("every task and estimator there is; to select from", lambda: cells(TASKS, (*REFERENCES, *ESTIMATORS))),
+}
+
+
+def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
+    """The cells of a suite whose id matches one of the patterns, as of `sipe benchmark run`, all without any; raises ValueError for an
+    unknown suite and for a pattern that matches none."""
+    if name not in SUITES:
+        raise ValueError(f"--suite {name}: expected one of {', '.join(SUITES)}")
+    found = list(SUITES[name].cells())
+    for pattern in patterns:
+        if not any(matches(cell.id, pattern) for cell in found):
+            raise ValueError(
+                f"--select {pattern}: matches no cell of the suite {name}, such as {found[0].id}; see `sipe transfer cells {name}`"
+            )
+    return [cell for cell in found if not patterns or any(matches(cell.id, pattern) for pattern in patterns)]
+
+
+def varied(chosen: Sequence[Cell], **variations: float | None) -> list[Cell]:
+    """The cells with variations of their randomisation, those of the truth as they are."""
+    given = tuple((name, value) for name, value in variations.items() if value is not None)
+    return [cell if cell.estimator == TRUTH else replace(cell, values=given) for cell in chosen]
+
+
+def estimate_of(cell: Cell) -> Cell | None:
+    """The benchmark's cell whose posterior a cell randomises by, None of a reference."""
+    return None if cell.estimator in REFERENCES else replace(cell, setting="direct", values=(), training=Cell.training)
+
+
+def agent_of(cell: Cell) -> Settings:
+    """How the agent of a cell learns."""
+    return settings(make_task(cell.task), cell.training)

@@ -1,0 +1,119 @@
+"""The commands ``sipe transfer ...``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sipe_bayes.benchmark.commands import (
+    Address,
+    Jobs,
+    Out,
+    Where,
+    at_least_one,
+    command_line,
+    executor_of,
+    refusing,
+    say,
+)
+
+app = typer.Typer(
+    name="transfer",
+    help="Train agents where an estimator believes the target to be, and test them there.",
+    no_args_is_help=True,
+)
+
+
+@app.command()
+def run(
+    suite: Annotated[str, typer.Option(help="See `sipe transfer cells`.")] = "study",
+    select: Annotated[
+        list[str] | None,
+        typer.Option(help="Only ids like this one, such as 'half_cheetah*/laplace/*'; again for several."),
+    ] = None,
+    out: Out = Path("results"),
+    training: Annotated[
+        int | None,
+        typer.Option(help="Control steps of each training; default the suite's, which differ between tasks."),
+    ] = None,
+    budget: Annotated[int | None, typer.Option(help="Rollouts of each estimate; default 1000.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Control steps of an estimate's trajectory.")] = None,
+    wider: Annotated[float | None, typer.Option(help="Spread every posterior this many times as far.")] = None,
+    observation_noise: Annotated[
+        float | None, typer.Option(help="Greatest sd of the noise on observations in training, in the channels' units.")
+    ] = None,
+    action_delay: Annotated[
+        int | None, typer.Option(help="Greatest delay of actions in training, control steps.")
+    ] = None,
+    jobs: Jobs = None,
+    executor: Where = "pool",
+    address: Address = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")] = False,
+) -> None:
+    """Measure the cells of a suite that have no record yet, and first the estimates that they need; exit code 1 if one failed."""
+    with refusing("; the same command goes on"):
+        from sipe_bayes.benchmark import transfer_run
+        from sipe_bayes.benchmark.run import changed
+        from sipe_bayes.benchmark.transfer import select as chosen
+        from sipe_bayes.benchmark.transfer import varied
+
+        at_least_one(training=training, budget=budget, steps=steps, jobs=jobs, action_delay=action_delay, wider=wider)
+        if observation_noise is not None and not 0 < observation_noise < float("inf"):
+            raise ValueError(f"--observation-noise {observation_noise}: expected an sd above 0; leave it out for none")
+        cells = changed(chosen(suite, select or ()), training=training, budget=budget, steps=steps)
+        cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
+        start = executor_of(executor, jobs, address)
+        failed = transfer_run.run(cells, out, start, command_line(), retry_failed, say)
+    if failed:
+        print(f"sipe: {failed} units failed; `sipe transfer status {out}` shows why", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+@app.command()
+def status(
+    folder: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("results"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """How far a transfer is, what failed, and what each agent earns in the target."""
+    with refusing():
+        from sipe_bayes.benchmark.transfer_run import lines, summary
+        from sipe_bayes.output import to_json
+
+        found = summary(folder)
+    print(to_json(found) if as_json else "\n".join(lines(found)))
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of results, as `sipe transfer run --out` filled it.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write; default transfer/ in the same folder.")] = None,
+) -> None:
+    """transfer.md, transfer.csv, the bars of the paper's Figure 6 and learning curves."""
+    with refusing():
+        from sipe_bayes.benchmark.transfer_report import write
+
+        if out is not None and out.exists() and not out.is_dir():
+            raise ValueError(f"--out {out}: is a file, not a folder; choose another name")
+        written = write(folder, out)
+    for path in written:
+        print(path)
+
+
+@app.command()
+def cells(
+    suite: Annotated[str | None, typer.Argument(help="Without one, the suites.")] = None,
+    select: Annotated[list[str] | None, typer.Option(help="As of `sipe transfer run`.")] = None,
+) -> None:
+    """The suites, or the ids of a suite's cells."""
+    with refusing():
+        from sipe_bayes.benchmark.transfer import SUITES
+        from sipe_bayes.benchmark.transfer import select as chosen
+
+        if suite is not None:
+            found = [f"{cell.id} ({cell.training:,} control steps)" for cell in chosen(suite, select or ())]
+        else:
+            found = [f"{name}: {len(list(s.cells()))} cells; {s.about}" for name, s in SUITES.items()]
+    print("\n".join(found))

@@ -1,0 +1,175 @@
+"""Measuring one cell of the transfer: its randomisation, its agent's training, and what the agent earns in the target."""
+
+from __future__ import annotations
+
+import json
+import time
+import traceback
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sipe_bayes.benchmark.cells import Cell
+from sipe_bayes.benchmark.measure import POLICIES, versions
+from sipe_bayes.benchmark.records import RECORDS, Record, file_name, posterior_path, record_path
+from sipe_bayes.benchmark.transfer import (
+    DEFAULT,
+    EPISODES,
+    POINT_EPISODES,
+    POINTS,
+    PRIOR,
+    TRUTH,
+    TransferRecord,
+    agent_of,
+    estimate_of,
+)
+from sipe_bayes.benchmark.work import Done
+from sipe_bayes.envs.registry import make_task
+from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.posterior import Dirac, Particles, Posterior, prior
+from sipe_bayes.rl.randomization import Randomization
+from sipe_bayes.simulator import Simulator
+
+FOLDER = "transfer"  # of the records, in a folder of results
+_TARGET_SEED = 4_000_000  # of the target's episodes: other ones than those that a policy is kept by
+
+
+def run(cell: Cell, folder: Path, command: str) -> Done:
+    """Measure a cell. folder: of the results; the estimate is read from it, and the training keeps its checkpoint there."""
+    began = time.process_time()
+    record = _blank(cell, command)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            record = _measured(cell, record, folder)
+    except Exception:  # a failed cell must not stop the others
+        return _failed(record, traceback.format_exc(), time.process_time() - began)
+    cpu = time.process_time() - began
+    found = record.evaluation
+    rate = "" if found["success_rate"] is None else f", success {found['success_rate']:.2f}"
+    line = f"return {found['mean']:.1f} in the target{rate}, {record.seconds:.0f} s"
+    return Done((_json(replace(record, cpu_seconds=cpu)),), line, cpu)
+
+
+def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
+    """What a cell comes to whose process does not live to tell."""
+    return _failed(_blank(cell, command), why, 0.0)
+
+
+def _failed(record: TransferRecord, why: str, cpu: float) -> Done:
+    return Done((_json(replace(record, status="failed", traceback=why)),), why.strip().splitlines()[-1], cpu, True)
+
+
+def _json(record: TransferRecord) -> tuple[str, bytes]:
+    return f"{FOLDER}/{RECORDS}/{file_name(record.id)}.json", record.to_json().encode()
+
+
+def _blank(cell: Cell, command: str) -> TransferRecord:
+    return TransferRecord(
+        id=cell.id,
+        task=cell.task,
+        estimator=cell.estimator,
+        setting=cell.id.split("/")[2],
+        variant=cell.variant,
+        seed=cell.seed,
+        budget=cell.budget,
+        steps=cell.horizon,
+        status="done",
+        values=dict(cell.values),
+        training=cell.training,
+        agent=agent_of(cell).deviations(),
+        versions=versions(),
+        command=command,
+    )
+
+
+def randomization(cell: Cell, folder: Path) -> Randomization:
+    """What the episodes of a cell's training draw; raises ValueError where its estimate is not there, failed, or is over other
+    parameters than the environment's."""
+    task, values = make_task(cell.task), dict(cell.values)
+    posterior: Posterior
+    if cell.estimator == TRUTH:
+        posterior = Dirac(task.theta(cell.variant), task.space)
+    elif cell.estimator == PRIOR:
+        posterior = prior(task.space)
+    elif cell.estimator == DEFAULT:
+        posterior = Dirac(task.theta("default"), task.space)
+    else:
+        posterior = _estimated(cell, folder, task.space)
+    if "wider" in values and bool((posterior.stddev > 1e-9).any()):  # a point has nothing to widen
+        posterior = posterior.wider(values["wider"])
+    return Randomization(posterior, values.get("observation_noise", 0.0), int(values.get("action_delay", 0)))
+
+
+def _estimated(cell: Cell, folder: Path, space: ParameterSpace) -> Particles:
+    """The draws of a benchmark's cell."""
+    import xarray
+
+    estimate = estimate_of(cell)
+    assert estimate is not None
+    path = record_path(folder, estimate.id)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such estimate; `sipe transfer run` measures it first")
+    record = Record.read(path)
+    if not record.done:
+        why = (record.traceback or "?").strip().splitlines()[-1]
+        raise ValueError(f"the estimate {record.id} failed ({why}); mend it and run again with --retry-failed")
+    with xarray.open_dataset(posterior_path(folder, estimate.id), group="posterior", engine="h5netcdf") as data:
+        found = {str(name): np.asarray(data[name], float).reshape(-1) for name in data.data_vars}
+    if set(found) != set(space.names):
+        raise ValueError(
+            f"{record.id}: is a posterior over {', '.join(found)}, and {cell.task} has {', '.join(space.names)}; measure it again"
+        )
+    values = np.stack([found[name] for name in space.names], -1)
+    return Particles(space.normalise(values).clip(0.0, 1.0), space)
+
+
+def _measured(cell: Cell, record: TransferRecord, folder: Path) -> TransferRecord:
+    from sipe_bayes.rl import evaluation
+    from sipe_bayes.rl.loop_run import solves
+    from sipe_bayes.rl.policy import load_policy
+    from sipe_bayes.rl.train import COUNTS, choose, read_curve, train
+
+    task, own = make_task(cell.task), folder / POLICIES / file_name(cell.id)
+    drawn, every = randomization(cell, folder), max(cell.training // POINTS, task.episode_steps)
+    policy = train(
+        *(task, cell.training, cell.seed, own, agent_of(cell)),
+        resume=True,
+        randomization=drawn,
+        evaluate_every=every,
+        evaluation_episodes=POINT_EPISODES,
+        checkpoint_every=every,
+    )
+    simulator, truth = Simulator(task, num_threads=1), task.theta(cell.variant)
+
+    def earned(acting: Any, episodes: int) -> dict[str, Any]:
+        return evaluation.evaluate(acting, simulator, episodes, _TARGET_SEED, truth)
+
+    rows, curve = read_curve(own), []
+    for step, own_return, *_ in rows:
+        there = earned(load_policy(own / "policies" / f"{step}.safetensors", task.name), POINT_EPISODES)
+        row = {"step": step, "own_return": own_return, "target_return": there["mean"]}
+        curve.append({**row, "target_success": there["success_rate"]})
+    kept = choose(rows, cell.training)["expert"]
+    (mine,) = [row for row in rows if row[0] == kept]
+    found, counts = earned(policy, EPISODES), json.loads((own / COUNTS).read_text(encoding="utf-8"))
+    return replace(
+        record,
+        seconds=rows[-1][4],
+        names=list(task.space.names),
+        truth=truth.tolist(),
+        mean=drawn.posterior.mean.tolist(),
+        sd=drawn.posterior.stddev.tolist(),
+        checksums={"model": simulator.checksum(), "randomization": drawn.fingerprint},
+        evaluation=found,
+        random=earned(evaluation.random(task, cell.seed), EPISODES),
+        curve=curve,
+        kept=kept,
+        converged=solves(task, mine[1], mine[3]),
+        solved_reference=solves(task, found["mean"], found["success_rate"]),
+        redrawn=counts["redrawn"],
+        diverged=counts["diverged"],
+    )

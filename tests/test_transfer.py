@@ -1,0 +1,297 @@
+"""Sim2sim transfer: its cells, killed and resumed runs, what is refused, and what the report makes of returns."""
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from sipe_bayes.benchmark import transfer_measure
+from sipe_bayes.benchmark.cells import Cell
+from sipe_bayes.benchmark.measure import POLICIES, _netcdf
+from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
+from sipe_bayes.benchmark.transfer import SETTING, SUITES, TransferRecord, estimate_of, select, settings, varied
+from sipe_bayes.benchmark.transfer_report import bars, curves, label, relative, rows, table
+from sipe_bayes.benchmark.transfer_run import load, summary
+from sipe_bayes.cli import app
+from sipe_bayes.envs.registry import TASKS, make_task
+from sipe_bayes.posterior import Dirac, Posterior, prior
+
+SMALL = ["--suite", "quick", "--training", "600", "--budget", "60", "--steps", "20"]
+TWO = ["--select", "pendulum/truth", "--select", "pendulum/laplace"]
+TIMES = ("seconds", "cpu_seconds", "command")
+CELL = Cell("Pendulum", "laplace", SETTING, "in_distribution", 0, budget=60, steps=20, training=600)
+
+
+def sipe(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["transfer", *arguments])
+
+
+def measured(folder: Path, *arguments: str) -> Result:
+    return sipe("run", *SMALL, *arguments, "--executor", "inline", "--out", str(folder))
+
+
+def what_counts(folder: Path) -> dict[str, Any]:
+    """Records without what they took, and the bytes of the agents."""
+    found: dict[str, Any] = {}
+    for record in load(folder):
+        plain = {k: v for k, v in asdict(record).items() if k not in TIMES}
+        agents = sorted((folder / POLICIES / file_name(record.id)).rglob("*.safetensors"))
+        found[record.id] = plain, {path.name: path.read_bytes() for path in agents}
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("transfer") / "out"
+    found = measured(folder, *TWO)
+    assert found.exit_code == 0, found.output
+    return folder
+
+
+# Cells
+
+
+def test_cells() -> None:
+    study = select("study")
+    assert len({cell.id for cell in study}) == len(study)
+    assert {c.estimator for c in study} == {
+        *("truth", "prior", "default", "regression", "bayesopt", "maml", "simopt", "adr", "bayessim", "npe", "laplace")
+    }
+    assert {c.variant for c in study} == {"default", "in_distribution"}
+    assert {c.seed for c in study} == {0, 1, 2}
+    assert min(c.training for c in study) >= 150_000
+    assert not [c for c in study if (c.estimator, c.variant) == ("default", "default")]
+    assert set(SUITES) == {"quick", "study", "nine", "all"}
+    assert {c.task for c in select("all")} == set(TASKS)
+
+
+def test_the_estimates_are_the_benchmarks() -> None:
+    assert estimate_of(CELL) == replace(Cell("Pendulum", "laplace"), budget=60, steps=20)
+    assert estimate_of(replace(CELL, estimator="truth")) is None
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_every_task_has_an_agent_that_learns_within_its_training(task: str) -> None:
+    """Half of a training at least is learnt from, in a buffer that holds all of it."""
+    for training in (400, 20_000, 150_000):
+        chosen = settings(make_task(task), training)
+        assert chosen.start_steps <= training / 2
+        assert chosen.capacity // chosen.lanes > make_task(task).episode_steps
+        assert chosen.capacity >= training
+
+
+def test_variations_are_in_the_id_and_not_of_the_truth() -> None:
+    first, second = varied([replace(CELL, estimator="truth"), CELL], wider=2.0, action_delay=1, observation_noise=None)
+    assert first.id == "Pendulum/truth/transfer/in_distribution/seed0"
+    assert second.id == "Pendulum/laplace/transfer,wider=2.0,action_delay=1/in_distribution/seed0"
+    assert estimate_of(second) == estimate_of(CELL)
+
+
+# Runs
+
+
+def test_records(undisturbed: Path) -> None:
+    """The policy is kept by its own randomisation alone; estimates are the benchmark's records."""
+    found = {r.estimator: r for r in load(undisturbed)}
+    assert set(found) == {"truth", "laplace"}
+    for record in found.values():
+        assert TransferRecord.read(record_path(undisturbed / "transfer", record.id)) == record
+        assert [row["step"] for row in record.curve] == [200, 400, 600]
+        second = [row for row in record.curve if row["step"] > 400]
+        assert record.kept == max(second, key=lambda row: row["own_return"])["step"]
+        assert record.evaluation["episodes"] == record.random["episodes"] == 50
+        assert record.converged is False
+        assert not (undisturbed / POLICIES / file_name(record.id) / "checkpoint").exists()
+    assert found["truth"].mean == found["truth"].truth
+    assert found["truth"].sd == [0.0] * 3
+    direct = Record.read(record_path(undisturbed, "Pendulum/laplace/direct/in_distribution/seed0"))
+    np.testing.assert_allclose(found["laplace"].mean, direct.mean, atol=4 * max(direct.sd) / np.sqrt(2000) + 1e-12)
+    again = measured(undisturbed, *TWO)
+    assert again.output == "2 cells, 2 of them there already; 0 estimates to make first\n"
+
+
+def test_status_and_report(undisturbed: Path, tmp_path: Path) -> None:
+    found = summary(undisturbed)
+    assert (found["cells"], found["done"], found["failed"], found["missing"]) == (2, 2, {}, [])
+    assert "2 cells, 2 done, 0 failed, 0 missing" in sipe("status", str(undisturbed)).output
+    made = sipe("report", str(undisturbed), "--out", str(tmp_path))
+    assert made.exit_code == 0, made.output
+    assert {p.name for p in tmp_path.iterdir()} == {"transfer.md", "transfer.csv", "bars.png", "curves.png"}
+
+
+def test_killed_twice_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
+    """SIGKILL in the middle of each of the two trainings; what results is what an undisturbed run gives, to the last bit."""
+    out, rng = tmp_path / "out", random.Random(7)
+    command = [
+        sys.executable,
+        "-m",
+        "sipe_bayes.cli",
+        "transfer",
+        "run",
+        *SMALL,
+        *TWO,
+        "--executor",
+        "inline",
+        "--out",
+        str(out),
+    ]
+    for done in (0, 1):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        until = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < until:
+            if len(list(out.glob("policies/*/checkpoint/state.safetensors"))) and _records(out) == done:
+                break
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.2))
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        assert _records(out) == done
+    assert measured(out, *TWO).exit_code == 0
+    assert what_counts(out) == what_counts(undisturbed)
+
+
+def _records(out: Path) -> int:
+    return len(list(out.glob("transfer/records/P*.json")))
+
+
+# What is refused
+
+
+def estimated(folder: Path, posterior: Posterior, **changes: Any) -> None:
+    """The record of CELL's estimate."""
+    estimate = estimate_of(CELL)
+    assert estimate is not None
+    plain = (estimate.id, estimate.task, estimate.estimator, estimate.setting, estimate.variant, estimate.seed)
+    Record(*plain, budget=60, steps=20, **{"status": "done", **changes}).write(folder)
+    posterior_path(folder, estimate.id).write_bytes(_netcdf(posterior, 0))
+
+
+def test_a_posterior_over_other_parameters_is_refused_by_name(tmp_path: Path) -> None:
+    estimated(tmp_path, prior(make_task("CartPole").space))
+    done = transfer_measure.run(CELL, tmp_path, "")
+    assert done.failed
+    assert (
+        "is a posterior over pole_mass, pole_length, cart_friction, and Pendulum has mass, length, damping" in done.line
+    )
+
+
+def test_a_failed_or_missing_estimate_is_named(tmp_path: Path) -> None:
+    assert "no such estimate" in transfer_measure.run(CELL, tmp_path, "").line
+    estimated(
+        tmp_path, prior(make_task("Pendulum").space), status="failed", traceback="Traceback\nArithmeticError: no middle"
+    )
+    line = transfer_measure.run(CELL, tmp_path, "").line
+    assert "laplace/direct/in_distribution/seed0 failed (ArithmeticError: no middle)" in line
+
+
+def test_variations_reach_the_training(tmp_path: Path) -> None:
+    space = make_task("Pendulum").space
+    estimated(tmp_path, Dirac([0.2, 0.3, 0.4], space))
+    (cell,) = varied([CELL], wider=2.0, observation_noise=0.1, action_delay=2)
+    drawn = transfer_measure.randomization(cell, tmp_path)
+    assert (drawn.observation_noise, drawn.action_delay) == (0.1, 2)
+    np.testing.assert_allclose(drawn.posterior.mean, [0.2, 0.3, 0.4], atol=1e-12)  # a point has nothing to widen
+    estimated(tmp_path, prior(space))
+    assert not np.allclose(
+        transfer_measure.randomization(cell, tmp_path).posterior.sample((5,)),
+        transfer_measure.randomization(CELL, tmp_path).posterior.sample((5,)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--suite", "studies"], ["--suite studies", "quick, study, nine, all"]),
+        (["--select", "pendulum/truht"], ["pendulum/truht", "sipe transfer cells quick"]),
+        (["--training", "0"], ["--training 0"]),
+        (["--wider", "0.5"], ["--wider 0.5", "at least 1"]),
+        (["--observation-noise", "-1"], ["--observation-noise -1"]),
+        (["--executor", "slurm"], ["pool, ray or inline"]),
+        (["--out", "/dev/null"], ["is a file"]),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], words: list[str], tmp_path: Path) -> None:
+    given = ["--suite", "quick"] if "--suite" not in arguments else []
+    out = ["--out", str(tmp_path)] if "--out" not in arguments else []
+    refused(sipe("run", *given, *arguments, *out), *words)
+
+
+def refused(found: Result, *words: str) -> None:
+    assert found.exit_code == 2, found.output
+    assert found.stderr.count("\n") == 1, found.stderr
+    for word in words:
+        assert word in found.stderr
+
+
+def test_results_of_another_kind_are_left_alone(undisturbed: Path, tmp_path: Path) -> None:
+    other = replace(load(undisturbed)[0], training=601)
+    other.write(tmp_path / "transfer")
+    refused(measured(tmp_path, *TWO), "with training 601 and not 600", "choose another folder")
+    refused(sipe("status", str(tmp_path / "nowhere")), "no transfer was started")
+    refused(sipe("report", str(tmp_path / "nowhere")), "holds no transfer")
+
+
+# What the report makes of returns
+
+
+def record(name: str, seed: int, earned: float, task: str = "HalfCheetahLinks", **changes: Any) -> TransferRecord:
+    cell = Cell(task, name, SETTING, "in_distribution", seed)
+    plain = (cell.id, task, name, SETTING, "in_distribution", seed)
+    evaluation = {"episodes": 50, "mean": earned, "sd": 1.0, "success_rate": None}
+    curve = [{"step": s, "own_return": 0.0, "target_return": earned * s, "target_success": None} for s in (1, 2)]
+    more: dict[str, Any] = {
+        "evaluation": evaluation,
+        "random": {"mean": 100.0},
+        "curve": curve,
+        "seconds": 1.0,
+        **changes,
+    }
+    return TransferRecord(*plain, budget=60, steps=20, status="done", **more)
+
+
+def test_percentages_and_their_bootstrap() -> None:
+    """Of two seeds a resample has the mean of either alone in one case of four, so the interval ends there."""
+    value, interval = relative(np.array([300.0, 700.0]), np.array([1100.0, 1100.0]), 100.0)
+    assert value == pytest.approx(40.0)
+    assert interval == pytest.approx((20.0, 60.0))
+    assert relative(np.array([300.0]), np.array([500.0]), 100.0) == (50.0, None)
+    paired = relative(np.array([100.0, 1000.0]), np.array([200.0, 2000.0]), 0.0)
+    assert paired[1] == pytest.approx((50.0, 50.0)), "a seed's agent and oracle are drawn together"
+
+
+def test_rows_and_table() -> None:
+    oracle = [record("truth", k, 1100.0) for k in range(3)]
+    given = [*oracle, *(record("adr", k, 600.0 + 100 * k) for k in range(2)), record("prior", 0, 350.0)]
+    adr_wider = record("adr", 0, 1100.0, values={"wider": 2.0})
+    given.append(replace(adr_wider, setting="transfer,wider=2.0"))
+    given.append(replace(record("npe", 0, 0.0), status="failed", evaluation={}))
+    found = {row.name: row for row in rows(given)}
+    assert list(found) == ["truth", "prior", "adr", "adr, wider=2.0"]
+    assert found["truth"].percent == found["adr, wider=2.0"].percent == 100
+    assert found["prior"].percent == 25
+    assert found["adr"].percent == 55
+    assert found["adr"].paper == pytest.approx(100 * 650 / 1100)
+    assert label(given[-2]) == "adr, wider=2.0"
+    text = table(rows(given), given)
+    assert "| adr | 2 | 650.0 ± 50.0 | 55 (50 to 60) | 59 (55 to 64) |" in text
+    for figure in (bars(rows(given)), curves(given)):
+        assert {t.get_text() for t in figure.legends[0].get_texts()} >= {"truth (oracle)", "prior (uniform)", "adr"}
+    heights = sorted(p.get_height() for p in bars(rows(given)).axes[0].patches)
+    assert heights == [25, 55, 100]
+
+
+def test_negative_returns_and_a_missing_oracle() -> None:
+    """Where returns are negative the paper's percentage means nothing and is left out; without an oracle there is none at all."""
+    given = [record("truth", 0, -200.0, random={"mean": -1200.0}), record("adr", 0, -700.0, random={"mean": -1200.0})]
+    found = rows(given)
+    assert [(row.percent, row.paper) for row in found] == [(100.0, None), (50.0, None)]
+    (alone,) = rows([record("adr", 0, 700.0)])
+    assert (alone.percent, alone.paper, alone.interval) == (None, None, None)
