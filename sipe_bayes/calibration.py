@@ -189,7 +189,7 @@ def _doubts(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> t
     return tuple(doubts)
 
 
-def _method(
+def method_of(
     problem: Problem,
     estimator: str | None,
     seed: int | None,
@@ -197,6 +197,7 @@ def _method(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> Estimator:
+    """The configuration's estimator; what is given overrides it."""
     config = problem.config
     name = estimator or config.estimator
     takes = estimator_class(name).searches
@@ -225,7 +226,7 @@ def calibrate(
 ) -> Calibration:
     """Fit, check and summarise. Estimator, seed and budget override the configuration's."""
     began = time.monotonic()
-    method = _method(problem, estimator, seed, budget, checkpoint, progress)
+    method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
 
     def tell(what: str) -> None:
@@ -400,7 +401,7 @@ def run(
     Every input is checked before the folder is touched. The same call after an interruption resumes."""
     problem = prepare(config, num_threads)
     name = estimator or problem.config.estimator
-    _method(problem, name, seed, budget)
+    method_of(problem, name, seed, budget)
     problem.likelihood.bind(problem.simulator, problem.train)
     if problem.holdout is not None:
         Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.holdout)

@@ -10,6 +10,8 @@ import typer
 
 from sipe_bayes import data_commands
 from sipe_bayes.benchmark import commands as benchmark_commands
+from sipe_bayes.benchmark import transfer_commands
+from sipe_bayes.diagnostics import check_commands, suggest_commands
 from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.rl import commands as rl_commands
 
@@ -25,7 +27,10 @@ app = typer.Typer(
 )
 app.add_typer(data_commands.app)
 app.add_typer(benchmark_commands.app)
+app.add_typer(transfer_commands.app)
 app.command()(benchmark_commands.simulate)
+app.command()(check_commands.check)
+app.command()(suggest_commands.suggest)
 app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 CHECKPOINT = "checkpoint.safetensors"
 RUN = "run.json"
+RANDOMIZATION = "randomization"
+_RANDOMIZATION_DRAWS = 100  # in the generated code
 _PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
 
 
@@ -103,6 +105,7 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
     """Fill the folder of a finished run; its ``run.json`` comes last and says so."""
     from sipe_bayes.diagnostics.report import write_report
     from sipe_bayes.envs.export import ExportError, write_identified
+    from sipe_bayes.envs.randomization_code import write_randomization
 
     calibration.posterior.save(folder / "posterior")
     with replacing(folder / "posterior.nc") as temporary:
@@ -112,6 +115,8 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
         calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
     except ExportError as error:
         calibration.warnings.append(str(error))
+    draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=_generator())
+    write_randomization(problem.environment, draws, folder / RANDOMIZATION)
     randomization = domain_randomization(calibration, problem)
     write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
     write_report(calibration, folder)
@@ -122,7 +127,8 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, Any]:
     """What a policy trainer samples from: each parameter's normal in its unit, its bounds, and the covariance.
 
-    ``targets`` says what the value is multiplied by for each target that it is written to."""
+    ``targets`` says what the value is multiplied by for each target that it is written to, ``posterior`` which saved posterior beside the
+    file the normal stands for (``sipe_bayes.rl.randomization.load_randomization`` reads it)."""
     import numpy as np
 
     space = problem.environment.space
@@ -143,7 +149,7 @@ def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str
         for p, s in zip(calibration.parameters, space, strict=True)
     ]
     covariance = np.atleast_2d(np.cov(draws.T))
-    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist()}
+    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "posterior": "posterior"}
 
 
 def _generator() -> Any:

@@ -22,6 +22,8 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli import app
+from sipe_bayes.posterior import load_posterior
+from sipe_bayes.rl.randomization import Randomization, load_randomization
 
 MODEL = """\
 <mujoco model="pendulum">
@@ -371,7 +373,7 @@ def test_output_folder(finished: tuple[Path, Path, Any]) -> None:
     names = {p.name for p in out.iterdir()}
     assert names == {
         *("checkpoint.safetensors", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
-        *("identified.xml", "domain_randomization.json", "result.json", "report.html", "figures"),
+        *("identified.xml", "domain_randomization.json", "randomization", "result.json", "report.html", "figures"),
     }
     assert list((out / "figures").iterdir())
     assert strict_json((out / "result.json").read_text()) == strict_json(result.stdout)
@@ -424,6 +426,8 @@ def test_domain_randomization(finished: tuple[Path, Path, Any]) -> None:
     np.testing.assert_array_equal(covariance, covariance.T)
     # two sets of 4000 draws of a normal: relative error of an sd 0.011 each, 6 standard errors
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [p["sd"] for p in parameters], rtol=0.1)
+    read = load_randomization(out / "domain_randomization.json")
+    assert read.fingerprint == Randomization(load_posterior(out / "posterior")).fingerprint
 
 
 def test_same_run_comes_back_and_another_seed_is_refused(finished: tuple[Path, Path, Any]) -> None:

@@ -71,3 +71,18 @@ def test_dead_parameters_and_ranges_are_found() -> None:
     windows = Segments(0.5).bind(simulator, Trajectories.stack(trajectory))
     dead = dead_ranges(windows, np.array([0.4, 0.3, 0.5, 0.5]))
     assert dead == {"wind": [(0.0, 1.0)]}
+
+
+def test_ridges_carry_units() -> None:
+    """A quotient has its parameters' units, a sum's factors what makes its terms alike."""
+    space = ParameterSpace([Parameter("force", 0.5, 4.0, unit="N"), Parameter("mass", 0.5, 4.0, unit="kg")])
+    rng = np.random.default_rng(0)
+    mass = rng.uniform(1.0, 2.5, 4000)
+    quotient = np.stack([1.5 * mass * np.exp(0.01 * rng.standard_normal(4000)), mass], 1)
+    (found,) = ridges(space, quotient, [0.3, 0.3])
+    assert " N/kg is determined" in found.text, found.text
+    assert found.text.startswith("force / mass = 1."), found.text
+    total = np.stack([3.0 - 0.8 * mass + 0.003 * rng.standard_normal(4000), mass], 1)
+    (found,) = ridges(space, total, [0.3, 0.3])
+    assert "N/kg" in found.text or "kg/N" in found.text, found.text
+    assert found.text.split("±")[1].split(" is determined")[0].endswith((" N", " kg")), found.text

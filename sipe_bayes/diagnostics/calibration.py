@@ -45,7 +45,7 @@ LEVELS = np.arange(1, 100) / 100
 FALSE_ALARMS = 0.01  # of one check of all parameters
 _SHOWN = 0.9  # the interval that sentences speak of
 _SIMULATED = 4000
-_FEWEST = 20
+FEWEST = 20
 
 
 @dataclass(frozen=True)
@@ -160,14 +160,21 @@ def check_calibration(
 ) -> CalibrationCheck:
     """Check R posteriors against their truths (R, N) in theta, drawn from the prior. The same seed gives the same answer.
     Raises ValueError for fewer than 20 pairs or other shapes."""
-    names = _names(posteriors)
-    theta = np.asarray(truths, float)
-    if theta.shape != (len(posteriors), len(names)) or not np.isfinite(theta).all():
-        raise ValueError(f"truths: expected finite theta ({len(posteriors)}, {len(names)}), got shape {theta.shape}")
-    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    names, generator = _names(posteriors), torch.Generator().manual_seed(seed)
     points = [posterior.sample((draws,), generator=generator).numpy() for posterior in posteriors]
-    ranks = np.stack([_mass(drawn, truth, rng) for drawn, truth in zip(points, theta, strict=True)])
-    tarp = tarp_values(points, theta, rng.random(theta.shape), rng)
+    return check_draws(names, points, truths, seed=seed)
+
+
+def check_draws(names: tuple[str, ...], draws: Sequence[FloatArray], truths: Any, *, seed: int = 0) -> CalibrationCheck:
+    """As ``check_calibration``, of R sets of draws (M, N) of the posteriors of the parameters ``names``."""
+    theta = np.asarray(truths, float)
+    if len(draws) < FEWEST:
+        raise ValueError(f"posteriors: expected at least {FEWEST} of as many truths, got {len(draws)}")
+    if theta.shape != (len(draws), len(names)) or not np.isfinite(theta).all():
+        raise ValueError(f"truths: expected finite theta ({len(draws)}, {len(names)}), got shape {theta.shape}")
+    rng = np.random.default_rng(seed)
+    ranks = np.stack([_mass(drawn, truth, rng) for drawn, truth in zip(draws, theta, strict=True)])
+    tarp = tarp_values(draws, theta, rng.random(theta.shape), rng)
     return CalibrationCheck(
         names,
         tuple(uniformity(column) for column in ranks.T),
@@ -238,9 +245,7 @@ def _tails(found: Uniformity) -> str:
 
 
 def _names(posteriors: Sequence[Posterior]) -> tuple[str, ...]:
-    if len(posteriors) < _FEWEST:
-        raise ValueError(f"posteriors: expected at least {_FEWEST} of as many truths, got {len(posteriors)}")
     names = {posterior.space.names for posterior in posteriors}
     if len(names) > 1:
         raise ValueError(f"posteriors: expected the same parameters in all, got {sorted(names)}")
-    return names.pop()
+    return names.pop() if names else ()

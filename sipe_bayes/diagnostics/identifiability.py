@@ -92,16 +92,19 @@ def _describe(space: ParameterSpace, draws: FloatArray, members: list[int]) -> R
     if eigenvalue > _NARROW:
         return None
     kept = np.flatnonzero(loadings > _MEMBER)
-    names = [space[members[k]].name for k in kept]
+    names, units = ([getattr(space[members[k]], what) for k in kept] for what in ("name", "unit"))
     combined = x[:, kept] @ weights[kept]
     if kind == "product":
         sign = np.prod(np.sign(chosen[0, kept]))
         value = float(np.exp(combined.mean()))
         width, text, value = value * float(combined.std()), _product(names, weights[kept]), sign * value
+        unit = _product(units, weights[kept]).replace(" / ", "/").replace(" * ", " ")
     else:
-        value, width, text = float(combined.mean()), float(combined.std()), _sum(names, weights[kept])
+        unit = units[int(np.argmax(loadings[kept]))]
+        value, width, text = float(combined.mean()), float(combined.std()), _sum(names, weights[kept], units, unit)
+    unit = f" {unit}" if unit not in ("", "1") else ""
     alone = " and ".join(names) if len(names) == 2 else ", ".join(names[:-1]) + " and " + names[-1]
-    return Ridge(f"{text} = {value:.4g} ± {width:.1g} is determined; {alone} alone are not", tuple(names))
+    return Ridge(f"{text} = {value:.4g} ± {width:.1g}{unit} is determined; {alone} alone are not", tuple(names))
 
 
 def _narrowest(x: FloatArray) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
@@ -114,15 +117,24 @@ def _narrowest(x: FloatArray) -> tuple[float, tuple[float, ...], tuple[float, ..
 
 
 def _product(names: Sequence[str], weights: FloatArray) -> str:
+    """Names, or units of which some are empty, with their powers."""
+
     def factor(name: str, power: float) -> str:
         return name if abs(power - 1) < 0.05 else f"{name}^{power:.2g}"
 
-    above = [factor(n, w) for n, w in zip(names, weights, strict=True) if w > 0]
-    below = [factor(n, -w) for n, w in zip(names, weights, strict=True) if w < 0]
+    above = [factor(n, w) for n, w in zip(names, weights, strict=True) if w > 0 and n]
+    below = [factor(n, -w) for n, w in zip(names, weights, strict=True) if w < 0 and n]
     text = " * ".join(above) or "1"
     return f"{text} / {below[0] if len(below) == 1 else '(' + ' * '.join(below) + ')'}" if below else text
 
 
-def _sum(names: Sequence[str], weights: FloatArray) -> str:
-    terms = [f"{'+' if w > 0 else '-'} {abs(w):.3g} {n}" for n, w in zip(names, weights, strict=True)]
+def _sum(names: Sequence[str], weights: FloatArray, units: Sequence[str], unit: str) -> str:
+    """Terms that all have ``unit``: a factor has the unit that its parameter lacks."""
+
+    def factor(weight: float, own: str) -> str:
+        number = "" if abs(weight - 1) < 5e-4 else f"{weight:.3g} "
+        return number if own == unit else f"({number or '1 '}{unit or '1'}/{own or '1'}) "
+
+    rows = zip(names, weights, units, strict=True)
+    terms = [f"{'+' if w > 0 else '-'} {factor(abs(w), own)}{n}" for n, w, own in rows]
     return " ".join(terms).removeprefix("+ ")

@@ -1,0 +1,146 @@
+"""What a planned experiment would tell of the parameters, before it is done.
+
+At theta the simulation of the planned commands is linearised as ``laplace`` would linearise the log, windows' starts unknown and
+marginalised, noise as given; what is left is the Fisher information I(theta) = J' V^-1 J of the parameters alone. With the present
+knowledge, a normal of precision P, the experiment leaves the covariance (P + I)^-1: D. Lindley 1956, "On a measure of the information
+provided by an experiment" (https://doi.org/10.1214/aoms/1177728069); K. Chaloner, I. Verdinelli 1995, "Bayesian experimental design: a
+review" (https://doi.org/10.1214/ss/1177009939), whose A-criterion, averaged over draws of theta, this is, in sds.
+
+Deviations: the noise's own uncertainty is left out; the expectation is linear in theta at each draw, so that contacts that are made or
+missed between draws show only in their average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.diagnostics.identifiability import ridges
+from sipe_bayes.diagnostics.result import Ridge
+from sipe_bayes.likelihood import Segments
+from sipe_bayes.noise import Noise, eliminate
+from sipe_bayes.posterior import GaussianMixture, Posterior
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+
+FloatArray = NDArray[np.float64]
+
+NOT_DETERMINED = 0.5  # contraction below which a parameter is not determined
+_IDLE = 1e-6  # contraction below which the experiment does not touch a parameter
+_FLAT_PRECISION = 0.01  # sd 10 in units of the cube
+_DRAWS = 4000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An experiment: actions (T, A) held dt seconds each, from the state ``start`` (S,), default the model's own."""
+
+    actions: FloatArray
+    dt: float
+    start: FloatArray | None = None
+    name: str = "planned"
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a plan is expected to leave. contraction (N,): of each parameter's sd; covariance (N, N) in theta; ridges in words; idle:
+    parameters that it never excites."""
+
+    names: tuple[str, ...]
+    contraction: FloatArray
+    covariance: FloatArray
+    ridges: list[Ridge]
+    idle: tuple[str, ...]
+
+    def sentences(self) -> list[str]:
+        """What the plan would not determine, in words; none where it determines all."""
+        words = [f"{name} is never excited: its posterior will be what is known now" for name in self.idle]
+        words += [ridge.text.replace(" is determined;", " would be determined;") for ridge in self.ridges]
+        told = {*self.idle, *(name for ridge in self.ridges for name in ridge.parameters)}
+        words += [
+            f"{name} would not be determined (expected contraction {c:.2f})"
+            for name, c in zip(self.names, self.contraction, strict=True)
+            if c < NOT_DETERMINED and name not in told
+        ]
+        return words
+
+
+def information(
+    simulator: Simulator, likelihood: Segments, plan: Plan, noise: Noise, theta: FloatArray
+) -> FloatArray | None:
+    """Fisher information (N, N) of a plan at theta (N,), under ``noise`` of the fitted channels; None where the simulation diverges."""
+    start = simulator.default_state() if plan.start is None else plan.start
+    motion = simulator.rollout(theta[None], plan.actions[None], start[None], plan.dt, [plan.name])
+    if motion.states is None or not motion.valid.all():
+        return None
+    log = Trajectory(
+        motion.observations[0], plan.actions, plan.dt, motion.states[0], plan.name, simulator.environment.channels
+    )
+    windows = likelihood.bind(simulator, Trajectories.stack(log))
+    found = windows.linearise(theta, windows.no_starts())
+    if not found.valid:
+        return None
+    normal = windows.moments(found).normal(noise)
+    arrow = eliminate(normal, windows.num_theta, windows.start_precision, windows.no_starts())
+    return arrow.precision
+
+
+def informations(
+    simulator: Simulator, likelihood: Segments, plan: Plan, noise: Noise, thetas: FloatArray
+) -> list[FloatArray]:
+    """Of each of thetas (M, N) where the simulation does not diverge."""
+    found = (information(simulator, likelihood, plan, noise, theta) for theta in thetas)
+    return [one for one in found if one is not None]
+
+
+def knowledge(known: Posterior) -> FloatArray:
+    """Precision (N, N) of the normal with a posterior's covariance."""
+    covariance = known.covariance.numpy()
+    return np.asarray(np.linalg.inv(covariance + 1e-12 * np.eye(len(covariance))))
+
+
+def contraction(precision: FloatArray, found: Sequence[FloatArray]) -> FloatArray:
+    """Expected 1 - sd afterwards / sd now (N,), averaged over the informations ``found`` (M of (N, N))."""
+    now = np.sqrt(np.diag(np.linalg.inv(precision)))
+    after = [np.sqrt(np.diag(np.linalg.inv(precision + one))) for one in found]
+    return np.asarray(np.mean([1 - sd / now for sd in after], axis=0))
+
+
+def expect(
+    simulator: Simulator,
+    likelihood: Segments,
+    plan: Plan,
+    noise: Noise,
+    known: Posterior,
+    *,
+    draws: int = 8,
+    seed: int = 0,
+) -> Expectation:
+    """What ``plan`` is expected to tell beyond what is ``known``, the prior or a posterior, at ``draws`` draws of it. Raises
+    ValueError where all of them diverge."""
+    thetas = known.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
+    found = informations(simulator, likelihood, plan, noise, thetas)
+    if not found:
+        raise ValueError(
+            f"plan: {plan.name!r} diverges at all {draws} draws; make its commands smaller, or narrow the bounds"
+        )
+    precision, middle = knowledge(known), np.median(thetas, axis=0)
+    gain = contraction(precision, found)
+    centre = information(simulator, likelihood, plan, noise, middle)
+    centre = found[0] if centre is None else centre
+    covariance = np.asarray(np.linalg.inv(precision + centre), np.float64)
+    open_covariance = np.linalg.inv(centre + _FLAT_PRECISION * np.eye(len(middle)))
+    normal = GaussianMixture([0.0], middle[None], open_covariance[None], known.space)
+    values = normal.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
+    names = known.space.names
+    return Expectation(
+        names,
+        gain,
+        covariance,
+        ridges(known.space, values, gain.tolist()),
+        tuple(name for name, c in zip(names, gain, strict=True) if c < _IDLE),
+    )

@@ -1,0 +1,171 @@
+"""Which experiment next? Candidate command sequences ranked by what they are expected to tell of the parameters asked for.
+
+For each candidate, the contraction of each parameter's sd that its Fisher information promises (``diagnostics.expected``), averaged
+over draws of what is known now and over the parameters asked for. Candidates are given, or generated within each actuator's limits:
+
+- chirps: the frequency goes from one end of the band to the other, up or down, by equal factors in equal times;
+- band-limited noise: white noise through a Butterworth band-pass filter of second order, scaled to its largest value;
+- sums of sines of random phases, as many as the band holds multiples of 1 / duration, at most ten (M. Schroeder 1970, "Synthesis of
+  low-peak-factor signals", https://doi.org/10.1109/TIT.1970.1054411, chooses phases; here they are drawn).
+
+A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at a draw counts
+there as telling nothing. What each candidate makes the measured quantities reach is stated, for whether the machine may go there is not
+known here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.signal
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
+from sipe_bayes.likelihood import Segments
+from sipe_bayes.noise import Noise
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.simulator import Simulator
+
+FloatArray = NDArray[np.float64]
+
+KINDS = ("chirp up", "chirp down", "noise", "sines")
+_SIZES = (1.0, 0.5, 0.25)  # of the limits
+_MOST_SINES = 10
+_EDGE = 0.05  # of the duration, at either end
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A plan and its worth: score, the mean over the parameters asked for of contraction (N,); reach: lowest and highest value of
+    each channel over the draws (C, 2); diverged: at how many of the draws."""
+
+    plan: Plan
+    score: float
+    contraction: FloatArray
+    reach: FloatArray
+    diverged: int
+
+
+def rank(
+    simulator: Simulator,
+    likelihood: Segments,
+    plans: Sequence[Plan],
+    noise: Noise,
+    known: Posterior,
+    names: Sequence[str] = (),
+    *,
+    draws: int = 4,
+    seed: int = 0,
+    tell: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Suggestion]:
+    """Plans, the most telling first, of the parameters ``names``, default all. noise: of the fitted channels; known: the prior, or the
+    posterior so far, of which ``draws`` are drawn. Raises ValueError for unknown names."""
+    space = known.space
+    unknown = [name for name in names if name not in space.names]
+    if unknown:
+        raise ValueError(f"names: no parameter {unknown[0]!r}; there are {', '.join(space.names)}")
+    wanted = [space.index(name) for name in names or space.names]
+    thetas = known.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
+    precision, found = knowledge(known), []
+    nothing = np.zeros((len(space), len(space)))
+    for number, plan in enumerate(plans):
+        tell(number, len(plans))
+        told = informations(simulator, likelihood, plan, noise, thetas)
+        lost = draws - len(told)
+        gain = contraction(precision, told + [nothing] * lost)
+        found.append(Suggestion(plan, float(gain[wanted].mean()), gain, _reach(simulator, plan, thetas), lost))
+    return sorted(found, key=lambda one: -one.score)
+
+
+def _reach(simulator: Simulator, plan: Plan, thetas: FloatArray) -> FloatArray:
+    start = simulator.default_state() if plan.start is None else plan.start
+    motion = simulator.rollout(thetas, plan.actions[None], start[None], plan.dt, [plan.name] * len(thetas))
+    seen = np.where(motion.valid[..., None], motion.observations, np.nan)
+    return np.stack([np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))], axis=1)
+
+
+def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArray:
+    """Lowest and highest command (A, 2): the model's control ranges, else what was commanded before, (..., A); raises ValueError where
+    neither tells."""
+    environment, model = simulator.environment, simulator.model
+    found = np.full((environment.num_actions, 2), np.nan)
+    names = getattr(environment, "actuators", None)
+    for j in range(environment.num_actions):
+        actuator = model.actuator(names[j]).id if names is not None else None
+        if actuator is not None and model.actuator_ctrllimited[actuator]:
+            found[j] = model.actuator_ctrlrange[actuator]
+        elif recorded is not None:
+            most = float(np.abs(recorded[..., j]).max())
+            found[j] = -most, most
+    if not (found[:, 0] < found[:, 1]).all():
+        raise ValueError(
+            "limits: the model states no control range and no log has commands; give low and high for each actuator"
+        )
+    return found
+
+
+def generate(
+    count: int, duration: float, dt: float, bounds: FloatArray, band: tuple[float, float], seed: int = 0
+) -> list[Plan]:
+    """``count`` plans of ``duration`` seconds, dt apart, within bounds (A, 2), of frequencies in ``band`` (Hz): the kinds in turn, sizes
+    in turn. Raises ValueError for a band that the duration or dt cannot hold."""
+    low, high = band
+    steps = round(duration / dt)
+    if not 1 / duration <= low < high < 0.5 / dt:
+        raise ValueError(
+            f"band: expected {1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s steps, got {low:g} "
+            f"and {high:g}"
+        )
+    rng = np.random.default_rng(seed)
+    time = np.asarray(np.arange(steps) * dt, np.float64)
+    edge = np.clip(np.minimum(time, time[-1] - time) / (_EDGE * duration), 0.0, 1.0)
+    plans = []
+    for number in range(count):
+        kind, size = KINDS[number % len(KINDS)], _SIZES[number // len(KINDS) % len(_SIZES)]
+        waves = np.stack([_wave(kind, time, low, high, rng) for _ in bounds], axis=1)
+        middle, half = bounds.mean(1), np.diff(bounds, axis=1)[:, 0] / 2
+        rest = np.clip(0.0, bounds[:, 0], bounds[:, 1])
+        actions = rest + edge[:, None] * (middle - rest + size * half * waves)
+        plans.append(Plan(actions, dt, name=f"{kind}, {size:g} of the limits, {number}"))
+    return plans
+
+
+def _wave(kind: str, time: FloatArray, low: float, high: float, rng: np.random.Generator) -> FloatArray:
+    """One actuator's wave (T,) within -1 and 1."""
+    phase = rng.uniform(0, 2 * np.pi)
+    if kind.startswith("chirp"):
+        ends = (low, high) if kind.endswith("up") else (high, low)
+        ratio = ends[1] / ends[0]
+        swept = ends[0] * time[-1] / np.log(ratio) * (ratio ** (time / time[-1]) - 1)
+        return np.asarray(np.sin(2 * np.pi * swept + phase))
+    if kind == "noise":
+        dt = time[1] - time[0]
+        sections = scipy.signal.butter(2, [low, high], "bandpass", fs=1 / dt, output="sos")
+        wave = scipy.signal.sosfiltfilt(sections, rng.standard_normal(len(time)), padlen=0)
+    else:
+        multiples = np.arange(np.ceil(low * time[-1]), np.floor(high * time[-1]) + 1)
+        chosen = rng.choice(multiples, min(_MOST_SINES, len(multiples)), replace=False) / time[-1]
+        wave = np.sin(2 * np.pi * chosen * time[:, None] + rng.uniform(0, 2 * np.pi, len(chosen))).sum(1)
+    return np.asarray(wave / np.abs(wave).max())
+
+
+def to_dict(found: Sequence[Suggestion], simulator: Simulator, names: Sequence[str]) -> dict[str, Any]:
+    """Plain data, the best first."""
+    space, channels = simulator.space, simulator.environment.channels
+    return {
+        "parameters": list(names or space.names),
+        "candidates": [
+            {
+                "name": one.plan.name,
+                "score": one.score,
+                "contraction": dict(zip(space.names, one.contraction.tolist(), strict=True)),
+                "reach": dict(zip(channels, one.reach.tolist(), strict=True)),
+                "diverged": one.diverged,
+            }
+            for one in found
+        ],
+    }

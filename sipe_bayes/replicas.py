@@ -1,0 +1,85 @@
+"""Replicas of recorded trajectories: the same experiment simulated at a known theta, with the noise that the recording has.
+
+Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white or
+first-order autoregressive in each channel. The commands are replayed open loop: where a feedback law kept the machine on its
+course, a replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from sipe_bayes.callable_simulator import CallableSimulator
+from sipe_bayes.likelihood import Segments, first_states
+from sipe_bayes.noise import Noise
+from sipe_bayes.noise_level import noise_level
+from sipe_bayes.simulator import Simulator
+from sipe_bayes.trajectory import Trajectories, Trajectory
+
+FloatArray = NDArray[np.float64]
+
+
+def observation_noise(diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments) -> Noise:
+    """Noise of all O channels: what an estimator's ``diagnostics`` say of the channels that it fitted, ``noise_level`` of the
+    others, as white."""
+    sd = noise_level(trajectories, likelihood)
+    tau = np.zeros(len(sd))
+    fitted = list(range(len(sd)))
+    if likelihood.fit is not None and trajectories.channels:
+        fitted = [trajectories.channels.index(name) for name in likelihood.fit]
+    if len(diagnostics.get("noise_sd", ())) == len(fitted):
+        sd[fitted], tau[fitted] = diagnostics["noise_sd"], diagnostics.get("noise_tau", np.zeros(len(fitted)))
+    return Noise(sd, tau)
+
+
+class Replicas:
+    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels)."""
+
+    def __init__(self, simulator: Simulator | CallableSimulator, trajectories: Trajectories, noise: Noise) -> None:
+        self.simulator, self.trajectories, self.noise = simulator, trajectories, noise
+        self.starts = _starts(simulator, trajectories)
+
+    def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
+        """One replica of every trajectory at theta (N,), with states where the recording has them; None where one diverges."""
+        log = self.trajectories
+        motion = self.simulator.replay(theta[None], log, self.starts)
+        inside = np.arange(motion.valid.shape[1]) <= log.length[:, None]
+        if not (motion.valid | ~inside).all():
+            return None
+        noise = np.stack([self._drawn(len(row), float(dt), rng) for row, dt in zip(inside, log.dt, strict=True)])
+        if isinstance(self.simulator, CallableSimulator):
+            noise[:, 0] = 0.0  # x is the second sample
+        seen = np.where(np.isfinite(log.observations), motion.observations + noise, np.nan)
+        items = []
+        for k, recorded in enumerate(log):
+            n = len(recorded) + 1
+            states = None if recorded.states is None or motion.states is None else motion.states[k, :n]
+            items.append(Trajectory(seen[k, :n], recorded.actions, recorded.dt, states, recorded.name, log.channels))
+        return Trajectories.stack(items)
+
+    def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
+        """Noise (count, O) of samples dt seconds apart."""
+        white = rng.standard_normal((count, len(self.noise.sd)))
+        out = np.empty_like(white)
+        for c, (sd, tau) in enumerate(zip(self.noise.sd, self.noise.tau, strict=True)):
+            a = float(np.exp(-dt / tau)) if tau > 0 else 0.0
+            scaled = white[:, c] * np.sqrt(1 - a**2)
+            scaled[0] = white[0, c]
+            out[:, c] = sd * scipy.signal.lfilter([1.0], [1.0, -a], scaled)
+        return out
+
+
+def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
+    """Starting states (R, S); where they are not recorded, a delayed actuator's commands before the log are its first ones."""
+    starts = first_states(simulator, trajectories)
+    if isinstance(simulator, CallableSimulator) or trajectories.states is not None:
+        return starts
+    starts[:, 0] = 0.0
+    past = [actions[:1] for actions in trajectories.actions]
+    timestep = np.array([simulator.physics_steps(float(dt))[1] for dt in trajectories.dt])
+    return simulator.environment.history(simulator.model, starts, past, timestep)

@@ -1,0 +1,163 @@
+"""``sipe check`` passes an honest estimator, sees posteriors half and twice as wide, and goes on where it was interrupted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sipe_bayes.cli import app
+from sipe_bayes.diagnostics import check as checks
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.registry import ESTIMATORS
+from sipe_bayes.inference.state import State
+from sipe_bayes.posterior import GaussianMixture, Posterior
+from sipe_bayes.trajectory import Trajectories
+
+MODEL = """
+<mujoco><option timestep="0.02" gravity="0 0 0" integrator="Euler"/>
+  <worldbody><body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="0.5"/>
+    <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="motor" joint="slide"/></actuator></mujoco>"""
+CONFIG = """
+model = "cart.xml"
+window = 0.6
+search = {restarts = 1, candidates = 0}
+noise = {model = "white"}
+commands = [{actuator = "motor", column = "force", unit = "N"}]
+measurements = [{column = "place", target = "joint:slide.position", unit = "m"}]
+logs = [{file = "log.csv"}]
+[[parameters]]
+name = "mass"
+target = "body:cart.mass"
+bounds = [0.5, 1.5]
+[[parameters]]
+name = "damping"
+target = "joint:slide.damping"
+bounds = [0.0, 2.0]
+"""
+
+
+class Planted(Laplace):
+    """Laplace's normals, ``width`` times as wide."""
+
+    width: ClassVar[float]
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        found = super().posterior(state, trajectories)
+        assert isinstance(found, GaussianMixture)
+        return GaussianMixture(found.log_weights, found.means, self.width**2 * found.covariances, found.space)
+
+
+class Half(Planted):
+    width = 0.5
+
+
+class Twice(Planted):
+    width = 2.0
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    import mujoco
+
+    monkeypatch.setitem(ESTIMATORS, "half", ("tests.test_check", "Half"))
+    monkeypatch.setitem(ESTIMATORS, "twice", ("tests.test_check", "Twice"))
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    rows = ["time,force,place"]
+    for k in range(91):
+        force = 2.0 * np.sin(1.3 * 0.02 * k * 2 * np.pi) + np.sin(0.6 * 0.02 * k * 2 * np.pi)
+        rows.append(f"{0.02 * k:.3f},{force:.6f},{data.qpos[0] + 0.005 * rng.standard_normal():.6f}")
+        data.ctrl[0] = force
+        mujoco.mj_step(model, data)
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "cart.xml").write_text(MODEL)
+    (tmp_path / "config.toml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "config.toml"
+
+
+def call(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+
+
+@pytest.mark.parametrize(
+    ("estimator", "verdict"), [("laplace", "calibrated"), ("half", "too narrow"), ("twice", "too wide")]
+)
+def test_planted_widths_are_seen_and_honest_ones_pass(
+    config: Path, estimator: str, verdict: str, tmp_path: Path
+) -> None:
+    """The false-alarm rate of a check is 2 % in all; halved and doubled posteriors are seen in 40 logs all but surely."""
+    result = call(config, estimator, "--truths", 40, "--out", tmp_path / "out", "--threads", 1, "--json")
+    found = json.loads(result.stdout)
+    print(found["verdict"], found["sharpness"])
+    assert [p["verdict"] for p in found["parameters"]] == [verdict] * 2
+    assert result.exit_code == (0 if verdict == "calibrated" else 1)
+    assert found["truths"] == 40
+    share = {"calibrated": (0.78, 0.98), "too narrow": (0.4, 0.75), "too wide": (0.96, 1.0)}[verdict]
+    assert share[0] <= found["coverage_90"] <= share[1]
+    said = {"calibrated": "no cause for alarm"}.get(verdict, f"{verdict}; use sipe.Recalibrated(...)")
+    assert said in found["verdict"]
+    for name in ("ranks.png", "coverage.png"):
+        assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_an_interrupted_check_goes_on(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is there is not fitted again; a damaged file is."""
+    arguments = (config, "laplace", "--truths", 20, "--threads", 1, "--json", "--out")
+    done: list[int] = []
+    fit = checks._Worker.fit
+
+    def dying(self: Any, number: int) -> Any:
+        if number == 12:
+            raise KeyboardInterrupt
+        return fit(self, number)
+
+    monkeypatch.setattr(checks._Worker, "fit", dying)
+    assert call(*arguments, tmp_path / "out").exit_code != 0
+    assert len(list((tmp_path / "out" / "fits").iterdir())) == 12
+    (tmp_path / "out" / "fits" / "00003.npz").write_bytes(b"half a file")
+    before = (tmp_path / "out" / "fits" / "00007.npz").read_bytes()
+    monkeypatch.setattr(checks._Worker, "fit", lambda self, number: (done.append(number), fit(self, number))[1])
+    assert json.loads(call(*arguments, tmp_path / "out").stdout)["truths"] == 20
+    assert done == [3, *range(12, 20)]
+    assert (tmp_path / "out" / "fits" / "00007.npz").read_bytes() == before
+    other = call(*arguments, tmp_path / "out", "--seed", 1)
+    assert other.exit_code == 2
+    assert "holds another check (it differs in seed, settings)" in other.stderr
+
+
+def test_an_amortised_estimator_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task, its method trained once and conditioned on every log."""
+    trained: list[int] = []
+    from sipe_bayes.inference.abc import ABC
+
+    train = ABC.train
+    monkeypatch.setattr(ABC, "train", lambda self, *given: (trained.append(1), train(self, *given))[1])
+    arguments = ("Pendulum", "abc", "--truths", 20, "--budget", 200, "--steps", 20, "--threads", 1, "--json", "--out")
+    result = call(*arguments, tmp_path / "plain")
+    assert json.loads(result.stdout)["truths"] == 20, result.output
+    assert len(trained) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("config.toml", "laplace", "--truths", 10), "truths: expected at least 20, got 10"),
+        (("config.toml", "laplase"), "did you mean 'laplace'?"),
+        (("missing.toml", "laplace"), "missing.toml"),
+        (("Pendulumm", "laplace"), "Pendulumm"),
+        (("Pendulum", "abc", "--noise", -1), "--noise: expected at least 0"),
+        (("config.toml", "laplace", "--out", "."), "holds files of something else"),
+    ],
+)
+def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], words: str) -> None:
+    result = call(*arguments, "--json")
+    assert result.exit_code == 2, result.output
+    assert words in result.stderr
+    assert result.stderr.count("\n") == 1

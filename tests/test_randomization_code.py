@@ -1,0 +1,131 @@
+"""Generated randomisation: it compiles, holds the posterior's draws, and writes them into a model as the library does."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.envs.randomization_code import sources, write_randomization
+from sipe_bayes.parameters import Parameter
+
+XML = """
+<mujoco><worldbody>
+  <body name="arm"><joint name="hinge" axis="0 1 0" damping="0.1"/>
+    <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.02" mass="0.5"/>
+    <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="0 0 1"/><geom size="0.03" mass="0.2"/></body></body>
+  </worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+PARAMETERS = [
+    Parameter("mass", 0.2, 1.0, targets=("body:arm.mass",)),
+    Parameter("damping", 0.0, 0.5, targets=("joint:hinge.damping",)),
+    Parameter("armature", 0.0, 0.1, targets=("joint:hinge.armature",)),
+    Parameter("gear", 0.5, 2.0, targets=("actuator:motor.gear",)),
+    Parameter("com", -0.1, 0.1, targets=("body:tip.com_x",)),
+    Parameter("gravity", -11.0, -9.0, targets=("option.gravity_z",)),
+    Parameter("density", 0.0, 2.0, targets=("option.density",)),
+    Parameter("bias", -0.1, 0.1, targets=("sensor:joint:hinge.position.bias",)),
+]
+FILES = {"mujoco_playground.py", "gymnasium_wrapper.py", "isaac_lab_events.py"}
+
+
+@pytest.fixture(scope="module")
+def case() -> tuple[MjcfEnvironment, np.ndarray]:
+    environment = MjcfEnvironment.build(XML, PARAMETERS, ["motor"], ["joint:hinge.position"])
+    theta = np.random.default_rng(0).random((12, len(PARAMETERS)))
+    return environment, environment.space.values(theta)
+
+
+class Robot(gymnasium.Env):
+    """Nothing but a model, as Gymnasium's MuJoCo environments have one."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(XML)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        return np.zeros(1, np.float32), {}
+
+
+def test_the_gymnasium_wrapper_writes_draws_as_the_library_does(case: tuple[MjcfEnvironment, np.ndarray]) -> None:
+    """Every reset leaves the model of one draw, derived constants and options included; every draw comes up."""
+    environment, draws = case
+    space: dict[str, Any] = {}
+    exec(sources(environment, draws)["gymnasium_wrapper.py"], space)
+    wrapped, own, seen = space["PosteriorRandomization"](Robot()), environment.compile(), set()
+    for k in range(80):
+        wrapped.reset(seed=0 if k == 0 else None)
+        model = wrapped.unwrapped.model
+        number = int(np.argmin(np.abs(draws[:, 0] - model.body("arm").mass[0])))
+        seen.add(number)
+        environment.write(own, draws[number])
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        for field in (
+            "body_mass",
+            "body_inertia",
+            "dof_damping",
+            "dof_armature",
+            "actuator_gear",
+            "body_ipos",
+            "dof_invweight0",
+        ):
+            np.testing.assert_allclose(getattr(model, field), getattr(own, field), rtol=1e-7, atol=1e-12, err_msg=field)
+        assert model.opt.gravity[2] == pytest.approx(draws[number, 5])
+        assert model.opt.density == pytest.approx(draws[number, 6])
+    assert len(seen) == 12
+    other = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>')
+    robot = Robot()
+    robot.model = other
+    with pytest.raises(ValueError, match="expected nbody = 3, got 2"):
+        space["PosteriorRandomization"](robot)
+
+
+def test_files_are_python_and_name_what_has_no_place(case: tuple[MjcfEnvironment, np.ndarray], tmp_path: Path) -> None:
+    environment, draws = case
+    paths = write_randomization(environment, draws, tmp_path / "randomization")
+    assert {path.name for path in paths} == FILES
+    for path in paths:
+        tree = ast.parse(path.read_text())
+        assert "bias is a sensor's bias" in (ast.get_docstring(tree) or "")
+        assert "12 posterior draws" in (ast.get_docstring(tree) or "")
+    isaac = (tmp_path / "randomization" / "isaac_lab_events.py").read_text()
+    calls = [node for node in ast.walk(ast.parse(isaac)) if isinstance(node, ast.Call)]
+    terms = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "EventTerm"]
+    assert len(terms) == 3  # mass, damping, armature
+    mean, sd = draws[:, 0].mean(), draws[:, 0].std()
+    assert f'"mass_distribution_params": ({mean:.9g}, {sd:.9g})' in isaac
+    assert "# actuator:motor.gear:" in isaac
+    playground = (tmp_path / "randomization" / "mujoco_playground.py").read_text()
+    functions = [n.name for n in ast.parse(playground).body if isinstance(n, ast.FunctionDef)]
+    assert functions == ["randomize_fn"]
+
+
+def test_unphysical_draws_are_left_out(case: tuple[MjcfEnvironment, np.ndarray]) -> None:
+    environment, draws = case
+    wrong = draws.copy()
+    wrong[0, 0] = -1.0
+    assert "from 11 posterior draws" in sources(environment, wrong)["gymnasium_wrapper.py"]
+    with pytest.raises(ValueError, match="draws: expected some that a model can have"):
+        sources(environment, wrong[:1])
+
+
+def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, np.ndarray]) -> None:
+    mjx = pytest.importorskip("mujoco.mjx", reason="mujoco-mjx is not installed")
+    import jax
+
+    environment, draws = case
+    space: dict[str, Any] = {}
+    exec(sources(environment, draws)["mujoco_playground.py"], space)
+    model = mjx.put_model(environment.compile())
+    batched, in_axes = space["randomize_fn"](model, jax.random.split(jax.random.key(0), 5))
+    assert batched.body_mass.shape == (5, 3)
+    assert in_axes.body_mass == 0
+    assert in_axes.body_pos is None
+    for mass in np.asarray(batched.body_mass)[:, 1]:
+        assert np.abs(draws[:, 0] - mass).min() < 1e-5
