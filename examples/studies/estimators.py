@@ -158,7 +158,7 @@ def table() -> None:
         "budget": BUDGET,
         "cells": records,
     }
-    write_text(HERE / "results" / "estimators.json", json.dumps(summary, indent=0, default=float) + "\n")
+    write_text(HERE / "results" / "estimators.json", json.dumps(summary, default=float) + "\n")
     write_text(HERE / "results" / "estimators.md", "\n".join(lines).strip() + "\n")
     print("\n".join(lines))
 

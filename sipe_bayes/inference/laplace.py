@@ -60,6 +60,7 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
+_MANY, _ELITE, _LEAST_SPREAD = 40, 6, 1e-3  # candidates; how many of the best lead on; sd, in the cube
 _TOLERANCE = 0.02  # nats
 _ROUGH = 1e-4  # of the energy
 _SAME_NOISE = 0.03  # relative
@@ -76,8 +77,8 @@ _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due"
 class Laplace(Estimator):
     """Mixture of truncated normals at the optima of the windowed likelihood; see the module's docstring.
 
-    restarts: starting points followed. candidates: draws from the prior among which they are chosen. initial (R, N):
-    the starting points themselves instead.
+    restarts: starting points followed. candidates: points among which they are chosen: draws from the prior and, of 40 or more,
+    later ones around the best. initial (R, N): the starting points themselves instead.
     """
 
     name: ClassVar[str] = "laplace"
@@ -383,26 +384,45 @@ def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def screen(estimator: Laplace, windows: Windows, trajectories: Trajectories) -> FloatArray:
-    """Starting points (R, N): the best of the model as given and ``candidates`` draws, by their plain residuals.
+    """Starting points (R, N): the model as given and the best of ``candidates``, by their plain residuals.
 
-    Raises ValueError when every one of them diverges."""
-    generator = torch.Generator().manual_seed(estimator.seed)
-    draws = estimator.prior.sample((estimator.candidates,), generator=generator).numpy()
+    From ``_MANY`` candidates on, only the first 40 % are drawn from the prior, the others in ten generations from a normal around
+    the best ones so far: the cross-entropy method, which finds the narrow valleys that contact leaves. Raises ValueError when every
+    one of the first diverges."""
+    generator, count = torch.Generator().manual_seed(estimator.seed), estimator.candidates
+    later: list[int] = np.diff(np.linspace(2 * count // 5, count, 11).astype(int)).tolist() if count >= _MANY else []
+    draws = estimator.prior.sample((count - sum(later),), generator=generator).numpy()
     points = np.concatenate([estimator.space.default_theta[None], draws])
-    still = np.tile(windows.no_starts(), (len(points), 1, 1, 1))
-    residual, valid = windows.residuals(points, still)
-    if not valid.any():
+    loss = _plain_loss(windows, points)
+    if not np.isfinite(loss).any():
         raise ValueError(
             f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
             "shorten the model's timestep or the window"
         )
-    spread = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), 1e-12)
-    loss = np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
-    if not valid[0]:
+    rng = np.random.default_rng([estimator.seed, 1])
+    for size in later:
+        best = points[_by_loss(loss)[:_ELITE]]
+        drawn = best.mean(0) + (best.std(0) + _LEAST_SPREAD) * rng.standard_normal((size, points.shape[1]))
+        points = np.concatenate([points, np.clip(drawn, 0.0, 1.0)])
+        loss = np.concatenate([loss, _plain_loss(windows, points[-size:])])
+    chosen = _by_loss(loss)
+    if np.isfinite(loss[0]):
+        chosen = np.concatenate([[0], chosen[chosen != 0]])
+    else:
         estimator.warn("the model as given diverges on these logs; the search started elsewhere")
-    order = np.argsort(loss, kind="stable")[: int(valid.sum())]
-    chosen = [0, *[i for i in order if i != 0]] if valid[0] else list(order)
     return points[chosen[: estimator.restarts]]
+
+
+def _plain_loss(windows: Windows, points: FloatArray) -> FloatArray:
+    """Squared residuals (B,) of points (B, N), in units of each channel's spread; infinite where a simulation diverges."""
+    residual, valid = windows.residuals(points, np.tile(windows.no_starts(), (len(points), 1, 1, 1)))
+    spread = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), 1e-12)
+    return np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
+
+
+def _by_loss(loss: FloatArray) -> NDArray[np.int64]:
+    """Places of the finite ones, the least first."""
+    return np.argsort(loss, kind="stable")[: int(np.isfinite(loss).sum())]
 
 
 def _begin(windows: Windows, theta: FloatArray) -> State:
