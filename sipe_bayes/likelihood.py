@@ -358,13 +358,14 @@ class Windows:
         with_theta: bool = True,
         with_starts: bool = True,
         residual: FloatArray | None = None,
+        theta_step: float | None = None,
     ) -> Linearisation:
         """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs.
 
         with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
-        at this very point, which spares the one."""
+        at this very point, which spares the one. theta_step: of the finite differences, default ``self.theta_step``."""
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
-        size = self.theta_step
+        size = self.theta_step if theta_step is None else theta_step
         sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
         for j in range(n):

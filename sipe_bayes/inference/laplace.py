@@ -23,9 +23,18 @@ the search has all but come to an optimum that is already known.
 Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ from
 place to place, and the place would otherwise be an accident of the start.
 
+Contact bends a simulation at every scale, and a linearisation may see none of a valley that is narrower than its step.
+Where the starts are recorded and theta alone is searched, points at 1e-6 to 0.1 of the cube along the axes and at 1, 3 and 10 sd
+along the principal directions of each optimum are tried as well (a poll, as of pattern search: Torczon 1997, "On the convergence
+of pattern search algorithms", SIAM J. Optim. 7), and the search goes on from a better one, with finite differences no longer than
+the way there. The normal that is left is no narrower than the
+shortest of these steps, and holds within one sd every point tried that fits better or as well, to half a nat, whatever the
+curvature says.
+
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
-uncertainty of the noise widens the normal by the moments over a handful of weighted noise values.
+uncertainty of the noise widens the normal by the moments over a handful of weighted noise values. Residuals below what the
+simulation's own rounding leaves are no independent evidence: such a channel counts as one sample, not as many.
 """
 
 from __future__ import annotations
@@ -70,6 +79,8 @@ _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move al
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _NEAR = 0.1  # of the way to a known optimum
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
+_POLL, _MOST_POLLS = 10.0 ** np.arange(-6, 0), 20  # how far from an optimum, in the cube; how often
+_POLL_SD = np.array([1.0, 3.0, 10.0])
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
@@ -197,7 +208,7 @@ class Laplace(Estimator):
                 )
             moments = windows.moments(linearisation) if rough else moments
             return self._finish(state, windows, moments, noise, theta, starts, linearisation.jacobian)
-        return self._next(state, windows) if _known(state) else state
+        return self._next(state, windows) if not state["polls"] and _known(state) else state
 
     def _held_step(self, state: State, windows: Windows, prior: QuadraticPrior) -> State:
         """A step of theta alone, the starts as the log tells them, on every other window; near the optimum the search goes
@@ -232,12 +243,13 @@ class Laplace(Estimator):
     def _linearise(self, state: State, windows: Windows) -> tuple[Linearisation, bool, float]:
         """Linearisation at the state's point, whether part of it is of an earlier one, and the drift of that part."""
         theta, starts, jacobian, n = state["theta"], state["starts"], state["jacobian"], windows.num_theta
+        size = state["theta_step"]
         residual = state["residual"] if state["residual"].size else None
         if not jacobian.size or not np.isfinite(state["drift"]) or not state["keep_starts"]:
-            return windows.linearise(theta, starts, residual=residual), False, 0.0
+            return windows.linearise(theta, starts, residual=residual, theta_step=size), False, 0.0
         if not state["moved"]:
             return Linearisation(state["residual"], jacobian, True), state["drift"] > 0, state["drift"]
-        found = windows.linearise(theta, starts, with_starts=False, residual=residual)
+        found = windows.linearise(theta, starts, with_starts=False, residual=residual, theta_step=size)
         both = np.concatenate([found.jacobian, jacobian[..., n:]], axis=-1)
         return replace(found, jacobian=both), True, state["drift"]
 
@@ -275,6 +287,7 @@ class Laplace(Estimator):
                 middle = sandwich(jacobian, arrow.start_slope, white, windows.sequences, point)
                 centre, spread = self.normal(theta, *_sandwiched(arrow, middle))
             else:
+                point = _beyond_rounding(windows, point)
                 inner = eliminate(moments.normal(point), moments.num_theta, windows.start_precision, pull)
                 centre, spread = self.normal(theta, inner.precision, inner.gradient)
             mean += weight * centre
@@ -282,6 +295,7 @@ class Laplace(Estimator):
             centres.append((weight, centre))
         for weight, centre in centres:
             covariance += weight * np.outer(centre - mean, centre - mean)
+        polled, better, covariance = self._poll(windows, theta, noise, covariance)
         found = {
             "theta": theta,
             "starts": starts,
@@ -292,11 +306,43 @@ class Laplace(Estimator):
             "tau": noise.tau,
             "evidence": np.array(evidence),
         }
+        if not windows.num_start and not polled and state["polls"]:
+            return self._next(state, windows)
         further = None if state["centred"] else self._middle(windows, theta, starts, noise, mean, covariance)
         if further is not None:
             return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
         modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in found.items()}
-        return self._next({**state, **modes}, windows)
+        state, polls = {**state, **modes}, state["polls"]
+        if better is None or polls >= _MOST_POLLS:
+            return self._next(state, windows)
+        size = min(state["theta_step"], max(float(np.abs(better - theta).max()), _POLL[0]))
+        onward = {"theta": better, "theta_step": size, "polls": polls + 1, "iteration": 0, "moved": True}
+        return {**state, **onward, **_AFRESH}
+
+    def _poll(
+        self, windows: Windows, theta: FloatArray, noise: Noise, covariance: FloatArray
+    ) -> tuple[bool, FloatArray | None, FloatArray]:
+        """Whether there was a poll (only of theta alone, and within the budget), its best point, if better than the optimum, and
+        the covariance that holds the points as good."""
+        axes, (variance, principal) = np.eye(len(theta)), np.linalg.eigh(covariance)
+        along = np.sqrt(np.clip(variance, 0, _OPEN**2))[:, None] * principal.T
+        ways = np.concatenate([k * axes for k in _POLL] + [k * along for k in _POLL_SD])
+        trials = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
+        left = (windows.budget - windows.rollouts) / len(windows.trajectories)
+        if windows.num_start or left <= len(trials):
+            return False, None, covariance
+        trials, starts, prior = np.concatenate([theta[None], trials]), windows.no_starts(), self.quadratic_prior
+        residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
+        values = np.array(
+            [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(trials, residual, strict=True)]
+        )
+        values = np.where(valid, values, np.inf)
+        best = int(values.argmin())
+        wide = covariance + _POLL[0] ** 2 * np.eye(len(theta))
+        for way in trials[values < values[0] + _DRIFT] - theta:
+            if way @ np.linalg.solve(wide, way) > 1:
+                wide += np.outer(way, way)
+        return True, (trials[best] if values[best] < values[0] - _DRIFT else None), wide
 
     def _middle(
         self,
@@ -447,6 +493,8 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "keep_starts": False,
         "moved": True,
         "centred": False,
+        "polls": 0,
+        "theta_step": windows.theta_step,
     }
 
 
@@ -495,6 +543,12 @@ def _noise(
     found = estimate_noise(moments, before, context, fixed_sd(windows), coloured, shortest, longest)
     sd = np.where(np.isnan(fixed_sd(windows)), np.maximum(found.sd, windows.rounding), found.sd)
     return Noise(sd, found.tau)
+
+
+def _beyond_rounding(windows: Windows, noise: Noise) -> Noise:
+    """The noise with channels at the least sd, the simulation's rounding, as if they were one sample."""
+    least, counts = windows.rounding * (1 + _SAME_NOISE), windows.observed.sum(axis=(0, 1))
+    return Noise(np.where(noise.sd <= least, noise.sd * np.sqrt(np.maximum(counts, 1)), noise.sd), noise.tau)
 
 
 def free_noise(windows: Windows) -> NDArray[np.int64]:
