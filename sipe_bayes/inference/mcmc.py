@@ -87,19 +87,20 @@ class MCMC(Estimator):
         return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def start(self, trajectories: Trajectories) -> State:
-        """Fit ``laplace``, which places the walkers and supplies the starts' Jacobian."""
+        """Fit ``laplace``, with at most half the budget, which places the walkers and supplies the starts' Jacobian."""
         first = Laplace(
             self.simulator,
             prior=self.prior,
-            budget=self.budget,
+            budget=max(1, self.budget // 2),
             seed=self.seed,
             likelihood=self.likelihood,
             restarts=self.restarts,
             candidates=self.candidates,
         )
         windows = self.windows(trajectories)
-        first._bound = (trajectories, windows)
+        first._bound, windows.budget = (trajectories, windows), first.budget
         found = first.fit(trajectories)
+        windows.budget = self.budget
         for sentence in first.warnings:
             self.warn(sentence)
         if not first._state or not len(first._state["mode_theta"]):
