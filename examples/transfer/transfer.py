@@ -3,11 +3,12 @@
     python examples/transfer/transfer.py            # minutes on two cores; goes on after an interruption
     python examples/transfer/transfer.py --seeds 1  # a third of that
 
-1. The "real" pendulum, whose mass and length nobody knows, is moved to and fro for 5 s and recorded with 5 % noise.
+1. The target, a simulated pendulum that stands for the machine and whose mass and length nobody knows, is moved to and fro for
+   5 s and recorded with 5 % noise.
 2. ``laplace`` gets the log and gives a posterior of mass, length and damping.
 3. DDPG agents are trained under five randomisations: the posterior, its most probable point, the uniform prior, the model as it is, and, as
    what nobody has, the truth. All for as many steps, with the same settings and seeds.
-4. Each is tested on the real pendulum as it is: 50 episodes. ``transfer.png`` and ``transfer.json`` lie beside this file.
+4. Each is tested on the target as it is: 50 episodes. ``transfer.png`` and ``transfer.json`` lie beside this file.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ NAMES = ("truth", "posterior", "point", "prior", "model as it is")
 
 
 def fit() -> sipe.Posterior:
-    """The posterior of the real pendulum's log."""
-    real = sipe.make(TASK)
-    real.set_parameters(TRUTH)
-    log = sipe.demonstrations(real, count=1, steps=100, noise=0.05)
+    """The posterior of the log of the target."""
+    target = sipe.make(TASK)
+    target.set_parameters(TRUTH)
+    log = sipe.demonstrations(target, count=1, steps=100, noise=0.05)
     estimator = sipe.get_estimator(TASK, "laplace", likelihood=sipe.Segments(noise="white"), seed=0)
     return estimator.fit(log)
 
@@ -54,7 +55,7 @@ def randomisation(name: str, posterior: sipe.Posterior) -> sipe.Posterior:
 
 
 def trained(name: str, seed: int, runs: Path) -> dict[str, Any]:
-    """An agent's returns on the real pendulum: at the end, and along its training."""
+    """An agent's returns in the target: at the end, and along its training."""
     import torch
 
     from sipe_bayes.benchmark.transfer import settings
@@ -89,7 +90,7 @@ def trained(name: str, seed: int, runs: Path) -> dict[str, Any]:
 
 
 def draw(found: list[dict[str, Any]], posterior: sipe.Posterior) -> bytes:
-    """Left: the posterior's mass and length. Middle: returns on the real pendulum along the training. Right: at the end."""
+    """Left: the posterior's mass and length. Middle: returns in the target along the training. Right: at the end."""
     from matplotlib.figure import Figure
 
     from sipe_bayes.diagnostics.plots import CHAINS, DEFAULT, MEASURED, PRIOR, png
@@ -112,7 +113,7 @@ def draw(found: list[dict[str, Any]], posterior: sipe.Posterior) -> bytes:
         returns = np.array([row["return"] for row in mine])
         right.barh(-k, returns.mean(), color=colours[name], alpha=0.4)
         right.plot(returns, np.full(len(returns), -k), ".", color=colours[name])
-    middle.set(xlabel="control steps of training", ylabel="return", title="on the real pendulum")
+    middle.set(xlabel="control steps of training", ylabel="return", title="in the target")
     right.set(xlabel="return", title="at the end; every dot a seed")
     right.set_yticks([-k for k in range(len(NAMES))], NAMES)
     return png(figure)
