@@ -87,11 +87,11 @@ class MCMC(Estimator):
         return {**super().settings(), **{name: getattr(self, name) for name in own}}
 
     def start(self, trajectories: Trajectories) -> State:
-        """Fit ``laplace``, with at most half the budget, which places the walkers and supplies the starts' Jacobian."""
+        """Fit ``laplace``, with at most four fifths of the budget, which places the walkers and supplies the starts' Jacobian."""
         first = Laplace(
             self.simulator,
             prior=self.prior,
-            budget=max(1, self.budget // 2),
+            budget=max(1, 4 * self.budget // 5),
             seed=self.seed,
             likelihood=self.likelihood,
             restarts=self.restarts,
