@@ -109,7 +109,7 @@ def run(select: str) -> None:
         for task in TASKS:
             for method in METHODS:
                 file = path(task, method, seed)
-                if select not in f"{task}/{method}/{seed}" or file.exists():
+                if select not in f"{task}/{method}/{seed}" or (file.exists() and not _failed(file)):
                     continue
                 lock = file.with_suffix(".lock")
                 try:
@@ -125,6 +125,10 @@ def run(select: str) -> None:
                     lock.unlink()
                 write_text(file, json.dumps(record, default=float))
                 print(task, method, seed, record.get("seconds"), record.get("error", ""), flush=True)
+
+
+def _failed(file: Path) -> bool:
+    return "error" in json.loads(file.read_text(encoding="utf-8"))
 
 
 def baselines(task: str) -> list[dict[str, Any]]:
@@ -169,10 +173,12 @@ def _overview(records: list[dict[str, Any]], determined: dict[tuple[str, int], l
     for method in METHODS:
         row = []
         for task in TASKS:
-            cells = [r for r in records if (r["task"], r["method"]) == (task, method) and "error" not in r]
+            every = [r for r in records if (r["task"], r["method"]) == (task, method)]
+            cells = [r for r in every if "error" not in r]
+            failed = f", {len(every) - len(cells)} failed" if len(cells) < len(every) else ""
             reference = _row([b for b in baselines(task) if b["method"] == "prior"], determined)
             skill = 1 - _row(cells, determined)["crps"] / reference["crps"]
-            row.append(f"{skill:.2f} ({len(cells)})" if cells else "")
+            row.append(f"{skill:.2f} ({len(cells)}{failed})" if cells else "")
         lines.append(f"| {method} | {' | '.join(row)} |")
     return lines
 

@@ -23,13 +23,10 @@ the search has all but come to an optimum that is already known.
 Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ from
 place to place, and the place would otherwise be an accident of the start.
 
-Contact bends a simulation at every scale, and a linearisation may see none of a valley that is narrower than its step.
-Where the starts are recorded and theta alone is searched, points at 1e-6 to 0.1 of the cube along the axes and at 1, 3 and 10 sd
-along the principal directions of each optimum are tried as well (a poll, as of pattern search: Torczon 1997, "On the convergence
-of pattern search algorithms", SIAM J. Optim. 7), and the search goes on from a better one, with finite differences no longer than
-the way there. The normal that is left is no narrower than the
-shortest of these steps, and holds within one sd every point tried that fits better or as well, to half a nat, whatever the
-curvature says.
+Where the starts are recorded and theta alone is searched, points around each optimum are tried as well (``poll``), and the search
+goes on from a better one, with finite differences no longer than the way there. The normal that is left is no narrower than the
+shortest of these ways, and holds the points that fit as well as the optimum, whatever the curvature says; one that fits as
+well but lies beyond worse ones becomes a further starting point.
 
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
@@ -50,6 +47,7 @@ from sipe_bayes.checks import whole
 from sipe_bayes.inference import state_space_search
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.least_squares import FLAT_PRECISION, Fit, QuadraticPrior, energy_of, step
+from sipe_bayes.inference.poll import SHORTEST, Around, cost, poll
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import Linearisation, Windows
 from sipe_bayes.noise import (
@@ -79,8 +77,10 @@ _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move al
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _NEAR = 0.1  # of the way to a known optimum
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
-_POLL, _MOST_POLLS = 10.0 ** np.arange(-6, 0), 20  # how far from an optimum, in the cube; how often
-_POLL_SD = np.array([1.0, 3.0, 10.0])
+_MOST_POLLS, _MOST_POINTS = (
+    20,
+    10,
+)  # looks around that lead on from one starting point; starting points, with those found on the way
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
@@ -295,7 +295,12 @@ class Laplace(Estimator):
             centres.append((weight, centre))
         for weight, centre in centres:
             covariance += weight * np.outer(centre - mean, centre - mean)
-        polled, better, covariance = self._poll(windows, theta, noise, covariance)
+        searched = Noise(white, np.zeros(len(white))) if self.likelihood.noise == "sandwich" else noise
+        around = self._around(windows, theta, searched, covariance)
+        if around is not None:
+            covariance = around.covariance
+        elif state["polls"]:  # the budget ends: at least as wide as the optimum before, which this one betters
+            covariance = covariance + state["mode_covariance"][-1]
         found = {
             "theta": theta,
             "starts": starts,
@@ -306,43 +311,37 @@ class Laplace(Estimator):
             "tau": noise.tau,
             "evidence": np.array(evidence),
         }
-        if not windows.num_start and not polled and state["polls"]:
-            return self._next(state, windows)
         further = None if state["centred"] else self._middle(windows, theta, starts, noise, mean, covariance)
         if further is not None:
             return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
-        modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in found.items()}
+        before = len(state["mode_evidence"]) - (state["polls"] > 0)  # an optimum that a poll has bettered is none
+        modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"][:before], v[None]]) for k, v in found.items()}
         state, polls = {**state, **modes}, state["polls"]
-        if better is None or polls >= _MOST_POLLS:
+        if around is not None and around.other is not None and len(state["points"]) < _MOST_POINTS:
+            state = {**state, "points": np.concatenate([state["points"], around.other[None]])}
+        if around is None or around.better is None or polls >= _MOST_POLLS:
             return self._next(state, windows)
-        size = min(state["theta_step"], max(float(np.abs(better - theta).max()), _POLL[0]))
-        onward = {"theta": better, "theta_step": size, "polls": polls + 1, "iteration": 0, "moved": True}
+        size = min(state["theta_step"], max(float(np.abs(around.better - theta).max()), SHORTEST))
+        onward = {"theta": around.better, "theta_step": size, "polls": polls + 1, "iteration": 0, "moved": True}
         return {**state, **onward, **_AFRESH}
 
-    def _poll(
-        self, windows: Windows, theta: FloatArray, noise: Noise, covariance: FloatArray
-    ) -> tuple[bool, FloatArray | None, FloatArray]:
-        """Whether there was a poll (only of theta alone, and within the budget), its best point, if better than the optimum, and
-        the covariance that holds the points as good."""
-        axes, (variance, principal) = np.eye(len(theta)), np.linalg.eigh(covariance)
-        along = np.sqrt(np.clip(variance, 0, _OPEN**2))[:, None] * principal.T
-        ways = np.concatenate([k * axes for k in _POLL] + [k * along for k in _POLL_SD])
-        trials = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
-        left = (windows.budget - windows.rollouts) / len(windows.trajectories)
-        if windows.num_start or left <= len(trials):
-            return False, None, covariance
-        trials, starts, prior = np.concatenate([theta[None], trials]), windows.no_starts(), self.quadratic_prior
-        residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
-        values = np.array(
-            [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(trials, residual, strict=True)]
-        )
-        values = np.where(valid, values, np.inf)
-        best = int(values.argmin())
-        wide = covariance + _POLL[0] ** 2 * np.eye(len(theta))
-        for way in trials[values < values[0] + _DRIFT] - theta:
-            if way @ np.linalg.solve(wide, way) > 1:
-                wide += np.outer(way, way)
-        return True, (trials[best] if values[best] < values[0] - _DRIFT else None), wide
+    def _around(self, windows: Windows, theta: FloatArray, noise: Noise, covariance: FloatArray) -> Around | None:
+        """What a poll finds around an optimum; None where starts are searched too, or the budget leaves no room."""
+        if windows.num_start:
+            return None
+        if windows.rollouts + cost(len(theta)) * len(windows.trajectories) >= windows.budget:
+            self.warn(
+                "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow"
+            )
+            return None
+        starts, prior = windows.no_starts(), self.quadratic_prior
+
+        def energies(thetas: FloatArray) -> FloatArray:
+            residual, valid = windows.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
+            values = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(thetas, residual, strict=True)]
+            return np.where(valid, values, np.inf)
+
+        return poll(energies, theta, covariance)
 
     def _middle(
         self,
@@ -548,6 +547,7 @@ def _noise(
 def _beyond_rounding(windows: Windows, noise: Noise) -> Noise:
     """The noise with channels at the least sd, the simulation's rounding, as if they were one sample."""
     least, counts = windows.rounding * (1 + _SAME_NOISE), windows.observed.sum(axis=(0, 1))
+    least = np.where(np.isnan(fixed_sd(windows)), least, 0.0)
     return Noise(np.where(noise.sd <= least, noise.sd * np.sqrt(np.maximum(counts, 1)), noise.sd), noise.tau)
 
 

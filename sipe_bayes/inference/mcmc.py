@@ -12,7 +12,8 @@ Target, with r the residual at the predicted starts x(theta), V the noise covari
 which is the likelihood with the starts integrated out, exact where the prediction is linear in the starts over their
 (narrow) conditional posterior. x(theta) = x_hat - S (theta - theta_hat) and J_x are taken from the ``laplace`` fit that
 comes first and also places the walkers; that saves D of D + 1 simulations. How far a fresh J_x would move the target
-is measured on draws of the final chain and reported as ``linearisation_error`` (sd in nats).
+is measured on some of the first walkers and reported as ``linearisation_error`` (sd in nats; NaN where it would cost more than a
+tenth of the budget).
 
 With ``StateSpace`` the target is that of ``state_space_target``, over theta alone, with the noise of the ``laplace`` fit.
 
@@ -50,7 +51,7 @@ _MIXED_RHAT = 1.05
 _WIDER = 1.2  # of the sds of the independent proposal against laplace's
 _DRAWS = 4000  # at most kept
 _PLACINGS = 20  # rounds in which walkers look for a valid place
-_CHECKED = 16  # draws on which the linearisation is checked
+_CHECKED, _CHECKS_SHARE = 16, 0.1  # walkers on which the linearisation is checked; of the budget, at most
 
 
 class MCMC(Estimator):
@@ -98,13 +99,18 @@ class MCMC(Estimator):
             candidates=self.candidates,
         )
         windows = self.windows(trajectories)
-        first._bound, windows.budget = (trajectories, windows), first.budget
-        found = first.fit(trajectories)
-        windows.budget = self.budget
+        try:
+            found = first.fit(trajectories)
+        except ValueError as error:
+            if not str(error).startswith("budget: "):
+                raise
+            raise BudgetExhausted(
+                f"{self.budget} rollouts did not suffice for the laplace fit that comes first"
+            ) from None
+        windows.rollouts += first.rollouts
         for sentence in first.warnings:
             self.warn(sentence)
-        if not first._state or not len(first._state["mode_theta"]):
-            raise BudgetExhausted("the budget did not suffice for the first laplace fit")
+        assert first._state is not None
         best = distinct_modes(first._state)[0]
         conditioned = self._on_states if isinstance(windows, Chain) else self._on_starts
         picked, spread = conditioned(
@@ -129,6 +135,7 @@ class MCMC(Estimator):
             "log_prob": log_prob,
             "best": state["fit_theta"],
             "best_log_prob": float(self._target(windows, state)(centre[None])[0]),
+            "linearisation_error": self._linearisation_error(windows, state, walkers),
             "chain": np.empty((0, *walkers.shape)),
             "chain_log_prob": np.empty((0, count)),
             "accepted": np.zeros(count),
@@ -266,7 +273,7 @@ class MCMC(Estimator):
         rates = np.repeat(state["accepted"] / len(state["chain"]), theta.shape[1])
         stats = {"lp": log_prob.ravel(), "acceptance_rate": rates}
         mixing = self._mixing(state)
-        mixing["linearisation_error"] = self._linearisation_error(state, trajectories)
+        mixing["linearisation_error"] = state["linearisation_error"]
         self.diagnostics = {"mixing": mixing, **self._noise_summary(state, trajectories)}
         if not (mixing["rhat"] <= _MIXED_RHAT and mixing["ess"] >= self.effective / 2):
             self.warn(
@@ -286,19 +293,17 @@ class MCMC(Estimator):
         sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
         return {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
 
-    def _linearisation_error(self, state: State, trajectories: Trajectories) -> float:
-        """Sd, over draws, of the difference that a fresh Jacobian of the starts makes to the target (nats).
-
-        Its simulations are a check of the answer and stand outside the budget."""
-        windows = self.windows(trajectories)
-        used, budget = windows.rollouts, windows.budget
-        windows.budget = np.inf
+    def _linearisation_error(self, windows: Windows, state: State, walkers: FloatArray) -> float:
+        """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""
+        if not windows.num_start:
+            return 0.0
+        cost = len(windows.trajectories) * (2 * windows.num_start + 3)
+        count = min(_CHECKED, int(_CHECKS_SHARE * self.budget) // cost)
+        if count < 4 or windows.rollouts + count * cost > self.budget:
+            return float("nan")
         target = self._target(windows, state)
-        flat = self._kept(state).reshape(-1, state["chain"].shape[2])
-        points = flat[np.linspace(0, len(flat) - 1, _CHECKED).astype(int)]
-        difference = [float(target(p[None])[0]) - target.refreshed(p) for p in points]
-        windows.rollouts, windows.budget = used, budget
-        return float(np.std(difference))
+        points = walkers[np.linspace(0, len(walkers) - 1, count).astype(int)]
+        return float(np.std([float(target(p[None])[0]) - target.refreshed(p) for p in points]))
 
 
 class _Proposal:
