@@ -245,3 +245,17 @@ def test_the_papers_loop(name: str) -> None:
         estimator.update_parameter_estimate(trajectory)
     assert estimator.rollouts <= estimator.budget
     assert torch.isfinite(estimator.get_parameter_estimate(trajectory).mean).all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("name", ["bayessim", "npe", "maml"])
+def test_networks_train_on_a_gpu(name: str) -> None:
+    """The posterior comes back to the CPU, in double precision, about the truth as the CPU's does."""
+    simulator = pendulum()
+    recorded = log(simulator, TRUTH, 1, steps=60)
+    there, here = (
+        get_estimator(simulator, name, seed=0, device=device, **quick(name)).fit(recorded) for device in ("cuda", "cpu")
+    )
+    assert draws(there).dtype == torch.float64
+    assert draws(there).device.type == "cpu"
+    assert torch.allclose(there.mean, here.mean, atol=0.3)

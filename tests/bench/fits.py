@@ -6,6 +6,8 @@ import time
 import warnings
 from typing import Any
 
+import numpy as np
+
 import sipe_bayes as sipe
 from sipe_bayes.inference import ESTIMATORS, get_estimator
 from sipe_bayes.simulator import Simulator
@@ -41,3 +43,14 @@ def table() -> None:
             seconds = time.perf_counter() - begin
         own = seconds - simulator.spent
         print(f"{name:<12}{estimator.rollouts:>10}{simulator.spent:>12.1f}{own:>10.1f}", flush=True)
+    _many_parameters()
+
+
+def _many_parameters() -> None:
+    """bayesopt where the Gaussian process is at its largest: 1,000 evaluations of 51 parameters."""
+    space = sipe.ParameterSpace(sipe.Parameter(f"p{k}", low=0.0, high=1.0) for k in range(51))
+    simulator = sipe.CallableSimulator(lambda values: values, space, name="identity")
+    estimator = get_estimator(simulator, "bayesopt", budget=BUDGET, seed=0)
+    begin = time.perf_counter()
+    estimator.fit(np.full(51, 0.3))
+    print(f"bayesopt, 51 parameters, {estimator.rollouts} evaluations: {time.perf_counter() - begin:.0f} s")
