@@ -109,7 +109,8 @@ class MCMC(Estimator):
             ) from None
         windows.rollouts += first.rollouts
         for sentence in first.warnings:
-            self.warn(sentence)
+            if sentence != first._spent():  # of its share of the budget
+                self.warn(sentence)
         assert first._state is not None
         best = distinct_modes(first._state)[0]
         conditioned = self._on_states if isinstance(windows, Chain) else self._on_starts
