@@ -7,11 +7,12 @@ https://arxiv.org/abs/2011.08985: simulations that cannot be told from recording
     r(theta) = mean over the simulation's control steps of log D(s, a, s'),
 
 D being trained by binary cross-entropy on recorded control steps against those simulated at the thetas that a method looks at.
-It compares sets of control steps, not step with step, so that starting states and actions need not match. But they must reach about
-the same states under about the same actions: D tells simulations by those as well, and of one short recording it soon knows
-every step.
+It compares sets of control steps, not step with step, so that starting states and actions need not match: ``features`` takes
+simulations of others. But they must reach about the same states under about the same actions: D tells simulations by those as
+well, and of one short recording it soon knows every step. So ``simopt`` and ``adr`` simulate from the recorded
+starting states with the recorded actions; with others they are not offered.
 
-Deviations: ``simopt`` and ``adr`` simulate from the recorded starting states with the recorded actions, others are not offered; a step enters as (s, a, s' - s), which is as much as (s, a, s') and shows small changes; features are
+Deviations: a step enters as (s, a, s' - s), which is as much as (s, a, s') and shows small changes; features are
 standardised by the recorded steps; simulated steps get the recorded observations' noise, which would otherwise give them
 away; D is trained on the method's pool of recent simulations, not the latest alone; of a simulation at most 200 steps,
 evenly spread, are looked at.
@@ -75,9 +76,10 @@ class LearnedReward:
         training.network.standardise.fit(self.recorded)
         return _prefixed(training)
 
-    def features(self, predicted: FloatArray | None) -> Features:
-        """Control steps (B, M, F) of predictions (B, W, L, C), NaN throughout where they diverged; none of None."""
-        windows = self.windows
+    def features(self, predicted: FloatArray | None, unmatched: Windows | None = None) -> Features:
+        """Control steps (B, M, F) of predictions (B, W, L, C), NaN throughout where they diverged; none of None. unmatched: windows
+        with other starting states and actions, where the predictions are theirs."""
+        windows = unmatched or self.windows
         if predicted is None:
             predicted = np.empty((0, *windows.measured.shape))
         inside = np.arange(predicted.shape[2]) <= windows.steps[:, None]

@@ -14,6 +14,7 @@ FORM: Settings = {
     "bayesopt": SEARCH,
     "bayessim": {"components": 2, "training": Training(epochs=40)},
     "maml": {"iterations": 20, "tasks": 3},
+    "mcmc": {"budget": 300},
     "npe": {"max_epochs": 10, "transforms": 1, "hidden": 16},
     "regression": {"iterations": 2000},
 }

@@ -29,7 +29,10 @@ from tests.test_rl import contents
 EPISODE, HORIZON = 30, 20
 SMALL = Settings(hidden=(8, 8), batch=8, start_steps=60, updates_per_step=0.2)
 ONE_STEP = sipe.Segments(0.05, noise="white", starts="recorded")  # a search for starts would take a larger budget
-CHOSEN = {name: {"budget": 300, "likelihood": ONE_STEP, "candidates": 2} for name in ("laplace", "mcmc")}
+CHOSEN = {
+    name: {"budget": budget, "likelihood": ONE_STEP, "candidates": 2}
+    for name, budget in (("laplace", 300), ("mcmc", 600))
+}
 
 
 def task(name: str = "Pendulum", **changes: Any) -> Task:
