@@ -31,7 +31,7 @@ SMALL = Settings(hidden=(8, 8), batch=8, start_steps=60, updates_per_step=0.2)
 ONE_STEP = sipe.Segments(0.05, noise="white", starts="recorded")  # a search for starts would take a larger budget
 CHOSEN = {
     name: {"budget": budget, "likelihood": ONE_STEP, "candidates": 2}
-    for name, budget in (("laplace", 300), ("mcmc", 600))
+    for name, budget in (("laplace", 300), ("mcmc", 1000))
 }
 
 
@@ -39,8 +39,8 @@ def task(name: str = "Pendulum", **changes: Any) -> Task:
     return replace(sipe.make_task(name), **{"episode_steps": EPISODE, **changes})
 
 
-def estimator(name: str, of: Task | None = None, budget: int = 80, seed: int = 1, **settings: Any) -> Estimator:
-    chosen = {"budget": budget, **FORM.get(name, {}), **settings}
+def estimator(name: str, of: Task | None = None, seed: int = 1, **settings: Any) -> Estimator:
+    chosen = {"budget": 80, **FORM.get(name, {}), **settings}
     return sipe.get_estimator(Simulator(of or task(), 1), name, seed=seed, **chosen)
 
 
