@@ -77,10 +77,8 @@ _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move al
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _NEAR = 0.1  # of the way to a known optimum
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
-_MOST_POLLS, _MOST_POINTS = (
-    20,
-    10,
-)  # looks around that lead on from one starting point; starting points, with those found on the way
+_MOST_POLLS = 20  # looks around that lead on from one starting point
+_MOST_POINTS = 10  # starting points, with those found on the way
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
