@@ -55,7 +55,7 @@ class Behaviour:
 def agent(task: Task, policy: Policy, type: Agent) -> Behaviour:
     """A deterministic policy's, one observation at a time: the bits do not depend on how many lanes there are."""
     low, high, size = task.action_low, task.action_high, task.num_actions
-    noise = _ACTION_NOISE * (high - low) / 2 if _starts_alike(task) else 0.0
+    noise = action_noise(task)
     return Behaviour(
         lambda steps, rng: noise * rng.standard_normal((steps, size)),
         lambda seen, planned, rng: np.clip(np.asarray(policy(seen), float)[0] + planned, low, high),
@@ -155,6 +155,8 @@ def _key(type: Agent) -> tuple[int, ...]:
     return (1 + AGENTS.index(type),)
 
 
-def _starts_alike(task: Task) -> bool:
+def action_noise(task: Task) -> float:
+    """Sd of the noise on a deterministic agent's actions: zero but where every episode starts alike."""
     first, second = (task.initial_states(np.random.default_rng(seed), 1) for seed in (0, 1))
-    return all(a is b or np.array_equal(np.asarray(a), np.asarray(b)) for a, b in zip(first, second, strict=True))
+    alike = all(a is b or np.array_equal(np.asarray(a), np.asarray(b)) for a, b in zip(first, second, strict=True))
+    return _ACTION_NOISE * (task.action_high - task.action_low) / 2 if alike else 0.0

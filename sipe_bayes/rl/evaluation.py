@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes import acting
 from sipe_bayes.atomic import replacing, write_text
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
@@ -38,12 +39,14 @@ def evaluate(
     seed: int = 0,
     theta: FloatArray | None = None,
     variant: str = "default",
+    action_noise: float | None = None,
 ) -> dict[str, Any]:
     """``episodes`` episodes, a lane for each, lane i seeded with [seed, i].
 
-    theta: (N,) or (episodes, N), default the variant's. Returns mean, sd and standard_error of the undiscounted return,
-    success_rate (done at an episode's last step) and its success_error, None where only the return counts, the number of
-    episodes, and that of diverged ones. Raises ValueError for a policy of other sizes.
+    theta: (N,) or (episodes, N), default the variant's. action_noise: sd of Gaussian noise on the actions, default
+    ``acting.action_noise``: without it the episodes of a task that always starts alike would be one. Returns mean, sd and
+    standard_error of the undiscounted return, success_rate (done at an episode's last step) and its success_error, None where
+    only the return counts, the number of episodes, and that of diverged ones. Raises ValueError for a policy of other sizes.
     """
     task = make_task(task) if isinstance(task, str) else task
     simulator = task if isinstance(task, Simulator) else Simulator(task, 1)
@@ -54,10 +57,17 @@ def evaluate(
     given = simulator.environment.theta(variant) if theta is None else np.asarray(theta, float)
     generators = [np.random.default_rng([seed, i]) for i in range(episodes)]
     lanes = Episodes(simulator, given, generators, allow_outside=True)
+    environment = simulator.environment
+    sd = acting.action_noise(environment) if action_noise is None else action_noise
+    noise = [np.random.default_rng([seed, i, 1]) for i in range(episodes)] if sd else []
+    low, high, size = environment.action_low, environment.action_high, environment.num_actions
     step, running = lanes.first(), np.ones(episodes, bool)
     returns, success, diverged = np.zeros(episodes), np.zeros(episodes, bool), np.zeros(episodes, bool)
     while running.any():
-        step = lanes.step(policy(step.observations))
+        actions = policy(step.observations)
+        if noise:
+            actions = np.clip(actions + sd * np.stack([rng.standard_normal(size) for rng in noise]), low, high)
+        step = lanes.step(actions)
         returns[running] += step.rewards[running]
         ended = running & (step.terminated | step.truncated)
         diverged |= running & ~step.valid
@@ -97,8 +107,8 @@ def write_card(path: Path, task: Task, facts: dict[str, Any], episodes: int = EP
         "task": task.name,
         **facts,
         "evaluation": evaluate(load_policy(path, task.name), simulator, episodes),
-        "idle": evaluate(idle(task), simulator, episodes),
-        "random": evaluate(random(task), simulator, episodes),
+        "idle": evaluate(idle(task), simulator, episodes, action_noise=0.0),
+        "random": evaluate(random(task), simulator, episodes, action_noise=0.0),
         "solved_at": {"measure": task.solved.measure, "threshold": task.solved.threshold},
     }
     write_text(path.with_suffix(".json"), to_json(card, indent=2))
