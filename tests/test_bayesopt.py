@@ -65,6 +65,20 @@ def test_the_process_against_dense_algebra(n: int) -> None:
     torch.testing.assert_close(more.predict(theta)[1], plain.predict(theta)[1], rtol=1e-6, atol=1e-7)
 
 
+def test_slopes_are_autograds() -> None:
+    rng = np.random.default_rng(3)
+    x = torch.from_numpy(rng.random((30, 4)))
+    process = GaussianProcess(
+        x, (x**2).sum(1), torch.tensor([0.3, 0.5, 1.0, 2.0], dtype=torch.float64), 1e-3, 0.2, 1.0, 0.7
+    )
+    theta = torch.from_numpy(rng.random((5, 4))).requires_grad_(True)
+    mean, sd = process.predict(theta)
+    expected = [torch.autograd.grad(v.sum(), theta, retain_graph=True)[0] for v in (mean, sd)]
+    found = process.slopes(theta.detach())
+    for there, here in zip((mean, sd, *expected), found, strict=True):
+        torch.testing.assert_close(here, there.detach(), rtol=1e-8, atol=1e-10)
+
+
 def test_fitted_hyper_parameters_predict() -> None:
     """Standardised errors at fresh points are of order one, and a parameter that does nothing gets a long lengthscale."""
     rng = np.random.default_rng(0)

@@ -266,7 +266,9 @@ class BayesOpt(Estimator):
 
     def _merit(self, process: GaussianProcess, theta: Tensor) -> Tensor:
         """What a candidate maximises (B,) of theta (B, N)."""
-        mean, sd = process.predict(theta)
+        return self._acquired(process, *process.predict(theta))
+
+    def _acquired(self, process: GaussianProcess, mean: Tensor, sd: Tensor) -> Tensor:
         if self.acquisition == "upper_confidence_bound":
             return self.kappa * sd - mean
         return log_improvement((process.y.min() - self.xi - mean) / sd) + sd.log()
@@ -276,9 +278,12 @@ class BayesOpt(Estimator):
         from scipy.optimize import minimize
 
         def negative(flat: FloatArray) -> tuple[float, FloatArray]:
-            points = torch.from_numpy(flat.reshape(starts.shape)).requires_grad_(True)
-            total = -self._merit(process, points).sum()
-            (gradient,) = torch.autograd.grad(total, points)
+            with torch.no_grad():
+                mean, sd, by_mean, by_sd = process.slopes(torch.from_numpy(flat.reshape(starts.shape)))
+            mean, sd = mean.requires_grad_(True), sd.requires_grad_(True)
+            total = -self._acquired(process, mean, sd).sum()
+            along_mean, along_sd = torch.autograd.grad(total, (mean, sd))
+            gradient = along_mean[:, None] * by_mean + along_sd[:, None] * by_sd
             return float(total.detach()), gradient.numpy().ravel()
 
         bounds = list(zip(np.tile(low, len(starts)), np.tile(high, len(starts)), strict=True))

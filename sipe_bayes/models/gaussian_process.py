@@ -68,10 +68,14 @@ class GaussianProcess:
 
     def kernel(self, a: Tensor, b: Tensor) -> Tensor:
         """Correlations (A, B) between points a (A, N) and b (B, N)."""
+        r = self._distance(a, b)
+        return (1 + r + r**2 / 3) * torch.exp(-r)
+
+    def _distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """sqrt(5) r (A, B)."""
         a, b = a / self.lengthscale, b / self.lengthscale
         square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
-        r = _SQRT5 * square.clamp_min(1e-20).sqrt()
-        return (1 + r + r**2 / 3) * torch.exp(-r)
+        return _SQRT5 * square.clamp_min(1e-20).sqrt()
 
     def predict(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (B,) and sd (B,) of the smooth function at theta (B, N), in units of y; differentiable."""
@@ -83,6 +87,23 @@ class GaussianProcess:
         mean = self.location + self.scale * (self.level + (correlation * self._weights).sum(0))
         white = torch.linalg.solve_triangular(self._factor, correlation, upper=False)
         return mean, self.scale * (1 - (white**2).sum(0)).clamp_min(1e-12).sqrt()
+
+    def slopes(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What ``predict`` gives at theta (B, N), and the gradients (B, N) of both: by hand, at a fraction of autograd's time."""
+        r = self._distance(self.x, theta)
+        decay = torch.exp(-r)
+        correlation, along = (1 + r + r**2 / 3) * decay, (1 + r) * decay * (-5 / 3)
+        white = torch.linalg.solve_triangular(self._factor, correlation, upper=False)
+        solved = torch.linalg.solve_triangular(self._factor.T, white, upper=True)
+        mean = self.location + self.scale * (self.level + (correlation * self._weights).sum(0))
+        share = (1 - (white**2).sum(0)).clamp_min(1e-12).sqrt()
+        by_mean = self._pulled(theta, along * self._weights)
+        by_sd = self._pulled(theta, along * solved) / -share[:, None]
+        return mean, self.scale * share, self.scale * by_mean, self.scale * by_sd
+
+    def _pulled(self, theta: Tensor, weight: Tensor) -> Tensor:
+        """sum_i weight_ib (theta_b - x_i) / lengthscale^2 (B, N)."""
+        return (weight.sum(0)[:, None] * theta - weight.T @ self.x) / self.lengthscale**2
 
     def with_data(self, x: Tensor, y: Tensor) -> GaussianProcess:
         """The same hyper-parameters with other data."""
