@@ -73,8 +73,13 @@ class PlainDdpg:
                 y = y.clamp(-1 / (1 - self.settings.discount), 0)
         self.step(0, critic, ((critic(torch.cat([s, a], 1))[:, 0] - y) ** 2).mean())
         squashed = actor(s).tanh()
-        value = critic(torch.cat([s, self.squash(actor(s))], 1)).mean()
-        self.step(1, actor, self.settings.action_penalty * (squashed**2).mean() - value)
+        value = critic(torch.cat([s, self.squash(actor(s))], 1))
+        loss = self.settings.action_penalty * (squashed**2).mean() - value.mean()
+        if self.settings.cloning:
+            shown, half = self.settings.demonstrated, (self.agent.action_high - self.agent.action_low) / 2
+            away = (self.squash(actor(s)) - a)[-shown:] / half
+            loss = loss + self.settings.cloning * value.abs().mean().detach() * (away**2).mean()
+        self.step(1, actor, loss)
         with torch.no_grad():
             for network, target in ((actor, target_actor), (critic, target_critic)):
                 for p, q in zip(network.parameters(), target.parameters(), strict=True):
@@ -94,8 +99,9 @@ class PlainDdpg:
         Settings(hidden=(16, 8)),
         Settings(hidden=(16, 8), layer_norm=True),
         Settings(hidden=(16, 8), clip_targets=True, action_penalty=0.5, tau=0.05),
+        Settings(hidden=(16, 8), batch=BATCH, demonstration_share=0.4, cloning=1.5),
     ],
-    ids=["published", "layer norm", "hindsight's"],
+    ids=["published", "layer norm", "hindsight's", "cloning"],
 )
 def test_updates_are_those_of_autograd(settings: Settings) -> None:
     agent = Agent(SEEN, DONE, -2.0, 3.0, settings, np.random.default_rng(0))

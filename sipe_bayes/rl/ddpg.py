@@ -13,8 +13,10 @@ Deviations from the 2018 paper's DDPG: hidden layers of 256 and 256, Adam at 3e-
 had them in their repository; before: 400 and 300, 1e-3, 100. Random actions at the start: 25,000 steps on every task.
 Options (``sipe_bayes.rl.settings``), each off unless asked for and each a deviation: ``normalise`` (observations), ``layer_norm``
 (critic's hidden layers; Ba, Kiros, Hinton, "Layer Normalization", 2016, https://arxiv.org/abs/1607.06450), ``n_step``
-(returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``lanes`` (environments stepped
-together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
+(returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``cloning`` (the actor's loss also has the
+mean squared distance from what the demonstrations do: Nair et al., "Overcoming Exploration in Reinforcement Learning with
+Demonstrations", 2018, https://arxiv.org/abs/1709.10089, without their filter and in units of the mean |Q|, as Fujimoto, Gu, "A Minimalist
+Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860), ``lanes`` (environments stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
 experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
 
 The two networks are small and of one kind, so gradients are written out by hand on flat vectors of parameters: the
@@ -152,7 +154,7 @@ class Agent:
         values, tape = self.critic.forward(pairs)
         self.critic.backward(tape, (values - targets).mul_(2 / len(values)))
         self._critic_optimiser.step()
-        self._climb(observations)
+        self._climb(observations, batch.actions)
         for network, target in ((self.actor, self.target_actor), (self.critic, self.target_critic)):
             target.parameters.lerp_(network.parameters, self.settings.tau)
         self.updates += 1
@@ -200,7 +202,7 @@ class Agent:
         found = torch.addcmul(returns[:, None], discounts[:, None], values)
         return found.clamp_(-1 / (1 - self.settings.discount), 0.0) if self.settings.clip_targets else found
 
-    def _climb(self, observations: Tensor) -> None:
+    def _climb(self, observations: Tensor, actions: Float32Array) -> None:
         """The actor's step: along the critic's slope in the action, times what squashes it."""
         outputs, tape = self.actor.forward(observations)
         squashed = outputs.tanh_()
@@ -210,6 +212,10 @@ class Agent:
         inner = slope[:, self.observation_size :] * self._half
         if self.settings.action_penalty:
             inner = inner.add_(squashed, alpha=2 * self.settings.action_penalty / squashed.numel())
+        if self.settings.cloning:
+            shown = self.settings.demonstrated
+            away = squashed[-shown:] - torch.from_numpy(actions[-shown:] - self._middle).div_(self._half)
+            inner[-shown:] += 2 * self.settings.cloning * values.abs().mean() / away.numel() * away
         self.actor.backward(tape, inner.mul_(1 - squashed * squashed))
         self._actor_optimiser.step()
 

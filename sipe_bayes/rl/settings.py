@@ -31,6 +31,9 @@ class Settings:
     layer_norm: bool = _setting(False, "Normalise the critic's hidden layers.")
     n_step: int = _setting(1, "Rewards that a return sums before the critic is asked.", 1)
     demonstration_share: float = _setting(0.0, "Of each batch, from the demonstrations.", high=1)
+    cloning: float = _setting(
+        0.0, "Weight of the distance from the demonstrations' actions in the actor's loss, in mean |Q|."
+    )
     lanes: int = _setting(1, "Environments stepped together, before their updates.", 1)
     updates_per_step: float = _setting(1.0, "Updates for each control step.")
     clip_targets: bool = _setting(False, "Clip targets to what rewards from -1 to 0 allow.")
@@ -47,8 +50,15 @@ class Settings:
                 raise ValueError(f"{f.name}: expected a number {bounds}, got {value}")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"hidden: expected the sizes of one or more layers, got {self.hidden}")
+        if self.cloning and not self.demonstration_share:
+            raise ValueError(f"cloning: {self.cloning} needs demonstrations; set demonstration_share, or leave it out")
         if self.clip_targets and self.discount == 1:
             raise ValueError("clip_targets: expected a discount below 1, got 1; leave one of them out")
+
+    @property
+    def demonstrated(self) -> int:
+        """Transitions of a batch that come from the demonstrations, its last ones."""
+        return round(self.demonstration_share * self.batch)
 
     def deviations(self) -> dict[str, Any]:
         """The settings that are not at their defaults."""

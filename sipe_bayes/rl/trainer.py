@@ -164,7 +164,7 @@ class Trainer:
         count = self.settings.batch
         if self._shown is None:
             return self.replay.sample(self._picks, count)
-        shown = round(self.settings.demonstration_share * count)
+        shown = self.settings.demonstrated
         parts = [b.sample(self._picks, n) for b, n in ((self.replay, count - shown), (self._shown, shown)) if n]
         return Batch(*(np.concatenate([getattr(p, name) for p in parts]) for name in Batch.__annotations__))
 
