@@ -78,7 +78,7 @@ class PlainDdpg:
         if self.settings.cloning:
             shown, half = self.settings.demonstrated, (self.agent.action_high - self.agent.action_low) / 2
             away = (self.squash(actor(s)) - a)[-shown:] / half
-            loss = loss + self.settings.cloning * value.abs().mean().detach() * (away**2).mean()
+            loss = loss + self.settings.cloning * value.abs().mean().detach() * (away**2).sum(1).mean()
         self.step(1, actor, loss)
         with torch.no_grad():
             for network, target in ((actor, target_actor), (critic, target_critic)):

@@ -14,7 +14,7 @@ had them in their repository; before: 400 and 300, 1e-3, 100. Random actions at 
 Options (``sipe_bayes.rl.settings``), each off unless asked for and each a deviation: ``normalise`` (observations), ``layer_norm``
 (critic's hidden layers; Ba, Kiros, Hinton, "Layer Normalization", 2016, https://arxiv.org/abs/1607.06450), ``n_step``
 (returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``cloning`` (the actor's loss also has the
-mean squared distance from what the demonstrations do: Nair et al., "Overcoming Exploration in Reinforcement Learning with
+mean squared distance, in half ranges, from what the demonstrations do: Nair et al., "Overcoming Exploration in Reinforcement Learning with
 Demonstrations", 2018, https://arxiv.org/abs/1709.10089, without their filter and in units of the mean |Q|, as Fujimoto, Gu, "A Minimalist
 Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860), ``lanes`` (environments stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
 experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
@@ -215,7 +215,7 @@ class Agent:
         if self.settings.cloning:
             shown = self.settings.demonstrated
             away = squashed[-shown:] - torch.from_numpy(actions[-shown:] - self._middle).div_(self._half)
-            inner[-shown:] += 2 * self.settings.cloning * values.abs().mean() / away.numel() * away
+            inner[-shown:] += 2 * self.settings.cloning * values.abs().mean() / shown * away
         self.actor.backward(tape, inner.mul_(1 - squashed * squashed))
         self._actor_optimiser.step()
 

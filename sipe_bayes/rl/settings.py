@@ -32,7 +32,7 @@ class Settings:
     n_step: int = _setting(1, "Rewards that a return sums before the critic is asked.", 1)
     demonstration_share: float = _setting(0.0, "Of each batch, from the demonstrations.", high=1)
     cloning: float = _setting(
-        0.0, "Weight of the distance from the demonstrations' actions in the actor's loss, in mean |Q|."
+        0.0, "Weight of the squared distance from the demonstrations' actions in the actor's loss, in mean |Q|."
     )
     lanes: int = _setting(1, "Environments stepped together, before their updates.", 1)
     updates_per_step: float = _setting(1.0, "Updates for each control step.")
