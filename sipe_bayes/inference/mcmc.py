@@ -34,9 +34,11 @@ from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import Laplace, distinct_modes, free_noise, longest_tau
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
+from sipe_bayes.inference.window_noise import free_noise, longest_tau
 from sipe_bayes.likelihood import BudgetExhausted, Windows
 from sipe_bayes.noise import Marginal, Noise, Pulls, noise_covariance
 from sipe_bayes.posterior import GaussianMixture, Particles
