@@ -42,6 +42,10 @@ class BudgetExhausted(RuntimeError):
     """Raised instead of simulating beyond the budget."""
 
 
+class BudgetTooSmall(ValueError):
+    """A budget that ran out before there was anything to estimate from."""
+
+
 @dataclass(frozen=True)
 class Segments:
     """Multiple shooting with white or autoregressive noise.

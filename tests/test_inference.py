@@ -10,7 +10,7 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import Segments
+from sipe_bayes.likelihood import BudgetTooSmall, Segments
 from sipe_bayes.parameters import Parameter
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -128,7 +128,12 @@ def test_wrong_input() -> None:
         (lambda: get_estimator(simulator, "laplace", restarts=0), ValueError, "restarts"),
         (lambda: get_estimator(simulator, "mcmc", walkers=3), ValueError, "walkers"),
         (lambda: get_estimator(simulator, "mcmc", likelihood=Segments(noise="sandwich")), ValueError, "use 'ar1'"),
-        (lambda: get_estimator(simulator, "laplace", budget=12).fit(trajectory), ValueError, "raise the budget"),
+        (lambda: get_estimator(simulator, "laplace", budget=12).fit(trajectory), BudgetTooSmall, "raise the budget"),
+        (
+            lambda: get_estimator(simulator, "mcmc", budget=12).fit(trajectory),
+            BudgetTooSmall,
+            "^budget: 12 rollouts did not suffice for the laplace fit that comes first; raise it$",
+        ),
         (lambda: get_estimator(simulator, "laplace").fit(other), ValueError, "expected observations of the 1 channels"),
         (lambda: get_estimator(simulator, "laplace").fit(silent), ValueError, "no sample at all"),
         (lambda: get_estimator(simulator, "laplace").fit([]), ValueError, "at least one"),

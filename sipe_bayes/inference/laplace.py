@@ -36,6 +36,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetTooSmall
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
@@ -101,7 +102,7 @@ class Laplace(Estimator):
 
     def posterior(self, state: State, trajectories: Trajectories) -> GaussianMixture:
         if not len(state["mode_theta"]):
-            raise ValueError(
+            raise BudgetTooSmall(
                 f"budget: {self.budget} rollouts were not enough for one optimum; "
                 f"one step takes {self._cost(trajectories)} rollouts, so raise the budget"
             )
