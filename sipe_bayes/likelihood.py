@@ -25,7 +25,8 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.noise import Moments, Noise, Sequence, sequences, whiten
+from sipe_bayes.noise import Moments, Noise, whiten
+from sipe_bayes.sequences import Sequence, sequences
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
 

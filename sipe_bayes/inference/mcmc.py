@@ -40,7 +40,9 @@ from sipe_bayes.inference.state import State
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.inference.window_noise import free_noise, longest_tau
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
-from sipe_bayes.noise import Marginal, Noise, Pulls, noise_covariance
+from sipe_bayes.marginal import Marginal
+from sipe_bayes.noise import Noise, Pulls
+from sipe_bayes.noise_spread import noise_covariance
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories

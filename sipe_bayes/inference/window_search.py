@@ -38,7 +38,8 @@ from sipe_bayes.inference.window_noise import (
     same_noise,
 )
 from sipe_bayes.likelihood import Linearisation, Windows
-from sipe_bayes.noise import Arrow, Moments, Noise, eliminate, noise_cloud, restricted, sandwich
+from sipe_bayes.noise import Arrow, Moments, Noise, eliminate, restricted
+from sipe_bayes.noise_spread import noise_cloud, sandwich
 
 FloatArray = NDArray[np.float64]
 
