@@ -28,7 +28,7 @@ from sipe_bayes.atomic import write_bytes, write_text
 from sipe_bayes.benchmark.tables import order_estimators, order_tasks
 from sipe_bayes.benchmark.transfer import REFERENCES, SETTING, TRUTH, TransferRecord
 from sipe_bayes.benchmark.transfer_run import load
-from sipe_bayes.diagnostics.plots import CHAINS, DEFAULT, MEASURED, PRIOR, _figure, _styled, png
+from sipe_bayes.diagnostics.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, _figure, _styled, png
 
 FloatArray = NDArray[np.float64]
 
