@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows, fitted_channels
-from sipe_bayes.noise import sequences
+from sipe_bayes.sequences import sequences
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]

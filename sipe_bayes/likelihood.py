@@ -25,7 +25,8 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.noise import Moments, Noise, Sequence, sequences, whiten
+from sipe_bayes.noise import Moments, Noise, whiten
+from sipe_bayes.sequences import Sequence, sequences
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
 
@@ -40,6 +41,10 @@ _SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements in
 
 class BudgetExhausted(RuntimeError):
     """Raised instead of simulating beyond the budget."""
+
+
+class BudgetTooSmall(ValueError):
+    """A budget that ran out before there was anything to estimate from."""
 
 
 @dataclass(frozen=True)

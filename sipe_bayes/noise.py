@@ -17,57 +17,20 @@ Biometrika 58): -2 l_R = log|V| + log|A| + r' V^-1 r - b' A^-1 b, A = J' V^-1 J 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import NDArray
+
+from sipe_bayes.minimise import minimise
+from sipe_bayes.sequences import Sequence
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _RIDGE = 1e-12  # of a parameter's own precision
-_LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
-_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-3, 100, 2.0  # of the search for the noise: nats, steps, of a logarithm
 _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """The observed samples of one channel in order of time: rows of the flattened (W * L) samples.
-
-    index (n,), previous (n,; -1 begins a sequence), window (n,), gap (n,) an index into ``gaps`` seconds
-    (ascending; inf where a sequence begins).
-    """
-
-    index: IntArray
-    previous: IntArray
-    window: IntArray
-    crosses: NDArray[np.bool_]
-    gap: IntArray
-    gaps: FloatArray
-
-
-def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
-    """One Sequence per channel. observed (W, L, C): samples that count; sample (W, L): their number within the log;
-    log (W,): the log of each window; dt (W,): seconds per sample."""
-    _, length, channels = observed.shape
-    found = []
-    for c in range(channels):
-        index = np.flatnonzero(observed[:, :, c].ravel())
-        window, number = index // length, sample.ravel()[index]
-        steps = np.diff(number, prepend=0)
-        linked = np.zeros(len(index), bool)
-        if len(index) > 1:
-            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
-        previous = np.where(linked, np.concatenate([[-1], index[:-1]])[: len(index)], -1)
-        seconds = np.where(linked, steps * dt[window], np.inf)
-        gaps, gap = np.unique(np.asarray(np.round(seconds, 12), np.float64), return_inverse=True)
-        crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
-        found.append(Sequence(index, previous, window, crosses, gap, gaps))
-    return found
 
 
 def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
@@ -88,16 +51,6 @@ def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> F
     a = coefficients(sequence.gaps, tau)[sequence.gap]
     before = np.where(sequence.previous >= 0, residual[..., sequence.previous], 0.0)
     return (residual[..., sequence.index] - a * before) / (sd * np.sqrt(1 - a**2))
-
-
-def log_determinant(all_sequences: list[Sequence], noise: Noise) -> float:
-    """log|V| of the residual covariance."""
-    total = 0.0
-    for c, s in enumerate(all_sequences):
-        a = coefficients(s.gaps, float(noise.tau[c]))
-        counts = np.bincount(s.gap, minlength=len(s.gaps))
-        total += float(counts @ np.log(noise.sd[c] ** 2 * (1 - a**2)))
-    return total
 
 
 class Moments:
@@ -423,179 +376,4 @@ def estimate_noise(
     counts = np.array([len(s.index) for s in moments.sequences], float)
     ratio = shortest / np.exp(tau)
     information = [2 * counts, counts * ratio**2 / np.maximum(np.expm1(2 * ratio), 1e-300)][: 1 + coloured]
-    return unpack(_minimise(loss, x0, bounds, np.concatenate(information)))
-
-
-def _minimise(
-    loss: Callable[[FloatArray], tuple[float, FloatArray]], x: FloatArray, bounds: FloatArray, curvature: FloatArray
-) -> FloatArray:
-    """Minimiser within bounds (2, n) of a smooth loss in nats, by BFGS steps from a first diagonal ``curvature`` (n,).
-
-    SciPy's L-BFGS-B stops early on these losses and its steps cost more than they do."""
-    hessian = np.diag(np.maximum(curvature, 1.0))
-    value, slope = loss(x)
-    for _ in range(_MOST_STEPS):
-        low, high = np.maximum(bounds[0] - x, -_LONGEST_STEP), np.minimum(bounds[1] - x, _LONGEST_STEP)
-        move, factor, index = np.zeros(len(x)), np.zeros((len(x), len(x) + 7)), np.zeros(len(x), np.int32)
-        if mujoco.mju_boxQP(move, factor, index, hessian, slope, low, high) < 0:
-            return x
-        expected = -float(slope @ move + 0.5 * move @ hessian @ move)
-        if expected < _GAIN:
-            return x
-        trial, steeper = loss(x + move)
-        while value - trial < 1e-4 * expected and np.abs(move).max() > 1e-9:
-            move = 0.3 * move
-            trial, steeper = loss(x + move)
-        if trial >= value:
-            return x
-        bend, along = steeper - slope, hessian @ move
-        if bend @ move < 0.1 * (move @ along):  # Powell's damping keeps the Hessian positive
-            mix = 0.9 * (move @ along) / (move @ along - bend @ move)
-            bend = mix * bend + (1 - mix) * along
-        hessian += np.outer(bend, bend) / (bend @ move) - np.outer(along, along) / (move @ along)
-        x, value, slope = x + move, trial, steeper
-    return x
-
-
-def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArray) -> FloatArray:
-    """Covariance of the ``free`` entries of (log sd (C), log tau (C)): inverse curvature of the restricted likelihood
-    at ``noise``, sds held between 0.01 and 1."""
-    if not len(free):
-        return np.zeros((0, 0))
-    centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
-
-    def slopes(x: FloatArray) -> FloatArray:
-        logs = centre.copy()
-        logs[free] += x
-        _, by_sd, by_tau = restricted_slopes(moments, _from_logs(logs, noise), pulls)
-        return np.concatenate([by_sd, by_tau])[free]
-
-    h, here = 1e-3, slopes(np.zeros(len(free)))
-    curvature = np.array([(here - slopes(step)) / h for step in h * np.eye(len(free))])
-    eigenvalues, axes = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    return (axes / np.clip(eigenvalues, 1.0, 1e4)) @ axes.T
-
-
-def _from_logs(logs: FloatArray, like: Noise) -> Noise:
-    """Noise of (log sd, log tau); channels that are white in ``like`` stay white."""
-    channels = len(like.sd)
-    return Noise(np.exp(logs[:channels]), np.where(like.tau > 0, np.exp(logs[channels:]), 0.0))
-
-
-def noise_cloud(
-    moments: Moments, noise: Noise, pulls: Pulls, free: IntArray, longest: float
-) -> list[tuple[float, Noise]]:
-    """Weighted points that stand for the uncertainty of the noise: two along each principal axis of its covariance, at
-    sqrt(dimensions) sds, weighted by the restricted likelihood against its normal approximation."""
-    if not len(free):
-        return [(1.0, noise)]
-    covariance, d = noise_covariance(moments, noise, pulls, free), len(free)
-    eigenvalues, axes = np.linalg.eigh(covariance)
-    best = restricted(moments, noise, pulls)
-    centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
-    points = []
-    for direction in np.concatenate(
-        [axes.T * np.sqrt(d * eigenvalues)[:, None], -axes.T * np.sqrt(d * eigenvalues)[:, None]]
-    ):
-        logs = centre.copy()
-        logs[free] += direction
-        logs[len(noise.sd) :] = np.minimum(logs[len(noise.sd) :], np.log(longest))
-        point = _from_logs(logs, noise)
-        surplus = restricted(moments, point, pulls) - best + d / 2
-        points.append((float(np.exp(np.clip(surplus, -2.0, 2.0))), point))
-    total = sum(w for w, _ in points)
-    return [(w / total, point) for w, point in points]
-
-
-def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
-    """X' V X (N, N) of the rows X (n, N) of one channel, V its residual covariance.
-
-    With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion."""
-    a = coefficients(sequence.gaps, tau)[sequence.gap]
-    scale = sd * np.sqrt(1 - a**2)
-    z = np.empty_like(rows)
-    carried = np.zeros(rows.shape[1])
-    for i in range(len(rows) - 1, -1, -1):
-        z[i] = scale[i] * (rows[i] + carried)
-        carried = a[i] / scale[i] * z[i]
-    return z.T @ z
-
-
-def sandwich(
-    jacobian: FloatArray, slope: FloatArray, white: FloatArray, all_sequences: list[Sequence], noise: Noise
-) -> FloatArray:
-    """The middle (N, N) of the sandwich covariance H^-1 M H^-1 of plain least squares under coloured noise.
-
-    jacobian (W, L, C, N + D); slope (W, D, N): how the starts answer to theta; white (C,): the sds by which least squares
-    weighs the channels; noise: what the residuals really look like. (Huber 1967, "The behavior of maximum likelihood
-    estimates under nonstandard conditions", Berkeley Symposium 5.)"""
-    n = slope.shape[2]
-    projected = jacobian[..., :n] - np.einsum("wlcd,wdn->wlcn", jacobian[..., n:], slope)
-    flat = projected.reshape(-1, projected.shape[2], n)
-    return sum(  # type: ignore[return-value]
-        coloured_square(flat[s.index, c] / white[c] ** 2, s, float(noise.sd[c]), float(noise.tau[c]))
-        for c, s in enumerate(all_sequences)
-    )
-
-
-class Marginal:
-    """Log-likelihood of residuals with the starts integrated out, for many residuals and noises at once.
-
-    jacobian (W, L, C, D) of the prediction by the window's start, taken as constant; precision (D,) of the starts' prior.
-    """
-
-    def __init__(self, all_sequences: list[Sequence], jacobian: FloatArray, precision: FloatArray) -> None:
-        self.sequences, self.precision = all_sequences, precision
-        self.windows, self.length, _, self.num_start = jacobian.shape
-        empty = np.zeros(jacobian.shape[:3])
-        self.moments = Moments(empty, jacobian, 0, all_sequences)
-        flat = jacobian.reshape(self.windows * self.length, jacobian.shape[2], self.num_start)
-        self.rows = [flat[s.index, c] for c, s in enumerate(all_sequences)]
-        self.before = [
-            np.where((s.previous >= 0)[:, None], flat[s.previous, c], 0.0) for c, s in enumerate(all_sequences)
-        ]
-        self.edges = [np.searchsorted(s.window, np.arange(self.windows)) for s in all_sequences]
-
-    def __call__(self, residual: FloatArray, starts: FloatArray, sd: FloatArray, tau: FloatArray) -> FloatArray:
-        """(B,) for residuals (B, W, L, C) at starts (B, W, D) with sd and tau (B, C)."""
-        values = np.empty(len(residual))
-        for b in range(len(residual)):
-            noise = Noise(sd[b], tau[b])
-            arrow, square = self._eliminate(residual[b], starts[b], noise)
-            pull = float((starts[b] ** 2 @ self.precision).sum())
-            total = log_determinant(self.sequences, noise) + arrow.log_determinant + square - arrow.explained + pull
-            values[b] = -0.5 * total
-        return values
-
-    def best(self, residual: FloatArray, starts: FloatArray, noise: Noise) -> FloatArray:
-        """The change (W, D) of the starts that minimises the squares, for a residual (W, L, C)."""
-        return self._eliminate(residual, starts, noise)[0].start_offset
-
-    def _eliminate(self, residual: FloatArray, starts: FloatArray, noise: Noise) -> tuple[Arrow, float]:
-        d, flat = self.num_start, residual.reshape(self.windows * self.length, -1)
-        normal, square = self.moments.normal(noise) if d else np.empty(0), 0.0
-        for c, s in enumerate(self.sequences):
-            white = whiten(flat[:, c], s, float(noise.sd[c]), float(noise.tau[c]))
-            square += float(white @ white)
-            if not d:
-                continue
-            a = coefficients(s.gaps, float(noise.tau[c]))[s.gap]
-            scaled = white / (noise.sd[c] * np.sqrt(1 - a**2))
-            own = self.rows[c] * scaled[:, None]
-            lagged = self.before[c] * (-a * scaled)[:, None]
-            right = own + np.where(s.crosses[:, None], 0.0, lagged)
-            normal[:, :d, -1] += _window_sums(right, self.edges[c], s.window, self.windows)
-            crossing = np.where(s.crosses[:, None], lagged, 0.0)
-            normal[:, d : 2 * d, -1] += _window_sums(crossing, self.edges[c], s.window, self.windows)
-        if not d:  # recorded starts
-            none = np.zeros((0, 0))
-            starts, slopes = np.zeros((self.windows, 0)), np.zeros((self.windows, 0, 0))
-            return Arrow(none, np.zeros(0), 0.0, 0.0, 0.0, starts, slopes, none), square
-        return eliminate(normal, 0, self.precision, -self.precision * starts), square
-
-
-def _window_sums(rows: FloatArray, edges: IntArray, window: IntArray, windows: int) -> FloatArray:
-    """Sums (W, D) of rows (n, D) over the samples of each window; windows without samples give zero."""
-    sums = np.add.reduceat(np.concatenate([rows, np.zeros((1, rows.shape[1]))]), edges, axis=0)
-    sums[np.bincount(window, minlength=windows) == 0] = 0.0
-    return sums
+    return unpack(minimise(loss, x0, bounds, np.concatenate(information)))

@@ -138,6 +138,6 @@ def results_table(posterior: Posterior, truth: Any = None) -> Table:
 
 def _save(figure: Figure, path: Path) -> None:
     """Write a PNG file atomically."""
-    from sipe_bayes.diagnostics.plots import png
+    from sipe_bayes.diagnostics.drawing import png
 
     write_bytes(path, png(figure))

@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from sipe_bayes import atomic
-from sipe_bayes.benchmark import bank, cells, measure, records, run
+from sipe_bayes.benchmark import bank, cells, frame, measure, records, run
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import NINE, SUITES, Cell, matches, select, suite
 from sipe_bayes.benchmark.log import recorded
@@ -335,7 +335,7 @@ def test_bad_input_is_one_line(arguments: list[str], words: list[str], tmp_path:
     [
         ({"budget": 61}, ["with budget 61 and not 60"]),
         ({"steps": 7}, ["with steps 7 and not 20"]),
-        ({"versions": {**measure.versions(), "mujoco": "3.9"}}, ["with versions mujoco 3.9 and not mujoco "]),
+        ({"versions": {**frame.versions(), "mujoco": "3.9"}}, ["with versions mujoco 3.9 and not mujoco "]),
     ],
 )
 def test_results_of_another_kind_are_left_alone(

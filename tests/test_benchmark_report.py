@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark import figures, report_contents, report_html, report_latex, tables
+from sipe_bayes.benchmark.commands import report
 from sipe_bayes.benchmark.records import Record, RecordError, plan
-from sipe_bayes.benchmark.report_commands import report
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.posterior import Dirac, Posterior, prior
 

@@ -14,7 +14,8 @@ import torch
 import sipe_bayes as sipe
 from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
 from sipe_bayes.inference import ESTIMATORS
-from sipe_bayes.inference.laplace import Laplace, screen
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.window_search import screen
 from sipe_bayes.trajectory import Trajectories
 from tests.quick import SMALL
 
@@ -241,7 +242,7 @@ def test_many_candidates_find_a_narrow_valley() -> None:
         simulator = sipe.CallableSimulator(steps, space, name="steps", likelihood=0.01)
         estimator = Laplace(simulator, seed=seed, candidates=100)
         trajectories = Trajectories.stack([simulator.trajectory(steps(truth[None])[0])])
-        start = screen(estimator, estimator.windows(trajectories), trajectories)[1]
+        start = screen(estimator, estimator.windows(trajectories))[1]
         draws = estimator.prior.sample((100,), generator=torch.Generator().manual_seed(seed)).numpy()
         reached.append(np.abs(start - truth).mean())
         drawn.append(np.abs(draws - truth).mean(1).min())

@@ -13,19 +13,18 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from sipe_bayes.marginal import Marginal, log_determinant
 from sipe_bayes.noise import (
-    Marginal,
     Moments,
     Noise,
     Pulls,
     coefficients,
     eliminate,
     estimate_noise,
-    log_determinant,
     restricted,
-    sequences,
     whiten,
 )
+from sipe_bayes.sequences import sequences
 
 N, D = 3, 2
 SIGMAS = 5.0

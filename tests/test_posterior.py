@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,12 @@ def posterior(request: pytest.FixtureRequest) -> Posterior:
     name, n = request.param
     if name not in EXAMPLES:
         pytest.fail(f"{name} is registered but has no example here: add one line to EXAMPLES")
+    return example(name, n)
+
+
+@cache
+def example(name: str, n: int) -> Posterior:
+    """Made once: posteriors do not change."""
     return EXAMPLES[name](n)
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import sipe_bayes as sipe
 from sipe_bayes.diagnostics import check_plots, posterior_plots
 from sipe_bayes.diagnostics.calibration import check_calibration
-from sipe_bayes.diagnostics.plots import png
+from sipe_bayes.diagnostics.drawing import png
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, IndependentPrior, Particles, Posterior, uniform
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -13,6 +15,7 @@ import pytest
 import sipe_bayes as sipe
 from sipe_bayes.calibration import run
 from sipe_bayes.config import ConfigError
+from sipe_bayes.diagnostics import report
 
 MODEL = """
 <mujoco>
@@ -86,26 +89,40 @@ def config(folder: Path, name: str, logs: list[int], parameters: str, unit: str 
     return path
 
 
-def test_one_log_after_the_other_is_both_together(tmp_path: Path) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def unreported() -> Iterator[None]:
+    """Reports, which take longer than these fits, have tests of their own."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(report, "write_report", lambda *_: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory, unreported: None) -> Path:
+    """A folder with logs 0 and 1, and the run of log 0 in ``first``."""
+    folder = tmp_path_factory.mktemp("logs")
+    write(folder, MOTOR, 0.4, [0, 1])
+    run(config(folder, "first", [0], MASS), out=folder / "first")
+    return folder
+
+
+def test_one_log_after_the_other_is_both_together(logs: Path) -> None:
     """Bayes' rule: the posterior of log 0 as the prior for log 1 against a fit of both. The noise is estimated in each fit
     for itself, from 400 samples, which alone may move a width by a tenth."""
-    write(tmp_path, MOTOR, 0.4, [0, 1])
-    both = run(config(tmp_path, "both", [0, 1], MASS), out=tmp_path / "both")
-    run(config(tmp_path, "first", [0], MASS), out=tmp_path / "first")
-    earlier = str(tmp_path / "first" / "posterior")
-    then = run(config(tmp_path, "then", [1], MASS, prior=earlier), out=tmp_path / "then")
+    both = run(config(logs, "both", [0, 1], MASS), out=logs / "both")
+    earlier = str(logs / "first" / "posterior")
+    then = run(config(logs, "then", [1], MASS, prior=earlier), out=logs / "then")
     for a, b in zip(then.parameters, both.parameters, strict=True):
         print(a.name, (a.mean - b.mean) / b.sd, a.sd / b.sd)
         assert abs(a.mean - b.mean) < 0.3 * b.sd
         assert a.sd == pytest.approx(b.sd, rel=0.15)
     assert not any("counted twice" in w for w in then.warnings)
-    again = run(config(tmp_path, "again", [0], MASS, prior=earlier), out=tmp_path / "again")
+    again = run(config(logs, "again", [0], MASS, prior=earlier), out=logs / "again")
     assert any("counted twice" in w and "log0" in w for w in again.warnings)
 
 
-def test_an_earlier_posterior_of_another_unit_is_refused(tmp_path: Path) -> None:
-    write(tmp_path, MOTOR, 0.4, [0])
-    run(config(tmp_path, "first", [0], MASS), out=tmp_path / "first")
+def test_an_earlier_posterior_of_another_unit_is_refused(logs: Path, tmp_path: Path) -> None:
+    shutil.copytree(logs, tmp_path, dirs_exist_ok=True)
     side = tmp_path / "first" / "posterior.json"
     text = json.loads(side.read_text())
     text["space"][0]["unit"] = "g"

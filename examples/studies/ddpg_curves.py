@@ -27,7 +27,7 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.atomic import write_text
-from sipe_bayes.diagnostics.plots import CHAINS, _figure, _styled
+from sipe_bayes.diagnostics.drawing import CHAINS, _figure, _styled
 from sipe_bayes.output import to_json
 from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.settings import Settings

@@ -24,7 +24,7 @@ import difflib
 import fnmatch
 import inspect
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -215,11 +215,11 @@ SUITES = {
 }
 
 
-def suite(name: str) -> list[Cell]:
+def suite(name: str, suites: Mapping[str, Suite] = SUITES) -> list[Cell]:
     """The cells of a suite; raises ValueError for an unknown one."""
-    if name not in SUITES:
-        raise ValueError(f"--suite {name}: expected one of {', '.join(SUITES)}")
-    return list(SUITES[name].cells())
+    if name not in suites:
+        raise ValueError(f"--suite {name}: expected one of {', '.join(suites)}")
+    return list(suites[name].cells())
 
 
 def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
@@ -227,14 +227,15 @@ def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
 
     A pattern is a shell's (``half_cheetah*/adr/*``); capitals and underscores do not count, and it may stop at any ``/``."""
     cells = suite(name)
-    if not patterns:
-        return cells
-    chosen = [{cell.id for cell in cells if matches(cell.id, pattern)} for pattern in patterns]
-    for pattern, found in zip(patterns, chosen, strict=True):
-        if not found:
-            raise ValueError(f"--select {pattern}: {_no_match(name, cells, pattern)}")
-    wanted = set().union(*chosen)
-    return [cell for cell in cells if cell.id in wanted]
+    return matching(cells, patterns, lambda pattern: _no_match(name, cells, pattern))
+
+
+def matching(cells: list[Cell], patterns: Sequence[str], no_match: Callable[[str], str]) -> list[Cell]:
+    """Cells whose id matches one of the patterns, all without any; no_match: what the ValueError says of one that matches none."""
+    for pattern in patterns:
+        if not any(matches(cell.id, pattern) for cell in cells):
+            raise ValueError(f"--select {pattern}: {no_match(pattern)}")
+    return [cell for cell in cells if not patterns or any(matches(cell.id, pattern) for pattern in patterns)]
 
 
 def matches(cell_id: str, pattern: str) -> bool:

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sipe_bayes.benchmark import report_commands
-
 if TYPE_CHECKING:
+    from sipe_bayes.benchmark.cells import Suite
     from sipe_bayes.benchmark.work import Executor
 
 app = typer.Typer(name="benchmark", help="Measure estimators on the benchmark's environments.", no_args_is_help=True)
-app.command()(report_commands.report)
 
 BAD_INPUT = 2
 _INTERRUPTED = 130
 Out = Annotated[Path, typer.Option(help="Folder of results; the same command goes on where it was interrupted.")]
+Folder = Annotated[Path, typer.Argument(help="Folder of results.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+OneSuite = Annotated[str | None, typer.Argument(help="Without one, the suites.")]
+Retry = Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")]
 Jobs = Annotated[int | None, typer.Option(help="Processes of one thread each; default all cores.")]
 Where = Annotated[
     str, typer.Option(help="pool: processes of this machine; ray: a cluster; inline: this process alone.")
@@ -45,6 +47,26 @@ def refusing(then: str = "") -> Iterator[None]:
 
 
 @app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of results, as `sipe benchmark run --out` filled it.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write; default the same folder.")] = None,
+) -> None:
+    """report.html, one self-contained page; report.tex with its figures; report.pdf where pdflatex is installed."""
+    with refusing():
+        from sipe_bayes.benchmark.report_contents import contents
+        from sipe_bayes.benchmark.report_latex import write_reports
+        from sipe_bayes.benchmark.run import not_a_file
+
+        target = folder if out is None else out
+        not_a_file(target)
+        written, note = write_reports(contents(folder), target)
+    for path in written:
+        print(path)
+    if note:
+        print(f"sipe: {note}", file=sys.stderr)
+
+
+@app.command()
 def run(
     suite: Annotated[str, typer.Option(help="See `sipe benchmark cells`.")] = "paper",
     select: Annotated[
@@ -57,7 +79,7 @@ def run(
     jobs: Jobs = None,
     executor: Where = "pool",
     address: Address = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")] = False,
+    retry_failed: Retry = False,
 ) -> None:
     """Measure the cells of a suite that have no record yet; exit code 1 if one failed."""
     with refusing("; the same command goes on"):
@@ -67,28 +89,22 @@ def run(
         at_least_one(budget=budget, steps=steps, training=training, jobs=jobs)
         cells = runs.changed(chosen(suite, select or ()), budget=budget, steps=steps, training=training)
         failed = runs.run(cells, out, executor_of(executor, jobs, address), command_line(), retry_failed, say)
-    if failed:
-        print(f"sipe: {failed} cells failed; `sipe benchmark status {out}` shows why", file=sys.stderr)
-        raise typer.Exit(1)
+    exit_if_failed(f"{failed} cells", failed, f"benchmark status {out}")
 
 
 @app.command()
-def status(
-    folder: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("results"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
-) -> None:
+def status(folder: Folder = Path("results"), as_json: AsJson = False) -> None:
     """How far a run is, what failed, and what it took."""
     with refusing():
         from sipe_bayes.benchmark.status import lines, summary
-        from sipe_bayes.output import to_json
 
         found = summary(folder)
-    print(to_json(found) if as_json else "\n".join(lines(found)))
+    print_status(found, lines, as_json)
 
 
 @app.command()
 def cells(
-    suite: Annotated[str | None, typer.Argument(help="Without one, the suites.")] = None,
+    suite: OneSuite = None,
     select: Annotated[list[str] | None, typer.Option(help="As of `sipe benchmark run`.")] = None,
 ) -> None:
     """The suites, or the ids of a suite's cells."""
@@ -96,10 +112,7 @@ def cells(
         from sipe_bayes.benchmark.cells import SUITES
         from sipe_bayes.benchmark.cells import select as chosen
 
-        if suite is not None:
-            found = [cell.id for cell in chosen(suite, select or ())]
-        else:
-            found = [f"{name}: {len(list(s.cells()))} cells; {s.about}" for name, s in SUITES.items()]
+        found = about(SUITES) if suite is None else [cell.id for cell in chosen(suite, select or ())]
     print("\n".join(found))
 
 
@@ -162,6 +175,25 @@ def at_least_one(**options: float | None) -> None:
     for option, value in options.items():
         if value is not None and value < 1:
             raise ValueError(f"--{option.replace('_', '-')} {value}: expected at least 1; raise it or leave it out")
+
+
+def about(suites: Mapping[str, Suite]) -> list[str]:
+    """A line for each suite."""
+    return [f"{name}: {len(list(suite.cells()))} cells; {suite.about}" for name, suite in suites.items()]
+
+
+def print_status(found: dict[str, Any], lines: Callable[[dict[str, Any]], list[str]], as_json: bool) -> None:
+    """A summary as JSON, or as its ``lines``."""
+    from sipe_bayes.output import to_json
+
+    print(to_json(found) if as_json else "\n".join(lines(found)))
+
+
+def exit_if_failed(what: str, failed: int, status: str) -> None:
+    """Exit code 1 where something failed, with the command that shows why."""
+    if failed:
+        print(f"sipe: {what} failed; `sipe {status}` shows why", file=sys.stderr)
+        raise typer.Exit(1)
 
 
 def say(line: str) -> None:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-import traceback
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +14,9 @@ import torch
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
+from sipe_bayes.benchmark.frame import Files, blank, failed, measured
 from sipe_bayes.benchmark.log import Log, one_step, recorded
-from sipe_bayes.benchmark.records import RECORDS, Record, file_name
+from sipe_bayes.benchmark.records import Record, file_name, posterior_path
 from sipe_bayes.benchmark.work import Done
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.envs.registry import make_task
@@ -29,7 +27,6 @@ from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.simulator import Simulator
 
 POLICIES = "policies"
-_PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "sbi", "botorch")
 _ALONG = (0.1, 0.25, 0.5)  # of the budget, where the history looks at an estimate
 _CANDIDATES = 0.1  # of the budget: starting points of the methods that search a likelihood
 
@@ -47,63 +44,22 @@ class _Found:
     more: dict[str, Any]
 
 
-def versions() -> dict[str, str]:
-    found = {}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = ""
-    return found
-
-
 def run(cell: Cell, folder: Path, command: str) -> Done:
     """Measure a cell. folder: of the results; read for simulations, and a training's checkpoints are kept in it."""
-    began = time.process_time()
-    record = _blank(cell, command)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            record, netcdf = _measured(cell, record, folder)
-    except Exception:  # a failed cell must not stop the others
-        return _failed(record, traceback.format_exc(), time.process_time() - began)
-    files = ((f"{RECORDS}/{file_name(cell.id)}.nc", netcdf), _json(record))
-    line = f"accuracy {record.scores['mean_accuracy']:.3f}, CRPS {record.scores['mean_crps']:.3f}"
-    line += "" if record.seconds is None else f", {record.seconds:.1f} s"
-    return Done(files, line, time.process_time() - began)
+    return measured(blank_record(cell, command), lambda record: _measured(cell, record, folder))
 
 
 def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
     """What a cell comes to whose process does not live to tell."""
-    return _failed(_blank(cell, command), why, 0.0)
+    return failed(blank_record(cell, command), why)
 
 
-def _failed(record: Record, why: str, cpu: float) -> Done:
-    return Done((_json(replace(record, status="failed", traceback=why)),), why.strip().splitlines()[-1], cpu, True)
+def blank_record(cell: Cell, command: str) -> Record:
+    """A cell's record before it is measured."""
+    return blank(Record, cell, command)
 
 
-def _json(record: Record) -> tuple[str, bytes]:
-    return f"{RECORDS}/{file_name(record.id)}.json", record.to_json().encode()
-
-
-def _blank(cell: Cell, command: str) -> Record:
-    return Record(
-        id=cell.id,
-        task=cell.task,
-        estimator=cell.estimator,
-        setting=cell.setting,
-        variant=cell.variant,
-        seed=cell.seed,
-        budget=cell.budget,
-        steps=cell.horizon,
-        status="done",
-        values=dict(cell.values),
-        versions=versions(),
-        command=command,
-    )
-
-
-def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, bytes]:
+def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, str]:
     task = make_task(cell.task)
     log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
     simulator = Simulator(task, num_threads=1)
@@ -134,7 +90,9 @@ def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, bytes]:
         checksums={"model": simulator.checksum(), "log": digest(log.trajectories)},
         **found.more,
     )
-    return record, _netcdf(posterior, cell.seed)
+    line = f"accuracy {scores.mean_accuracy:.3f}, CRPS {scores.mean_crps:.3f}"
+    line += "" if found.seconds is None else f", {found.seconds:.1f} s"
+    return record, ((str(posterior_path(Path(), cell.id)), _netcdf(posterior, cell.seed)),), line
 
 
 def _baseline(cell: Cell, simulator: Simulator) -> _Found:

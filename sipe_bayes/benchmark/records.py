@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from sipe_bayes.atomic import write_text
 from sipe_bayes.output import OutputError, to_json
@@ -35,6 +35,11 @@ class Record:
     along the way, the last one the result. log: who acted, "expert" or "excitation", or "policy". converged: of a cell with a
     policy, whether the last one solves simulators drawn from the estimate; solved_reference: whether it solves the reference.
     """
+
+    FOLDER: ClassVar[str] = ""  # of records and plan, in a folder of results
+    NONE: ClassVar[str] = "no records; make some with `sipe benchmark run"
+    NEVER: ClassVar[str] = "no run was started in it; start one with `sipe benchmark run"
+    FIXED: ClassVar[tuple[str, ...]] = ("budget", "steps", "versions")  # alike in all runs of a cell in one folder
 
     id: str
     task: str
@@ -70,6 +75,16 @@ class Record:
     def done(self) -> bool:
         return self.status == "done"
 
+    @property
+    def failure(self) -> str:
+        """The last line of a failed cell's traceback."""
+        return (self.traceback or "?").strip().splitlines()[-1]
+
+    @property
+    def file(self) -> tuple[str, bytes]:
+        """Path in a folder of results, and content."""
+        return str(record_path(Path(self.FOLDER), self.id)), self.to_json().encode()
+
     def to_json(self) -> str:
         return to_json(asdict(self), indent=1) + "\n"
 
@@ -95,6 +110,35 @@ class Record:
             ) from None
         return record
 
+    @classmethod
+    def all_in(cls, folder: Path) -> list[Self]:
+        """All of this kind in a folder of results, by id; raises RecordError where there is none, or one cannot be read."""
+        found = cls._every(folder)
+        if not found:
+            raise RecordError(f"{folder}: holds {cls.NONE} --out {folder}`")
+        return found
+
+    @classmethod
+    def progress(cls, folder: Path) -> tuple[list[Self], dict[str, Any]]:
+        """Those in a folder of results, perhaps none, and how far it is, as plain data; raises RecordError for a folder in which no run
+        was started."""
+        asked = planned(folder / cls.FOLDER)
+        if not asked:
+            raise RecordError(f"{folder}: {cls.NEVER} --out {folder}`")
+        records = cls._every(folder)
+        known = {record.id for record in records}
+        return records, {
+            "folder": str(folder),
+            "cells": len(asked),
+            "done": sum(record.done for record in records),
+            "failed": {record.id: record.failure for record in records if not record.done},
+            "missing": [cell for cell in asked if cell not in known],
+        }
+
+    @classmethod
+    def _every(cls, folder: Path) -> list[Self]:
+        return [cls.read(path) for path in sorted((folder / cls.FOLDER / RECORDS).glob("[!.]*.json"))]
+
 
 def file_name(cell_id: str) -> str:
     """Of a cell's files, without the ending."""
@@ -111,11 +155,7 @@ def posterior_path(folder: Path, cell_id: str) -> Path:
 
 def load_all(folder: Path) -> list[Record]:
     """All records of a folder of results, by id; raises RecordError where there is none, or one cannot be read."""
-    records = folder / RECORDS
-    found = sorted(path for path in records.glob("*.json") if not path.name.startswith(".")) if records.is_dir() else []
-    if not found:
-        raise RecordError(f"{folder}: holds no records; make some with `sipe benchmark run --out {folder}`")
-    return [Record.read(path) for path in found]
+    return Record.all_in(folder)
 
 
 def planned(folder: Path) -> list[str]:

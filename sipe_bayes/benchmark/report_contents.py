@@ -101,7 +101,7 @@ def contents(folder: Path) -> Contents:
     wanted = planned(folder)
     known = {r.id for r in records}
     missing = [cell for cell in wanted if cell not in known]
-    failed = [(r.id, _last_line(r.traceback)) for r in records if not r.done]
+    failed = [(r.id, r.failure) for r in records if not r.done]
     done = [r for r in records if r.done]
     state = [f"{len(done):,} cells finished", f"{len(failed):,} failed"]
     state.append(
@@ -116,11 +116,6 @@ def contents(folder: Path) -> Contents:
         warnings=warning_counts(done),
         planned=len(wanted),
     )
-
-
-def _last_line(traceback: str | None) -> str:
-    lines = [line for line in (traceback or "").splitlines() if line.strip()]
-    return lines[-1].strip() if lines else "no traceback"
 
 
 def _grouped(missing: Sequence[str]) -> list[tuple[str, str, int, str]]:

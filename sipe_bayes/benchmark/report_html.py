@@ -12,7 +12,7 @@ import jinja2
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents
 from sipe_bayes.benchmark.tables import Table
-from sipe_bayes.diagnostics.plots import png
+from sipe_bayes.diagnostics.drawing import png
 from sipe_bayes.diagnostics.sipe_plot import two_lines
 
 

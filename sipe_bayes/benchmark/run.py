@@ -10,10 +10,11 @@ import fcntl
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from sipe_bayes.atomic import write_bytes, write_text
@@ -41,7 +42,7 @@ def run(
     is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
     budgets or lengths, or that another run is at work in, and OSError where it cannot be written."""
     with claimed(folder):
-        left = [cell for cell in cells if not finished(cell, folder, retry_failed)]
+        left = lacking(cells, folder, retry_failed)
         plan(folder, [cell.id for cell in cells])
         report(f"{len(cells)} cells, {len(cells) - len(left)} of them there already")
         if not left:
@@ -60,11 +61,16 @@ def simulate(
         return len(units)
 
 
+def not_a_file(folder: Path) -> None:
+    """Raises OutputError where the folder to write into is a file."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+
+
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
     """The folder, made if need be, for one run at a time."""
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+    not_a_file(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / _LOCK).open("w") as lock:
         try:
@@ -76,25 +82,27 @@ def claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def finished(cell: Cell, folder: Path, retry_failed: bool) -> bool:
-    path = record_path(folder, cell.id)
+def lacking(
+    cells: Iterable[Cell], folder: Path, retry_failed: bool, blank: Callable[[Cell, str], Record] = measure.blank_record
+) -> list[Cell]:
+    """The cells that have no record in a folder of results, or with retry_failed a failed one. blank: makes their records. Raises
+    OutputError for a record with other entries than its cell's."""
+    return [cell for cell in cells if not _finished(blank(cell, ""), folder, retry_failed)]
+
+
+def _finished(mine: Record, folder: Path, retry_failed: bool) -> bool:
+    path = record_path(folder / mine.FOLDER, mine.id)
     if not path.is_file():
         return False
-    found = Record.read(path)
-    mine: dict[str, Any] = {"budget": cell.budget, "steps": cell.horizon, "versions": measure.versions()}
-    check_alike(cell, folder, found, mine)
-    return found.done or not retry_failed
-
-
-def check_alike(cell: Cell, folder: Path, found: Record, mine: dict[str, Any]) -> None:
-    """Raises OutputError for a cell's record with other entries than ``mine``."""
-    for name, value in mine.items():
-        there = getattr(found, name)
-        if there != value:
+    found = mine.read(path)
+    for name in mine.FIXED:
+        there, here = getattr(found, name), getattr(mine, name)
+        if there != here:
             raise OutputError(
-                f"--out {folder}: holds {cell.id} with {name} {_differing(there, value)} and not {_differing(value, there)}; "
+                f"--out {folder}: holds {mine.id} with {name} {_differing(there, here)} and not {_differing(here, there)}; "
                 "choose another folder"
             )
+    return found.done or not retry_failed
 
 
 def _differing(one: Any, other: Any) -> Any:
@@ -114,11 +122,16 @@ def units_of(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:
     made = {which: bank.shards(which, budget, bank.known_place(which, folder)) for which, budget in banks.items()}
     units = [shard for shards in made.values() for shard in shards]
     for cell in cells:
-        arguments = {"cell": cell, "folder": folder.resolve(), "command": command}
         which = _bank(cell)
-        needs = frozenset(shard.name for shard in made[which]) if which is not None else frozenset()
-        units.append(Unit(cell.id, measure.run, arguments, measure.died, needs))
+        needs = [shard.name for shard in made[which]] if which is not None else []
+        units.append(unit(measure, cell, folder, command, needs))
     return units
+
+
+def unit(kind: ModuleType, cell: Cell, folder: Path, command: str, needs: Iterable[str] = ()) -> Unit:
+    """Measuring a cell. kind: ``measure``, or another module with its ``run`` and ``died``."""
+    arguments = {"cell": cell, "folder": folder.resolve(), "command": command}
+    return Unit(cell.id, kind.run, arguments, kind.died, frozenset(needs))
 
 
 def _bank(cell: Cell) -> Bank | None:

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.benchmark.records import Record, RecordError, load_all, planned
+from sipe_bayes.benchmark.records import Record
 from sipe_bayes.benchmark.run import runs
 
 _SHOWN = 20  # missing cells that are named
@@ -14,24 +14,11 @@ _SHOWN = 20  # missing cells that are named
 
 def summary(folder: Path) -> dict[str, Any]:
     """Of a folder of results, as plain data; raises RecordError for another one."""
-    asked = planned(folder)
-    if not asked:
-        raise RecordError(f"{folder}: no run was started in it; start one with `sipe benchmark run --out {folder}`")
-    try:
-        records = {record.id: record for record in load_all(folder)}
-    except RecordError:
-        if any((folder / "records").glob("[!.]*.json")):
-            raise
-        records = {}
-    failed = {r.id: _last_line(r) for r in records.values() if not r.done}
+    records, found = Record.progress(folder)
     return {
-        "folder": str(folder),
-        "cells": len(asked),
-        "done": sum(r.done for r in records.values()),
-        "failed": failed,
-        "missing": [cell for cell in asked if cell not in records],
-        "mixed": _mixed(list(records.values())),
-        "converged": _converged(list(records.values())),
+        **found,
+        "mixed": _mixed(records),
+        "converged": _converged(records),
         "runs": [_used(row) for row in runs(folder)],
     }
 
@@ -47,10 +34,6 @@ def _mixed(records: list[Record]) -> list[str]:
             )
             logs.setdefault(group, set()).add(record.checksums["log"])
     return [group for group, found in logs.items() if len(found) > 1]
-
-
-def _last_line(record: Record) -> str:
-    return (record.traceback or "?").strip().splitlines()[-1]
 
 
 def _converged(records: list[Record]) -> dict[str, str]:
@@ -80,11 +63,8 @@ def _share(part: float, whole: float) -> float | None:
 
 def lines(found: dict[str, Any]) -> list[str]:
     """``summary`` to be read."""
-    missing, failed = found["missing"], found["failed"]
-    said = [
-        f"{found['folder']}: {found['cells']} cells, {found['done']} done, {len(failed)} failed, {len(missing)} missing"
-    ]
-    said += [f"failed: {cell}: {why}" for cell, why in failed.items()]
+    missing = found["missing"]
+    said = [headline(found), *(f"failed: {cell}: {why}" for cell, why in found["failed"].items())]
     said += [f"missing: {cell}" for cell in missing[:_SHOWN]]
     if len(missing) > _SHOWN:
         said.append(f"missing: {len(missing) - _SHOWN} more")
@@ -99,6 +79,12 @@ def lines(found: dict[str, Any]) -> list[str]:
             use += f", {_percent(row['cpu_use_simulating'])} while simulating ({row['simulating']['seconds']:.0f} s)"
         said.append(f"{row['started']}: {use}: {row['command']}")
     return said
+
+
+def headline(found: dict[str, Any]) -> str:
+    """The counts of a summary."""
+    counts = f"{found['done']} done, {len(found['failed'])} failed, {len(found['missing'])} missing"
+    return f"{found['folder']}: {found['cells']} cells, {counts}"
 
 
 def _percent(share: float | None) -> str:

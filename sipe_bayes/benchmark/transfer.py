@@ -25,11 +25,11 @@ https://arxiv.org/abs/1707.01495), without demonstrations.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
-from sipe_bayes.benchmark.cells import PAPER, Cell, matches
+from sipe_bayes.benchmark.cells import PAPER, Cell, Suite, matching, suite
 from sipe_bayes.benchmark.records import Record
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import Task, Variant
@@ -91,6 +91,11 @@ class TransferRecord(Record):
     target; redrawn: theta that no model can have, diverged: episodes, in training.
     """
 
+    FOLDER: ClassVar[str] = "transfer"
+    NONE: ClassVar[str] = "no transfer; make one with `sipe transfer run"
+    NEVER: ClassVar[str] = "no transfer was started in it; start one with `sipe transfer run"
+    FIXED: ClassVar[tuple[str, ...]] = ("training", *Record.FIXED)
+
     training: int = 0
     agent: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, Any] = field(default_factory=dict)
@@ -99,14 +104,6 @@ class TransferRecord(Record):
     kept: int = 0
     redrawn: int = 0
     diverged: int = 0
-
-
-@dataclass(frozen=True)
-class Suite:
-    """Cells under one name."""
-
-    about: str
-    cells: Callable[[], Iterator[Cell]]
 
 
 def cells(
@@ -159,15 +156,9 @@ SUITES = {
 def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
     """The cells of a suite whose id matches one of the patterns, as of `sipe benchmark run`, all without any; raises ValueError for an
     unknown suite and for a pattern that matches none."""
-    if name not in SUITES:
-        raise ValueError(f"--suite {name}: expected one of {', '.join(SUITES)}")
-    found = list(SUITES[name].cells())
-    for pattern in patterns:
-        if not any(matches(cell.id, pattern) for cell in found):
-            raise ValueError(
-                f"--select {pattern}: matches no cell of the suite {name}, such as {found[0].id}; see `sipe transfer cells {name}`"
-            )
-    return [cell for cell in found if not patterns or any(matches(cell.id, pattern) for pattern in patterns)]
+    cells = suite(name, SUITES)
+    such = f"matches no cell of the suite {name}, such as {cells[0].id}; see `sipe transfer cells {name}`"
+    return matching(cells, patterns, lambda _: such)
 
 
 def varied(chosen: Sequence[Cell], **variations: float | None) -> list[Cell]:

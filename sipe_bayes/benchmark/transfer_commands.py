@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,12 +9,19 @@ import typer
 
 from sipe_bayes.benchmark.commands import (
     Address,
+    AsJson,
+    Folder,
     Jobs,
+    OneSuite,
     Out,
+    Retry,
     Where,
+    about,
     at_least_one,
     command_line,
     executor_of,
+    exit_if_failed,
+    print_status,
     refusing,
     say,
 )
@@ -51,7 +57,7 @@ def run(
     jobs: Jobs = None,
     executor: Where = "pool",
     address: Address = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")] = False,
+    retry_failed: Retry = False,
 ) -> None:
     """Measure the cells of a suite that have no record yet, and first the estimates that they need; exit code 1 if one failed."""
     with refusing("; the same command goes on"):
@@ -67,23 +73,17 @@ def run(
         cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
         start = executor_of(executor, jobs, address)
         failed = transfer_run.run(cells, out, start, command_line(), retry_failed, say)
-    if failed:
-        print(f"sipe: {failed} units failed; `sipe transfer status {out}` shows why", file=sys.stderr)
-        raise typer.Exit(1)
+    exit_if_failed(f"{failed} units", failed, f"transfer status {out}")
 
 
 @app.command()
-def status(
-    folder: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("results"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
-) -> None:
+def status(folder: Folder = Path("results"), as_json: AsJson = False) -> None:
     """How far a transfer is, what failed, and what each agent earns in the target."""
     with refusing():
         from sipe_bayes.benchmark.transfer_run import lines, summary
-        from sipe_bayes.output import to_json
 
         found = summary(folder)
-    print(to_json(found) if as_json else "\n".join(lines(found)))
+    print_status(found, lines, as_json)
 
 
 @app.command()
@@ -93,10 +93,11 @@ def report(
 ) -> None:
     """transfer.md, transfer.csv, the bars of the paper's Figure 6 and learning curves."""
     with refusing():
+        from sipe_bayes.benchmark.run import not_a_file
         from sipe_bayes.benchmark.transfer_report import write
 
-        if out is not None and out.exists() and not out.is_dir():
-            raise ValueError(f"--out {out}: is a file, not a folder; choose another name")
+        if out is not None:
+            not_a_file(out)
         written = write(folder, out)
     for path in written:
         print(path)
@@ -104,7 +105,7 @@ def report(
 
 @app.command()
 def cells(
-    suite: Annotated[str | None, typer.Argument(help="Without one, the suites.")] = None,
+    suite: OneSuite = None,
     select: Annotated[list[str] | None, typer.Option(help="As of `sipe transfer run`.")] = None,
 ) -> None:
     """The suites, or the ids of a suite's cells."""
@@ -112,8 +113,6 @@ def cells(
         from sipe_bayes.benchmark.transfer import SUITES
         from sipe_bayes.benchmark.transfer import select as chosen
 
-        if suite is not None:
-            found = [f"{cell.id} ({cell.training:,} control steps)" for cell in chosen(suite, select or ())]
-        else:
-            found = [f"{name}: {len(list(s.cells()))} cells; {s.about}" for name, s in SUITES.items()]
+        cells = [] if suite is None else chosen(suite, select or ())
+        found = about(SUITES) if suite is None else [f"{c.id} ({c.training:,} control steps)" for c in cells]
     print("\n".join(found))

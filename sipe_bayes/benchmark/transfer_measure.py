@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import traceback
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.measure import POLICIES, versions
-from sipe_bayes.benchmark.records import RECORDS, Record, file_name, posterior_path, record_path
+from sipe_bayes.benchmark.frame import Files, blank, failed, measured
+from sipe_bayes.benchmark.measure import POLICIES
+from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
 from sipe_bayes.benchmark.transfer import (
     DEFAULT,
     EPISODES,
@@ -33,57 +32,23 @@ from sipe_bayes.posterior import Dirac, Particles, Posterior, prior
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.simulator import Simulator
 
-FOLDER = "transfer"  # of the records, in a folder of results
 _TARGET_SEED = 4_000_000  # of the target's episodes: other ones than those that a policy is kept by
 
 
 def run(cell: Cell, folder: Path, command: str) -> Done:
     """Measure a cell. folder: of the results; the estimate is read from it, and the training keeps its checkpoint there."""
-    began = time.process_time()
-    record = _blank(cell, command)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            record = _measured(cell, record, folder)
-    except Exception:  # a failed cell must not stop the others
-        return _failed(record, traceback.format_exc(), time.process_time() - began)
-    cpu = time.process_time() - began
-    found = record.evaluation
-    rate = "" if found["success_rate"] is None else f", success {found['success_rate']:.2f}"
-    line = f"return {found['mean']:.1f} in the target{rate}, {record.seconds:.0f} s"
-    return Done((_json(replace(record, cpu_seconds=cpu)),), line, cpu)
+    return measured(blank_record(cell, command), lambda record: _measured(cell, record, folder))
 
 
 def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
     """What a cell comes to whose process does not live to tell."""
-    return _failed(_blank(cell, command), why, 0.0)
+    return failed(blank_record(cell, command), why)
 
 
-def _failed(record: TransferRecord, why: str, cpu: float) -> Done:
-    return Done((_json(replace(record, status="failed", traceback=why)),), why.strip().splitlines()[-1], cpu, True)
-
-
-def _json(record: TransferRecord) -> tuple[str, bytes]:
-    return f"{FOLDER}/{RECORDS}/{file_name(record.id)}.json", record.to_json().encode()
-
-
-def _blank(cell: Cell, command: str) -> TransferRecord:
-    return TransferRecord(
-        id=cell.id,
-        task=cell.task,
-        estimator=cell.estimator,
-        setting=cell.id.split("/")[2],
-        variant=cell.variant,
-        seed=cell.seed,
-        budget=cell.budget,
-        steps=cell.horizon,
-        status="done",
-        values=dict(cell.values),
-        training=cell.training,
-        agent=agent_of(cell).deviations(),
-        versions=versions(),
-        command=command,
-    )
+def blank_record(cell: Cell, command: str) -> TransferRecord:
+    """A cell's record before it is measured."""
+    own = {"setting": cell.id.split("/")[2], "training": cell.training, "agent": agent_of(cell).deviations()}
+    return blank(TransferRecord, cell, command, **own)
 
 
 def randomization(cell: Cell, folder: Path) -> Randomization:
@@ -127,12 +92,13 @@ def _estimated(cell: Cell, folder: Path, space: ParameterSpace) -> Particles:
     return Particles(space.normalise(values).clip(0.0, 1.0), space)
 
 
-def _measured(cell: Cell, record: TransferRecord, folder: Path) -> TransferRecord:
+def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[TransferRecord, Files, str]:
     from sipe_bayes.rl import evaluation
     from sipe_bayes.rl.loop_run import solves
     from sipe_bayes.rl.policy import load_policy
     from sipe_bayes.rl.train import COUNTS, choose, read_curve, train
 
+    began = time.process_time()
     task, own = make_task(cell.task), folder / POLICIES / file_name(cell.id)
     drawn, every = randomization(cell, folder), max(cell.training // POINTS, task.episode_steps)
     policy = train(
@@ -156,7 +122,9 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> TransferRecor
     kept = choose(rows, cell.training)["expert"]
     (mine,) = [row for row in rows if row[0] == kept]
     found, counts = earned(policy, EPISODES), json.loads((own / COUNTS).read_text(encoding="utf-8"))
-    return replace(
+    rate = "" if found["success_rate"] is None else f", success {found['success_rate']:.2f}"
+    line = f"return {found['mean']:.1f} in the target{rate}, {rows[-1][4]:.0f} s"
+    record = replace(
         record,
         seconds=rows[-1][4],
         names=list(task.space.names),
@@ -172,4 +140,6 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> TransferRecor
         solved_reference=solves(task, found["mean"], found["success_rate"]),
         redrawn=counts["redrawn"],
         diverged=counts["diverged"],
+        cpu_seconds=time.process_time() - began,
     )
+    return record, (), line

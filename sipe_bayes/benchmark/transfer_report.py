@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from sipe_bayes.atomic import write_bytes, write_text
 from sipe_bayes.benchmark.tables import order_estimators, order_tasks
 from sipe_bayes.benchmark.transfer import REFERENCES, SETTING, TRUTH, TransferRecord
-from sipe_bayes.benchmark.transfer_measure import FOLDER
 from sipe_bayes.benchmark.transfer_run import load
-from sipe_bayes.diagnostics.plots import CHAINS, DEFAULT, MEASURED, PRIOR, _figure, _styled, png
+from sipe_bayes.diagnostics.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, _figure, _styled, png
 
 FloatArray = NDArray[np.float64]
 
@@ -229,7 +228,7 @@ def write(folder: Path, into: Path | None = None) -> list[Path]:
     returns the paths. Raises RecordError where nothing is finished."""
     from sipe_bayes.benchmark.records import RecordError
 
-    records, target = load(folder), folder / FOLDER if into is None else into
+    records, target = load(folder), folder / TransferRecord.FOLDER if into is None else into
     if not any(r.done for r in records):
         raise RecordError(f"{folder}: every cell of the transfer failed; `sipe transfer status {folder}` shows why")
     found = rows(records)

@@ -13,10 +13,9 @@ from typing import Any
 from sipe_bayes.benchmark import run as runs
 from sipe_bayes.benchmark import transfer_measure
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.measure import versions
-from sipe_bayes.benchmark.records import RECORDS, RecordError, plan, planned, record_path
+from sipe_bayes.benchmark.records import plan
+from sipe_bayes.benchmark.status import headline
 from sipe_bayes.benchmark.transfer import TransferRecord, estimate_of
-from sipe_bayes.benchmark.transfer_measure import FOLDER
 from sipe_bayes.benchmark.work import Executor, Unit
 
 
@@ -31,10 +30,10 @@ def run(
     """Measure the cells that have no record in ``folder`` yet, after the estimates that they need; returns how many failed. Arguments
     and errors as of ``benchmark.run.run``."""
     with runs.claimed(folder):
-        left = [cell for cell in cells if not _finished(cell, folder, retry_failed)]
+        left = runs.lacking(cells, folder, retry_failed, transfer_measure.blank_record)
         estimates = {e.id: e for cell in left if (e := estimate_of(cell)) is not None}
-        lacking = [e for e in estimates.values() if not runs.finished(e, folder, retry_failed)]
-        plan(folder / FOLDER, [cell.id for cell in cells])
+        lacking = runs.lacking(estimates.values(), folder, retry_failed)
+        plan(folder / TransferRecord.FOLDER, [cell.id for cell in cells])
         report(
             f"{len(cells)} cells, {len(cells) - len(left)} of them there already; {len(lacking)} estimates to make first"
         )
@@ -47,59 +46,26 @@ def run(
 
 def _unit(cell: Cell, lacking: Sequence[Cell], folder: Path, command: str) -> Unit:
     estimate = estimate_of(cell)
-    needs = frozenset({estimate.id} if estimate in lacking and estimate is not None else ())
-    arguments = {"cell": cell, "folder": folder.resolve(), "command": command}
-    return Unit(cell.id, transfer_measure.run, arguments, transfer_measure.died, needs)
-
-
-def _finished(cell: Cell, folder: Path, retry_failed: bool) -> bool:
-    path = record_path(folder / FOLDER, cell.id)
-    if not path.is_file():
-        return False
-    mine: dict[str, Any] = {
-        "training": cell.training,
-        "budget": cell.budget,
-        "steps": cell.horizon,
-        "versions": versions(),
-    }
-    found = TransferRecord.read(path)
-    runs.check_alike(cell, folder, found, mine)
-    return found.done or not retry_failed
+    needs = [estimate.id] if estimate is not None and estimate in lacking else []
+    return runs.unit(transfer_measure, cell, folder, command, needs)
 
 
 def load(folder: Path) -> list[TransferRecord]:
     """All records of the transfer in a folder of results, by id; raises RecordError where there is none."""
-    found = sorted(path for path in (folder / FOLDER / RECORDS).glob("*.json") if not path.name.startswith("."))
-    if not found:
-        raise RecordError(f"{folder}: holds no transfer; make one with `sipe transfer run --out {folder}`")
-    return [TransferRecord.read(path) for path in found]
+    return TransferRecord.all_in(folder)
 
 
 def summary(folder: Path) -> dict[str, Any]:
     """How far a folder is, as plain data; raises RecordError for one without a transfer."""
-    asked = planned(folder / FOLDER)
-    if not asked:
-        raise RecordError(f"{folder}: no transfer was started in it; start one with `sipe transfer run --out {folder}`")
-    records = {r.id: r for r in load(folder)} if any((folder / FOLDER).glob(f"{RECORDS}/[!.]*.json")) else {}
-    done = [r for r in records.values() if r.done]
-    return {
-        "folder": str(folder),
-        "cells": len(asked),
-        "done": len(done),
-        "failed": {r.id: (r.traceback or "?").strip().splitlines()[-1] for r in records.values() if not r.done},
-        "missing": [cell for cell in asked if cell not in records],
-        "returns": {r.id: r.evaluation["mean"] for r in done},
-        "training_seconds": sum(r.seconds or 0.0 for r in done),
-    }
+    records, found = TransferRecord.progress(folder)
+    done = [r for r in records if r.done]
+    returns = {r.id: r.evaluation["mean"] for r in done}
+    return {**found, "returns": returns, "training_seconds": sum(r.seconds or 0.0 for r in done)}
 
 
 def lines(found: dict[str, Any]) -> list[str]:
     """``summary`` to be read."""
-    failed, missing = found["failed"], found["missing"]
-    said = [
-        f"{found['folder']}: {found['cells']} cells, {found['done']} done, {len(failed)} failed, {len(missing)} missing; "
-        f"{found['training_seconds']:.0f} s of training"
-    ]
+    said = [f"{headline(found)}; {found['training_seconds']:.0f} s of training"]
     said += [f"{cell}: return {earned:.1f}" for cell, earned in found["returns"].items()]
-    said += [f"failed: {cell}: {why}" for cell, why in failed.items()]
-    return said + [f"missing: {cell}" for cell in missing]
+    said += [f"failed: {cell}: {why}" for cell, why in found["failed"].items()]
+    return said + [f"missing: {cell}" for cell in found["missing"]]

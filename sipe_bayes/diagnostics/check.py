@@ -264,7 +264,7 @@ def _claim(study: Study, folder: Path) -> None:
 
 def _write(found: Finding, folder: Path) -> None:
     from sipe_bayes.diagnostics.check_plots import coverage_curve, rank_check
-    from sipe_bayes.diagnostics.plots import png
+    from sipe_bayes.diagnostics.drawing import png
     from sipe_bayes.output import to_json
 
     write_bytes(folder / "ranks.png", png(rank_check(found.check)))

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.calibration import LEVELS, CalibrationCheck, Uniformity
-from sipe_bayes.diagnostics.plots import (
+from sipe_bayes.diagnostics.drawing import (
     CHAINS,
     DEFAULT,
     MEASURED,

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.result import ChannelScore, Residual, Signal
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Marginal, Noise, whiten
+from sipe_bayes.marginal import Marginal
+from sipe_bayes.noise import Noise, whiten
 from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]

@@ -17,29 +17,31 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from sipe_bayes.diagnostics.plots import (
+from sipe_bayes.diagnostics.drawing import (
     CHAINS,
     DEFAULT,
     MEASURED,
     POSTERIOR,
     PRIOR,
-    _diagonal,
     _figure,
     _line,
+    _short,
+    _styled,
+    _ticks,
+    unit_text,
+)
+from sipe_bayes.diagnostics.panels import (
+    _diagonal,
     _pair,
     _pair_frame,
     _pair_in_prior,
     _prior_density,
     _prior_strip,
     _scale,
-    _short,
-    _styled,
-    _ticks,
     _view,
     correlation,
     density,
     draws,
-    unit_text,
 )
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Posterior

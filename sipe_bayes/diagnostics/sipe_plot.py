@@ -30,7 +30,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
-from sipe_bayes.diagnostics.plots import _figure, _styled
+from sipe_bayes.diagnostics.drawing import _figure, _styled
 
 FloatArray = NDArray[np.float64]
 Results = Mapping[str, Mapping[str, Sequence[Any]]]

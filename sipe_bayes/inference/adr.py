@@ -115,8 +115,6 @@ class ADR(RewardSearch):
         return {**state, "paths": paths, "done": not self.affordable(1, trajectories)}
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
-        if not state["simulated"]:
-            raise ValueError(f"budget: {self.budget} rollouts were not enough for one simulation; raise it")
         self.report(state)
         reward, particles = state["pool_reward"], state["paths"][-1]
         best = state["pool_theta"][reward.argmax()] if np.isfinite(reward).any() else None

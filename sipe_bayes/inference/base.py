@@ -21,7 +21,7 @@ from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.checks import path, whole
 from sipe_bayes.demonstration import Given
 from sipe_bayes.inference.state import State, load_state, save_state
-from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Segments, Windows
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulator import Simulator
@@ -153,7 +153,7 @@ class Estimator(ABC):
 
     def fit(self, trajectories: Recorded) -> Posterior:
         """The posterior given one or several trajectories, or an environment, which stands for its reference demonstrations;
-        raises ValueError for ones that do not fit the simulator."""
+        raises ValueError for ones that do not fit the simulator, and BudgetTooSmall for a budget without an estimate."""
         batch = self._given.stack(self._recorded(trajectories), anew=True)
         fingerprint = self._fingerprint(batch)
         self.warnings, self.diagnostics, self.rollouts, self._bound = [], {}, 0, None
@@ -176,7 +176,7 @@ class Estimator(ABC):
                     self.progress(self.describe(state), self.rollouts, self.budget)
         except BudgetExhausted as error:
             if state is None:
-                raise ValueError(f"budget: {error}; raise it") from None
+                raise BudgetTooSmall(f"budget: {error}; raise it") from None
             self.warn(self._spent())
         self._state = state
         return self._finished(state, batch)
@@ -189,7 +189,7 @@ class Estimator(ABC):
             try:
                 self._state = self._counted(self.start(batch), batch)
             except BudgetExhausted as error:
-                raise ValueError(f"budget: {error}; raise it") from None
+                raise BudgetTooSmall(f"budget: {error}; raise it") from None
         if not self._state["done"]:
             self._recall(self._state)
             try:

@@ -119,8 +119,6 @@ class CEM(Search):
         return {**state, "mean": mean, "covariance": covariance, "means": means, "generations": generations}
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
-        if not state["simulated"]:
-            raise ValueError(f"budget: {self.budget} rollouts were not enough for one simulation; raise it")
         self.report(state)
         good = np.isfinite(state["pool_reward"])
         if not good.any():

@@ -18,7 +18,7 @@ from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
 from sipe_bayes.inference.base import Estimator, Recorded, digest
 from sipe_bayes.inference.state import State
 from sipe_bayes.learned_reward import LearnedReward
-from sipe_bayes.likelihood import BudgetExhausted
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.models.discriminator import HIDDEN
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior.truncated_normal import interval_quantile
@@ -103,7 +103,9 @@ class Search(Estimator):
         return {"units": units, "pool_reward": np.concatenate([state["pool_reward"], reward])[-most:]}
 
     def report(self, state: State) -> None:
-        """Diagnostics and warnings of the simulations; raises ValueError where none was valid."""
+        """Diagnostics and warnings of the simulations; raises BudgetTooSmall without any, and ValueError where none was valid."""
+        if not state["simulated"]:
+            raise BudgetTooSmall(f"budget: {self.budget} rollouts were not enough for one simulation; raise it")
         if state["diverged"] == state["simulated"]:
             raise ValueError(
                 f"budget: {state['simulated']} simulations of {self.budget} rollouts, none of them valid; raise the budget, "

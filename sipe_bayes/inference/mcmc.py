@@ -34,11 +34,15 @@ from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import Laplace, distinct_modes, free_noise, longest_tau
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
-from sipe_bayes.likelihood import BudgetExhausted, Windows
-from sipe_bayes.noise import Marginal, Noise, Pulls, noise_covariance
+from sipe_bayes.inference.window_noise import free_noise, longest_tau
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
+from sipe_bayes.marginal import Marginal
+from sipe_bayes.noise import Noise, Pulls
+from sipe_bayes.noise_spread import noise_covariance
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
@@ -101,9 +105,7 @@ class MCMC(Estimator):
         windows = self.windows(trajectories)
         try:
             found = first.fit(trajectories)
-        except ValueError as error:
-            if not str(error).startswith("budget: "):
-                raise
+        except BudgetTooSmall:
             raise BudgetExhausted(
                 f"{self.budget} rollouts did not suffice for the laplace fit that comes first"
             ) from None
@@ -265,7 +267,7 @@ class MCMC(Estimator):
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
         if not len(state["chain"]):
-            raise ValueError(f"budget: {self.budget} rollouts were not enough for one block of steps; raise it")
+            raise BudgetTooSmall(f"budget: {self.budget} rollouts were not enough for one block of steps; raise it")
         n = len(self.space)
         chain = self._kept(state)
         thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))

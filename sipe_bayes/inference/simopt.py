@@ -142,8 +142,6 @@ class SimOpt(RewardSearch):
         }
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
-        if not state["simulated"]:
-            raise ValueError(f"budget: {self.budget} rollouts were not enough for one simulation; raise it")
         self.report(state)
         mean, covariance = state["means"][-1], state["covariances"][-1]
         self.proposal = GaussianMixture([0.0], mean[None], covariance[None], self.space)

@@ -7,13 +7,12 @@ starting point is dropped once its regression ends where an earlier one did.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.inference.least_squares import QuadraticPrior
+from sipe_bayes.inference.optima import Search
 from sipe_bayes.inference.smoother import (
     Point,
     border,
@@ -26,8 +25,6 @@ from sipe_bayes.inference.smoother import (
     scale,
 )
 from sipe_bayes.inference.state import State
-from sipe_bayes.parameters import ParameterSpace
-from sipe_bayes.posterior import Posterior
 from sipe_bayes.state_space import Chain
 from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
 
@@ -41,25 +38,6 @@ _DROPPED = 0.5  # where the process noise dropped by more than this, in logs
 _INNER = (3, 2)  # steps between them: before the first, later
 _AFTER_FILTER = 4
 _SAME = 0.02  # distance of regressed thetas that is none
-
-
-class Search(Protocol):
-    """What is needed of ``Laplace``."""
-
-    space: ParameterSpace
-    prior: Posterior
-    seed: int
-    restarts: int
-    candidates: int
-    initial: FloatArray | None
-
-    @property
-    def quadratic_prior(self) -> QuadraticPrior: ...
-
-    def warn(self, sentence: str | None) -> None: ...
-
-    def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of the quadratic model of data and prior at theta."""
 
 
 def start(search: Search, chain: Chain) -> State:

@@ -1,0 +1,49 @@
+"""The observed samples of logs in order of time, across windows and gaps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """The observed samples of one channel in order of time: rows of the flattened (W * L) samples.
+
+    index (n,), previous (n,; -1 begins a sequence), window (n,), gap (n,) an index into ``gaps`` seconds
+    (ascending; inf where a sequence begins).
+    """
+
+    index: IntArray
+    previous: IntArray
+    window: IntArray
+    crosses: NDArray[np.bool_]
+    gap: IntArray
+    gaps: FloatArray
+
+
+def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
+    """One Sequence per channel. observed (W, L, C): samples that count; sample (W, L): their number within the log;
+    log (W,): the log of each window; dt (W,): seconds per sample."""
+    _, length, channels = observed.shape
+    found = []
+    for c in range(channels):
+        index = np.flatnonzero(observed[:, :, c].ravel())
+        window, number = index // length, sample.ravel()[index]
+        steps = np.diff(number, prepend=0)
+        linked = np.zeros(len(index), bool)
+        if len(index) > 1:
+            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
+        previous = np.where(linked, np.concatenate([[-1], index[:-1]])[: len(index)], -1)
+        seconds = np.where(linked, steps * dt[window], np.inf)
+        gaps, gap = np.unique(np.asarray(np.round(seconds, 12), np.float64), return_inverse=True)
+        crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
+        found.append(Sequence(index, previous, window, crosses, gap, gaps))
+    return found
