@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-import warnings
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +22,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes import acting
 from sipe_bayes.atomic import write_text
 from sipe_bayes.diagnostics.calibration import check_calibration
 from sipe_bayes.posterior import Particles, prior
@@ -34,9 +34,9 @@ TASK, STEPS, NOISE, LEVEL, DRAWS = "HalfCheetahLinks", 100, 0.01, 0.9, 2000
 
 def logs(simulator: sipe.Simulator, count: int) -> tuple[Trajectories, Trajectories, np.ndarray, tuple[float, ...]]:
     """A recorded log and ``count`` held-out ones, the truths of those (count, N), and the noise's sd of each channel."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        recorded = sipe.demonstrations(simulator, count=1, steps=STEPS)
+    task = simulator.environment
+    excitation = acting.excitation(task, simulator.dt)
+    recorded, _ = acting.simulate(simulator, task.theta("default"), excitation, "reference", 1, 0, STEPS)
     spread = recorded.observations[0].std(0)
     sd = NOISE * spread
     rng = np.random.default_rng(2026)
