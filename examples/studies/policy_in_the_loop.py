@@ -5,8 +5,8 @@
     python examples/studies/policy_in_the_loop.py table            # results/policy_in_the_loop.json and .md of the cells there are
 
 A cell is method/seed. The reference is the in-distribution variant; each of ten updates takes one trajectory of 100 control steps
-from it, and the estimator has 1,000 rollouts in all. The agent is DDPG with its published settings: its
-first 25,000 steps are random. The paper's rule: a seed counts only if its policy solves the environment, here simulators drawn from
+from it, and the estimator has 1,000 rollouts in all. The agent is that of the
+transfer study (``sipe_bayes.benchmark.transfer.settings``). The paper's rule: a seed counts only if its policy solves the environment, here simulators drawn from
 the last estimate (see ``sipe_bayes.rl.policy_in_the_loop``); the seeds that do are counted, and all are shown beside them.
 """
 
@@ -28,6 +28,7 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.atomic import write_text
+from sipe_bayes.benchmark.transfer import settings as agent
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.output import to_json
 from sipe_bayes.posterior import Dirac, Posterior, prior
@@ -68,6 +69,7 @@ def run_cell(steps: int, budget: int, method: str, seed: int) -> None:
         steps,
         updates=UPDATES,
         trajectory_steps=TRAJECTORY_STEPS,
+        settings=agent(sipe.make_task(TASK), steps),
         folder=out,
         resume=True,
         report=report,
@@ -165,7 +167,7 @@ def accuracy(cells: list[dict[str, Any]]) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("run", "table"))
-    parser.add_argument("--steps", type=int, default=100_000, help="control steps of a cell's training")
+    parser.add_argument("--steps", type=int, default=150_000, help="control steps of a cell's training")
     parser.add_argument("--budget", type=int, default=1000, help="rollouts of a cell's estimator")
     parser.add_argument("--select", default="", help="part of method/seed")
     given = parser.parse_args()

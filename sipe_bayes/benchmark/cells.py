@@ -15,7 +15,8 @@ its file and one line. The prior and its mean are cells as well: no table stands
 
 Deviations. The paper sweeps and runs its ablation on unnamed variants; here they are the in-distribution one, as the default model
 lies at the centre of the range, where knowing nothing is a perfect guess. Its five environments with a policy are not all named;
-here they are one of each kind. Its search is taken as a full grid, without the combinations in which a value has no effect.
+here they are one of each kind. Its search is taken as a full grid, without the combinations in which a value has no effect. The settings with a
+policy train the agents of ``benchmark.transfer``.
 """
 
 from __future__ import annotations

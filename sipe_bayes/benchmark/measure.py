@@ -145,6 +145,7 @@ def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
 
 
 def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
+    from sipe_bayes.benchmark.transfer import agent_of
     from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, train_in_the_loop
 
     own = folder / POLICIES / file_name(cell.id)
@@ -155,6 +156,7 @@ def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
             cell.variant,
             cell.training,
             trajectory_steps=cell.horizon,
+            settings=agent_of(cell),
             folder=own,
             resume=True,
         )
