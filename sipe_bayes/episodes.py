@@ -40,7 +40,8 @@ class Step:
 
 
 class Episodes:
-    """B lanes of a simulator's task. theta (B, N); generators: one for each lane, for starting states and goals."""
+    """B lanes of a simulator's task. theta (B, N); generators: one for each lane, for starting states and goals. end_hopeless: end
+    episodes where ``Task.hopeless`` says so."""
 
     def __init__(
         self,
@@ -48,6 +49,7 @@ class Episodes:
         theta: FloatArray,
         generators: Sequence[np.random.Generator],
         allow_outside: bool = False,
+        end_hopeless: bool = False,
     ) -> None:
         task = simulator.environment
         if not isinstance(task, Task):
@@ -57,7 +59,7 @@ class Episodes:
         if not len(generators):
             raise ValueError("count: expected at least one lane, got 0")
         self.task, self.simulator, self.count = task, simulator, len(generators)
-        self.generators, self.allow_outside = list(generators), allow_outside
+        self.generators, self.allow_outside, self.end_hopeless = list(generators), allow_outside, end_hopeless
         self._skip, self._timestep = simulator.physics_steps(simulator.dt)
         self.theta = np.full((self.count, len(simulator.space)), np.nan)
         self._models: list[Any] = [None] * self.count
@@ -150,6 +152,8 @@ class Episodes:
         observations = task.observe(self.simulator.model, after, new, goals)
         transition = Transition(before, old, actions, after, new, goals)
         rewards, terminated, success = task.reward(transition), task.terminated(transition), task.success(transition)
+        if self.end_hopeless:
+            terminated = terminated | task.hopeless(after)
         if not good.all():
             after, observations = (
                 np.where(good[:, None], after, before),

@@ -298,6 +298,21 @@ def test_every_episode_gets_a_theta_of_its_own() -> None:
     assert len(np.unique(np.concatenate(drawn), axis=0)) == 6
 
 
+def test_a_training_may_end_episodes_of_the_fallen() -> None:
+    task = sipe.make_task("HumanoidLinks")
+    begun = []
+    for ends in (False, True):
+        trainer = Trainer(task, Settings(hidden=(8,), lanes=2, start_steps=400, end_hopeless=ends), 0)
+        for _ in range(100):  # random actions fell it within some twenty steps
+            trainer.advance()
+        begun.append(int((~trainer.replay.transition[:100]).sum()))
+        upright = ~task.hopeless(trainer.episodes.states)
+        assert upright.any() == ends
+    assert begun[0] == 0
+    assert 4 <= begun[1] <= 20
+    assert not task.hopeless(task.initial_states(np.random.default_rng(0), 3)[0]).any()
+
+
 def test_demonstrations_fill_their_share_of_a_batch() -> None:
     task = sipe.make_task("FetchPush")
     with warnings.catch_warnings():

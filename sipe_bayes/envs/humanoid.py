@@ -34,6 +34,7 @@ from sipe_bayes.envs.task import Solved, Transition, scaled
 from sipe_bayes.parameters import Parameter, ParameterSpace
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _STEP = 0.015  # s, five physics steps
 _NOISE = 0.01  # half-width of the starting state's uniform distribution
@@ -164,10 +165,13 @@ class Humanoid(LinkTask):
         assert step.derived is not None
         assert step.next_derived is not None
         forward = (step.next_derived[..., _CENTRE] - step.derived[..., _CENTRE]) / _STEP
-        height = step.next_states[..., _HEIGHT]
-        upright = (height > _HEALTHY[0]) & (height < _HEALTHY[1])
+        upright = _upright(step.next_states)
         effort = np.einsum("...a,...a->...", step.actions, step.actions)
         return np.asarray(_FORWARD_REWARD * forward + _UPRIGHT_REWARD * upright - _CONTROL_COST * effort)
+
+    def hopeless(self, states: FloatArray) -> BoolArray:
+        """Fallen, as the published class ends an episode."""
+        return ~_upright(states)
 
     def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
         model = self.published
@@ -176,6 +180,11 @@ class Humanoid(LinkTask):
 
     def bind(self, target: str) -> Target:
         return super().bind(target) if target.startswith("link:") else _bind(self.published, target)
+
+
+def _upright(states: FloatArray) -> BoolArray:
+    height = states[..., _HEIGHT]
+    return np.asarray((height > _HEALTHY[0]) & (height < _HEALTHY[1]))
 
 
 def humanoid_file() -> Path:

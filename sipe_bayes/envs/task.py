@@ -98,6 +98,10 @@ class Task(Environment):
         """(...,): whether the episode ends there; by default never."""
         return np.zeros(step.actions.shape[:-1], bool)
 
+    def hopeless(self, states: FloatArray) -> BoolArray:
+        """(...,) of states (..., S): whether a training may end an episode that the task goes on with; by default never."""
+        return np.zeros(states.shape[:-1], bool)
+
     def success(self, step: Transition) -> BoolArray | None:
         """(...,): whether the task is done at the end of the step; None where only the return counts."""
         return None

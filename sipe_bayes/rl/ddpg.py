@@ -16,7 +16,8 @@ Options (``sipe_bayes.rl.settings``), each off unless asked for and each a devia
 (returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``cloning`` (the actor's loss also has the
 mean squared distance, in half ranges, from what the demonstrations do: Nair et al., "Overcoming Exploration in Reinforcement Learning with
 Demonstrations", 2018, https://arxiv.org/abs/1709.10089, without their filter and in units of the mean |Q|, as Fujimoto, Gu, "A Minimalist
-Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860), ``lanes`` (environments stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
+Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860), ``end_hopeless`` (episodes of the training end
+where the humanoid has fallen, as the published class's), ``lanes`` (environments stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
 experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
 
 The two networks are small and of one kind, so gradients are written out by hand on flat vectors of parameters: the

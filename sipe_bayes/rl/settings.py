@@ -34,6 +34,9 @@ class Settings:
     cloning: float = _setting(
         0.0, "Weight of the squared distance from the demonstrations' actions in the actor's loss, in mean |Q|."
     )
+    end_hopeless: bool = _setting(
+        False, "End an episode of the training where the robot has fallen, if the task knows."
+    )
     lanes: int = _setting(1, "Environments stepped together, before their updates.", 1)
     updates_per_step: float = _setting(1.0, "Updates for each control step.")
     clip_targets: bool = _setting(False, "Clip targets to what rewards from -1 to 0 allow.")

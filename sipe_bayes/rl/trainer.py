@@ -55,7 +55,8 @@ class Trainer:
         self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial)
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
-        self.episodes = Episodes(Simulator(task, threads), task.theta("default"), lanes, allow_outside=True)
+        ending = {"allow_outside": True, "end_hopeless": settings.end_hopeless}
+        self.episodes = Episodes(Simulator(task, threads), task.theta("default"), lanes, **ending)
         self.draws = None if randomization is None else Draws(self.episodes.simulator, randomization.posterior)
         self._disturbances = None
         if randomization is not None and randomization.disturbs:
