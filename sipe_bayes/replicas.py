@@ -46,20 +46,34 @@ class Replicas:
 
     def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
         """One replica of every trajectory at theta (N,), with states where the recording has them; None where one diverges."""
+        return self.many(theta[None], rng)[0]
+
+    def many(self, theta: FloatArray, rng: np.random.Generator) -> list[Trajectories | None]:
+        """What ``make`` gives for each theta (B, N), simulated in one batch."""
+        motion, count = self.simulator.replay(theta, self.trajectories, self.starts), len(self.trajectories)
+        rows = [slice(b * count, (b + 1) * count) for b in range(len(theta))]
+        states = [None if motion.states is None else motion.states[r] for r in rows]
+        return [
+            self._measured(motion.observations[r], motion.valid[r], s, rng) for r, s in zip(rows, states, strict=True)
+        ]
+
+    def _measured(
+        self, observations: FloatArray, valid: NDArray[np.bool_], states: FloatArray | None, rng: np.random.Generator
+    ) -> Trajectories | None:
+        """Simulated observations (R, T+1, O) with noise, where the recording has samples; None where one is not valid."""
         log = self.trajectories
-        motion = self.simulator.replay(theta[None], log, self.starts)
-        inside = np.arange(motion.valid.shape[1]) <= log.length[:, None]
-        if not (motion.valid | ~inside).all():
+        inside = np.arange(valid.shape[1]) <= log.length[:, None]
+        if not (valid | ~inside).all():
             return None
         noise = np.stack([self._drawn(len(row), float(dt), rng) for row, dt in zip(inside, log.dt, strict=True)])
         if isinstance(self.simulator, CallableSimulator):
             noise[:, 0] = 0.0  # x is the second sample
-        seen = np.where(np.isfinite(log.observations), motion.observations + noise, np.nan)
+        seen = np.where(np.isfinite(log.observations), observations + noise, np.nan)
         items = []
         for k, recorded in enumerate(log):
             n = len(recorded) + 1
-            states = None if recorded.states is None or motion.states is None else motion.states[k, :n]
-            items.append(Trajectory(seen[k, :n], recorded.actions, recorded.dt, states, recorded.name, log.channels))
+            own = None if recorded.states is None or states is None else states[k, :n]
+            items.append(Trajectory(seen[k, :n], recorded.actions, recorded.dt, own, recorded.name, log.channels))
         return Trajectories.stack(items)
 
     def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
