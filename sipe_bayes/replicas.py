@@ -19,12 +19,15 @@ from sipe_bayes.likelihood import Segments, first_states
 from sipe_bayes.noise import Noise
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.simulator import Simulator
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories, Trajectory
 
 FloatArray = NDArray[np.float64]
 
 
-def observation_noise(diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments) -> Noise:
+def observation_noise(
+    diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments | StateSpace
+) -> Noise:
     """Noise of all O channels: what an estimator's ``diagnostics`` say of the channels that it fitted, ``noise_level`` of the
     others, as white."""
     sd = noise_level(trajectories, likelihood)

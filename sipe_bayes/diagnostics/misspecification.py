@@ -482,7 +482,9 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
     for k, name in enumerate(logs.names):
         i = int(far[k, :, 0].argmax())
         p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
-        found.append(OutsidePrior(p, name, windows.simulator.environment.channels[windows.channels[i]], farthest[k, i]))
+        found.append(
+            OutsidePrior(p, name, windows.simulator.environment.channels[windows.channels[i]], float(farthest[k, i]))
+        )
     return found
 
 
