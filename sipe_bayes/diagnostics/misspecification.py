@@ -101,7 +101,7 @@ class Misfit:
     def text(self) -> str:
         """In a sentence."""
         there = (
-            f"{self.cause} ({100 * self.share[self.channel]:.2g} % of what is left of {self.channel}), most in {self.log} between "
+            f"{self.cause} ({100 * self.share[self.channel]:.2g} % of the residual of {self.channel}), most in {self.log} between "
             f"{self.start:.3g} and {self.stop:.3g} s"
         )
         if not self.alarm:

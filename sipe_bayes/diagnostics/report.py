@@ -30,6 +30,7 @@ WELL_DETERMINED = 0.8
 prior's."""
 ALIKE = 1.05
 """Errors within this factor of one another count as the same."""
+_ONE = "The one value may be trusted within its interval"
 _NAMED = 6  # parameters that a sentence lists
 MIXED = 1.05
 """R-hat above which chains are called not mixed."""
@@ -141,20 +142,14 @@ def headline(parameters: Sequence[ParameterSummary], ridges: Sequence[Ridge] = (
     good = [p.name for p in wanted if parameter_verdict(p, ridges).tone == "good"]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
-    if len(good) == len(wanted):
-        text = f"All {len(good)} values" if len(good) > 1 else "The one value"
-        return Verdict("good", f"{text} may be trusted, within this model.")
     if not good:
-        text = (
-            f"None of the {len(wanted)} values may be trusted"
-            if len(wanted) > 1
-            else "The one value may not be trusted"
-        )
-        return Verdict("bad", f"{text} as it stands; the table says why.")
+        return Verdict("bad", "No value may be trusted within its interval; the table says why.")
+    if len(good) == len(wanted):
+        text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
+        return Verdict("good", f"{text}.")
     named = listed(good) if len(good) <= _NAMED else f"{listed(good[:_NAMED])} and others"
-    return Verdict(
-        "fair", f"{len(good)} of {len(wanted)} values may be trusted: {named}; the table says why not the others."
-    )
+    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals: {named}"
+    return Verdict("fair", f"{text}; the table says why not the others.")
 
 
 def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) -> Verdict:
@@ -203,7 +198,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     found = calibration.misfit
     if found is None or not found.alarm:
         return None
-    share = f"{100 * found.share[found.channel]:.2g} % of what is left of {found.channel}"
+    share = f"{100 * found.share[found.channel]:.2g} % of the residual of {found.channel}"
     if not found.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {found.cause} ({share}).")
     return Verdict("bad", f"The model lacks something: it looks like {found.cause} ({share}, p = {found.p:.2g}).")
