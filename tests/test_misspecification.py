@@ -180,6 +180,18 @@ def test_a_log_outside_the_prior_is_named_and_one_inside_is_not() -> None:
     assert "units or signs" in other.text
 
 
+def test_a_start_is_as_uncertain_as_its_estimate() -> None:
+    """White noise of sd s on a position sampled at dt: the slope of a quadratic over 7 samples at its first has the sd of least squares.
+    200 draws tell it to 5 %, five standard errors are 25 %."""
+    simulator = pendulum()
+    recorded = Trajectories.stack(log(simulator, [0.6, 0.08], 1, steps=60))
+    replicas, rng = Replicas(simulator, recorded, Noise(np.array([0.01]), np.zeros(1))), np.random.default_rng(0)
+    moved = np.stack([replicas._misled(replicas._noise(rng))[0] for _ in range(200)])
+    design = np.vander(np.arange(7) * 0.01, 3, increasing=True)
+    sd = 0.01 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+    np.testing.assert_allclose(moved.std(0)[1:3], sd[:2], rtol=0.25)
+
+
 def test_alarms_over_many_logs_of_the_prior_are_rare() -> None:
     """Ten calibrations of four logs each of the prior: the chance of any alarm is 5 % each, of three or more in ten 1.2 %."""
     rng, alarms = np.random.default_rng(0), 0

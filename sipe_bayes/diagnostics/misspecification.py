@@ -18,7 +18,7 @@ cause explains and, of a probe, how far the estimate would move if the model had
 
 **Prior predictive.** Logs simulated from the prior, with noise: the log's local outlier factor among them (M. Breunig et al. 2000,
 https://doi.org/10.1145/342009.335388), channel by channel. The p-value compares the log's largest with the largest of each simulation
-over all logs and channels, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based multiple
+over all logs and channels, each started as far off as noise leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based multiple
 testing").
 
 Deviations: a probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
+from sipe_bayes.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.replicas import Replicas
 from sipe_bayes.state_space import Chain
@@ -162,16 +162,17 @@ def misfit(
 
 @dataclass(frozen=True)
 class _Solved:
-    """What is left of a residual: statistics (K + 2 C,), step (N,) of theta and starts (W, D) that go with it, scores' information
-    (K,) and gradient (K,), theta's answer (N, K) to the probes, variance (N,)."""
+    """A residual solved for theta and starts, without the K probes: statistics (K + 2 C,), what is left (W, L, C), step (N + K,),
+    score (K,) of each probe and its information, theta's answer (N, K) to the probes and its variance (N,)."""
 
     statistics: FloatArray
     left: FloatArray
-    base: FloatArray
-    gradient: FloatArray
+    step: FloatArray
+    score: FloatArray
     information: FloatArray
-    cross: FloatArray
+    answer: FloatArray
     variance: FloatArray
+    arrow: Arrow
 
 
 class _Residuals:
@@ -275,7 +276,7 @@ class _Residuals:
         whiteness = [_autocorrelation(z) for z in white]
         pieces = [max(float((p**2).mean()) for p in np.array_split(z, _PIECES)) for z in white]
         statistics = np.cbrt(np.concatenate([gradient**2 / information, whiteness, pieces]))
-        return _Solved(statistics, left, base, gradient, information, cross, np.diag(inverse))
+        return _Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
 
     def _left(self, residual: FloatArray, step: FloatArray, starts: FloatArray) -> FloatArray:
         """What a step of theta and probes (N + K,) and one of the starts (W, D) leave of a residual (W, L, C)."""
@@ -289,13 +290,9 @@ class _Residuals:
 
     def _probe_named(self, p: float, probe: int, seen: _Solved, sd: FloatArray | None) -> Misfit:
         n, names = self.windows.num_theta, self.windows.simulator.space.names
-        amplitude = seen.gradient[probe] / seen.information[probe]
-        step = seen.base + amplitude * np.concatenate([-seen.cross[:, probe], np.eye(len(self.probes))[probe]])
-        moments = self.moments(self.residual[..., None])[0][1]
-        arrow = eliminate(
-            moments.normal(self.noise), self.count, self.windows.start_precision, self.windows.no_starts()
-        )
-        explained = self._left(self.residual, step, arrow.starts(step))
+        amplitude = seen.score[probe] / seen.information[probe]
+        step = seen.step + amplitude * np.concatenate([-seen.answer[:, probe], np.eye(len(self.probes))[probe]])
+        explained = self._left(self.residual, step, seen.arrow.starts(step))
         gains = [
             self._white(seen.left, c, self.noise) ** 2 - self._white(explained, c, self.noise) ** 2
             for c in range(len(self.noise.sd))
@@ -303,7 +300,7 @@ class _Residuals:
         before, after = ((x**2).sum((0, 1)) for x in (seen.left, explained))
         share = np.clip(1 - after / np.maximum(before, 1e-300), 0, 1)
         sd = np.sqrt(seen.variance) if sd is None else sd
-        shift = (np.clip(self.theta + step[:n] - seen.base[:n], 0, 1) - self.theta) / np.maximum(sd, 1e-12)
+        shift = (np.clip(self.theta + step[:n] - seen.step[:n], 0, 1) - self.theta) / np.maximum(sd, 1e-12)
         name, remedy = self.probes[probe]
         return self._placed(p, name, remedy, gains, share, dict(zip(names, shift.tolist(), strict=True)))
 
@@ -493,7 +490,9 @@ def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: 
     replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
     thetas = prior.sample((_PREDICTIVE,), generator=torch.Generator().manual_seed(seed)).numpy()
     batches = np.array_split(thetas, max(1, _PREDICTIVE // _PER_BATCH))
-    return [one.observations for batch in batches for one in replicas.many(batch, rng) if one is not None]
+    return [
+        one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
+    ]
 
 
 def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:
