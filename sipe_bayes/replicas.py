@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -97,14 +99,23 @@ class Replicas:
         """By how much (R, S) noise (R, T+1, O) on the recording moves the estimate of its start."""
         if isinstance(self.simulator, CallableSimulator) or self.trajectories.states is not None:
             return np.zeros_like(self.starts)
-        moved = []
-        for recorded, own in zip(self.trajectories, noise, strict=True):
+        moved = np.zeros_like(self.starts)
+        for k, ((begin, before), own) in enumerate(zip(self._beginnings, noise, strict=True)):
+            assert isinstance(self.simulator, Simulator)
+            noisy = replace(begin, observations=begin.observations + own[: len(begin) + 1])
+            moved[k, : len(before)] = estimate_states(self.simulator, noisy)[0] - before
+        return moved
+
+    @cached_property
+    def _beginnings(self) -> list[tuple[Trajectory, FloatArray]]:
+        """The first moments of every recording, and the start that they tell."""
+        assert isinstance(self.simulator, Simulator)
+        found = []
+        for recorded in self.trajectories:
             steps = min(len(recorded), math.ceil(_BEGINNING / recorded.dt))
-            seen, actions = recorded.observations[: steps + 1], recorded.actions[:steps]
-            both = [Trajectory(y, actions, recorded.dt) for y in (seen, seen + own[: steps + 1])]
-            before, after = (estimate_states(self.simulator, one)[0] for one in both)
-            moved.append(np.pad(after - before, (0, self.starts.shape[1] - len(before))))
-        return np.stack(moved)
+            begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
+            found.append((begin, estimate_states(self.simulator, begin)[0]))
+        return found
 
     def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
         """Noise (count, O) of samples dt seconds apart."""

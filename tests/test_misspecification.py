@@ -158,6 +158,8 @@ def test_a_burst_of_noise_is_placed_in_time() -> None:
     seen = found(Trajectory(burst, recorded.actions, recorded.dt, name="log", channels=recorded.channels))
     print(seen.text)
     assert seen.p == 1 / 40
+    assert seen.cause == "noise that is larger for a while"
+    assert not seen.shift
     assert seen.start < 2.5
     assert seen.stop > 2.0
 
@@ -182,21 +184,21 @@ def test_a_log_outside_the_prior_is_named_and_one_inside_is_not() -> None:
 
 def test_a_start_is_as_uncertain_as_its_estimate() -> None:
     """White noise of sd s on a position sampled at dt: the slope of a quadratic over 7 samples at its first has the sd of least squares.
-    200 draws tell it to 5 %, five standard errors are 25 %."""
+    100 draws tell it to 7 %, five standard errors are 35 %."""
     simulator = pendulum()
     recorded = Trajectories.stack(log(simulator, [0.6, 0.08], 1, steps=60))
     replicas, rng = Replicas(simulator, recorded, Noise(np.array([0.01]), np.zeros(1))), np.random.default_rng(0)
-    moved = np.stack([replicas._misled(replicas._noise(rng))[0] for _ in range(200)])
+    moved = np.stack([replicas._misled(replicas._noise(rng))[0] for _ in range(100)])
     design = np.vander(np.arange(7) * 0.01, 3, increasing=True)
     sd = 0.01 * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    np.testing.assert_allclose(moved.std(0)[1:3], sd[:2], rtol=0.25)
+    np.testing.assert_allclose(moved.std(0)[1:3], sd[:2], rtol=0.35)
 
 
 def test_alarms_over_many_logs_of_the_prior_are_rare() -> None:
-    """Ten calibrations of four logs each of the prior: the chance of any alarm is 5 % each, of three or more in ten 1.2 %."""
+    """Five calibrations of three logs each of the prior: the chance of any alarm is 5 % each, of two or more in five 2.3 %."""
     rng, alarms = np.random.default_rng(0), 0
-    for seed in range(10):
+    for seed in range(5):
         values = [rng.uniform(0.3, 1.0), rng.uniform(0.0, 0.2)]
-        logs = [log(pendulum(), values, 10 * seed + k, name=f"log {k}", steps=60) for k in range(4)]
+        logs = [log(pendulum(), values, 10 * seed + k, name=f"log {k}", steps=60) for k in range(3)]
         alarms += any(o.alarm for o in outside(*logs))
-    assert alarms <= 2
+    assert alarms <= 1

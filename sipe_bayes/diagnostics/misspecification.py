@@ -22,8 +22,8 @@ over all logs and channels, each started as far off as noise leaves the estimate
 testing").
 
 Deviations: a probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
-misfit passes as slow noise. Where a probe's own statistic is beyond the null, it is named, even if whiteness is odder: it says more. A
-cause that is named is the one that fits best, not one that is proven.
+misfit passes as slow noise. Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is
+named even if whiteness is odder, since it says more. A cause that is named is the one that fits best, not one that is proven.
 """
 
 from __future__ import annotations
@@ -199,14 +199,13 @@ class _Residuals:
         def p(statistic: int) -> float:
             return float((1 + (largest >= odd[statistic]).sum()) / (1 + simulated))
 
-        worst = int(odd.argmax())
-        if self.probes:
-            probe = int(odd[: len(self.probes)].argmax())
-            if p(probe) <= LEVEL:
-                return self._probe_named(p(worst), probe, seen, sd)
-        if worst < len(self.probes):
-            return self._probe_named(p(worst), worst, seen, sd)
-        return self._colour_named(p(worst), worst - len(self.probes), seen)
+        worst, k = int(odd.argmax()), len(self.probes)
+        if k:
+            best = int(odd[:k].argmax())
+            named = self._probe_named(p(worst), best, seen, sd)
+            if best == worst or (p(best) <= LEVEL and max(named.share.values()) >= SMALL):
+                return named
+        return self._colour_named(p(worst), worst - k, seen)
 
     def null(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated."""

@@ -40,8 +40,8 @@ _PROBLEMS = {
     "no_effect": "changes nothing",
     "not_determined": "not determined",
     "disagrees": "disagrees between logs",
+    "misfit": "model lacks something",
 }
-_LACKS = "misfit", "model lacks something"
 
 
 # Numbers in words
@@ -113,13 +113,10 @@ def parameter_verdict(parameter: ParameterSummary, ridges: Sequence[Ridge] = ())
     shared = bool(others) and parameter.contraction < WELL_DETERMINED and "no_effect" not in parameter.flags
     told = {flag: text for flag, text in _PROBLEMS.items() if not (shared and flag == "not_determined")}
     problems = [text for flag, text in told.items() if flag in parameter.flags]
-    lacks = _LACKS[0] in parameter.flags
     if problems:
-        return Verdict("bad", ", ".join(problems + [_LACKS[1]] * lacks))
+        return Verdict("bad", ", ".join(problems))
     if shared:
         return Verdict("fair", f"only with {listed(list(dict.fromkeys(others)))}")
-    if lacks:
-        return Verdict("bad", f"{_LACKS[1]} that moves it" if parameter.sd > 0 else _LACKS[1])
     if not parameter.sd > 0:
         return Verdict("fair", "a point without uncertainty")
     partly = "; part of its range changes nothing" if "dead_range" in parameter.flags else ""

@@ -97,10 +97,10 @@ class Recalibrated(Estimator):
             prior=estimator.prior,
             budget=budget,
             seed=seed,
-            likelihood=estimator.likelihood,
             checkpoint=checkpoint,
             progress=progress,
         )
+        self.likelihood = estimator.likelihood  # checked there, a StateSpace too
         n = len(self.space)
         default = max(_FEWEST, _PER_PARAMETER * (n + 2))
         self.refits = whole("refits", default if refits is None else refits, 3 * n + 10)
