@@ -15,9 +15,17 @@ from numpy.typing import NDArray
 
 from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config
 from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
-from sipe_bayes.diagnostics.evaluate import channel_scores, fitted_residuals, signals, white_noise
+from sipe_bayes.diagnostics.evaluate import (
+    best_starts,
+    channel_scores,
+    compare_errors,
+    fitted_residuals,
+    signals,
+    white_noise,
+)
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
-from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary, Ridge
+from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior, misfit, outside_prior
+from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary, Residual, Ridge
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
@@ -30,7 +38,9 @@ from sipe_bayes.output import CHECKPOINT, RUN, claim, describe_run, release, wri
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.replicas import observation_noise
 from sipe_bayes.simulator import Simulator
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 from sipe_bayes.units import find_unit, to_si
 
@@ -40,6 +50,7 @@ _DRAWS = 4000  # of the posterior, for summaries
 _NOT_DETERMINED = 0.5  # contraction below which a parameter is not determined
 _AT_BOUND = 0.02  # of the prior's range: how near to a bound the mode counts as at it
 _FLAT_SD = 1e3  # stands for a uniform prior beside an earlier posterior
+_SCORED = 0.5  # s, windows over which logs are scored and drawn where the likelihood has none
 
 
 @dataclass(frozen=True)
@@ -49,12 +60,24 @@ class Problem:
     config: Config
     environment: MjcfEnvironment
     simulator: Simulator
-    likelihood: Segments
+    likelihood: Segments | StateSpace
     prior: Posterior
     train: Trajectories
     holdout: Trajectories | None
     reports: tuple[LogReport, ...]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def segments(self) -> Segments:
+        """The windows by which logs are scored, drawn and checked: the likelihood's own, or, beside a ``StateSpace``, of half a second
+        or what a held-out log's ``window`` says; a shorter log is one window."""
+        if isinstance(self.likelihood, Segments):
+            return self.likelihood
+        own = {log.name: self.config.window_of(log) for log in self.config.logs if log.window is not None}
+        every = [*self.train, *(self.holdout or ())]
+        short = {log.name: None for log in every if len(log) * log.dt < _SCORED}
+        windows = tuple({**short, **own}.items())
+        return Segments(_SCORED, "white", self.likelihood.fit, self.likelihood.noise_sd, windows)
 
 
 def prepare(config: Config | str | Path, num_threads: int | None = None) -> Problem:
@@ -126,13 +149,17 @@ def _command_unit(config: Config, target: str) -> str:
     return units.get(target, "")
 
 
-def _likelihood(config: Config) -> Segments:
+def _likelihood(config: Config) -> Segments | StateSpace:
+    fit = tuple(m.name for m in config.measurements if m.fit)
+    noise_sd = tuple(m.noise_sd for m in config.measurements)
+    if config.likelihood == "state_space":
+        return StateSpace(fit, noise_sd)
     window = None if config.window == "log" else config.window
     return Segments(
         window=window,
         noise=config.noise.model,
-        fit=tuple(m.name for m in config.measurements if m.fit),
-        noise_sd=tuple(m.noise_sd for m in config.measurements),
+        fit=fit,
+        noise_sd=noise_sd,
         windows=tuple((log.name, config.window_of(log)) for log in config.logs if log.window is not None),
     )
 
@@ -203,6 +230,10 @@ def method_of(
     takes = estimator_class(name).searches
     if not takes and config.search != type(config.search)():
         raise ConfigError(f"{config.path}: key `search`: {name} does not search from several starts; drop the key")
+    if not takes and config.likelihood == "state_space":
+        raise ConfigError(
+            f"{config.path}: key `likelihood`: 'state_space' is for laplace and mcmc, got {name}; use 'segments'"
+        )
     return get_estimator(
         problem.simulator,
         name,
@@ -235,20 +266,26 @@ def calibrate(
 
     tell("checking what each parameter changes")
     theta = posterior.mode.numpy()
-    train = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.train)
-    fitted = problem.likelihood.bind(problem.simulator, problem.train)
+    scored = {"train": problem.train, "holdout": problem.holdout}
+    bound = {
+        use: Windows(replace(problem.segments, fit=None), problem.simulator, logs)
+        for use, logs in scored.items()
+        if logs is not None
+    }
+    fitted = problem.segments.bind(problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
     conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed, tell)
     method.warnings += [f"log {name} could not be fitted by itself; whether it agrees is unknown" for name in skipped]
     noise = _noise_of(method, fitted, theta)
+    tell("checking what the model lacks")
+    lacking, residuals = _residuals(problem, method, fitted, theta, noise, posterior.stddev.numpy())
+    outside = _outside(problem, method, fitted)
     tell("simulating the posterior's band")
     draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(method.seed))
-    summaries = _summaries(problem, posterior, draws, dead, conflict)
+    summaries = _summaries(problem, posterior, draws, dead, conflict, lacking)
     found = ridges(problem.environment.space, draws, [p.contraction for p in summaries])
-    bound = {"train": train}
-    if problem.holdout is not None:
-        bound["holdout"] = Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.holdout)
     scores = {use: channel_scores(w, theta) for use, w in bound.items()}
+    held = scores.get("holdout", [])
     return Calibration(
         name=_run_name(problem.config),
         estimator=method.name,
@@ -256,17 +293,59 @@ def calibrate(
         prior=problem.prior,
         parameters=summaries,
         train=scores["train"],
-        holdout=scores.get("holdout", []),
-        warnings=_warnings(problem, method, summaries, dead, found, conflict, scores.get("holdout", [])),
+        holdout=held,
+        warnings=_alarms(lacking, outside) + _warnings(problem, method, summaries, dead, found, conflict, held),
         signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
-        residuals=fitted_residuals(fitted, theta, noise),
+        residuals=residuals,
         ridges=found,
+        comparison=compare_errors(bound["holdout"], theta) if "holdout" in bound else None,
+        misfit=lacking,
+        outside=outside,
+        left_out=_left_out(problem),
         noise=_noise(fitted, noise),
         mixing=method.diagnostics.get("mixing"),
         logs=[r.to_dict() for r in problem.reports],
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
     )
+
+
+def _residuals(
+    problem: Problem, method: Estimator, fitted: Windows, theta: FloatArray, noise: Noise, sd: FloatArray
+) -> tuple[Misfit | None, list[Residual]]:
+    """What the residuals look like, and the residuals; nothing with a ``StateSpace``, whose process noise takes what the model
+    lacks. sd (N,): of the posterior in theta."""
+    if isinstance(problem.likelihood, StateSpace):
+        return None, []
+    starts = best_starts(fitted, theta, noise)
+    try:
+        found = misfit(fitted, theta, noise, starts=starts, sd=sd, seed=method.seed)
+    except ValueError as error:  # LinAlgError is one
+        method.warn(f"whether the residuals are noise is unknown: {error}")
+        found = None
+    return found, fitted_residuals(fitted, theta, noise, starts)
+
+
+def _outside(problem: Problem, method: Estimator, fitted: Windows) -> list[OutsidePrior]:
+    noise = observation_noise(method.diagnostics, problem.train, problem.likelihood)
+    try:
+        return outside_prior(fitted, problem.prior, noise, seed=method.seed)
+    except ValueError as error:
+        method.warn(f"whether the logs lie within the prior is unknown: {error}")
+        return []
+
+
+def _alarms(lacking: Misfit | None, outside: Sequence[OutsidePrior]) -> list[str]:
+    return [look.text for look in (*outside, lacking) if look is not None and look.alarm]
+
+
+def _left_out(problem: Problem) -> list[str]:
+    if isinstance(problem.likelihood, Segments):
+        return []
+    return [
+        "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, and process "
+        "noise, which is inferred, takes what the model lacks. Errors and signals are over windows from measured starts."
+    ]
 
 
 def _run_name(config: Config) -> str:
@@ -280,6 +359,7 @@ def _summaries(
     draws: FloatArray,
     dead: dict[str, list[tuple[float, float]]],
     conflict: Disagreement | None,
+    lacking: Misfit | None,
 ) -> list[ParameterSummary]:
     space = problem.environment.space
     theta = posterior.mode.numpy()
@@ -300,6 +380,8 @@ def _summaries(
             flags.append("at_bound")
         if conflict is not None and conflict.parameter == p.name:
             flags.append("disagrees")
+        if lacking is not None and lacking.matters and (p.name in lacking.moved or not lacking.shift):
+            flags.append("misfit")
         if p.log is not None:
             flags.append("nuisance")
         rows.append(
@@ -404,7 +486,7 @@ def run(
     method_of(problem, name, seed, budget)
     problem.likelihood.bind(problem.simulator, problem.train)
     if problem.holdout is not None:
-        Windows(replace(problem.likelihood, fit=None), problem.simulator, problem.holdout)
+        Windows(replace(problem.segments, fit=None), problem.simulator, problem.holdout)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
     folder = Path("runs") / f"{_run_name(problem.config)}-{name}" if out is None else out

@@ -36,6 +36,7 @@ app.command()(rl_commands.agents)
 
 BAD_INPUT = 2
 _PIPED_WIDTH = 120
+_TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
 def main() -> None:
@@ -203,27 +204,25 @@ def print_task(found: dict[str, Any]) -> None:
 
 
 def print_calibration(found: Calibration) -> None:
-    """The table of parameters, the errors, the warnings and where the report lies, on standard output."""
+    """What to think of it, the table of parameters, the errors, the warnings and where the report lies, on standard output."""
     from rich.table import Table
     from rich.text import Text
 
-    from sipe_bayes.diagnostics.report import parameter_verdict, significant
+    from sipe_bayes.diagnostics.report import parameter_verdict, significant, verdicts
 
     console = _console()
-    table = Table(title=Text(f"{found.name}: posterior by {found.estimator}"), title_justify="left")
-    for heading in ("parameter", "estimate", "90 % interval", "unit", "contraction", "verdict"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit", "verdict") else "right")
+    console.print(Text(f"{found.name}: posterior by {found.estimator}"))
+    for verdict in verdicts(found):
+        console.print(Text(verdict.text, style=_TONES[verdict.tone]))
+    table = Table()
+    for heading in ("parameter", "value", "90 % interval", "unit", "verdict"):
+        table.add_column(heading, justify="right" if heading in ("value", "90 % interval") else "left")
     for p in found.parameters:
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
-        low, high = significant(p.q05, p.sd, scale), significant(p.q95, p.sd, scale)
-        table.add_row(
-            Text(p.name),  # brackets of a name are not markup
-            f"{significant(p.mode, p.sd, scale)} ± {significant(p.sd, p.sd, scale)}",
-            f"{low} .. {high}",
-            p.unit,
-            f"{p.contraction:.2f}",
-            parameter_verdict(p).text,
-        )
+        value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
+        verdict = parameter_verdict(p, found.ridges)
+        # brackets of a name are not markup
+        table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     console.print(table)
     for title, scores in (("held out", found.holdout), ("train", found.train)):
         for s in scores:
@@ -234,6 +233,8 @@ def print_calibration(found: Calibration) -> None:
                 highlight=False,
                 markup=False,
             )
+    for sentence in found.left_out:
+        console.print(f"left out: {sentence}", highlight=False, markup=False)
     for warning in found.warnings:
         console.print(f"warning: {warning}", highlight=False, markup=False)
     console.print(f"{found.rollouts} rollouts, {found.seconds:.1f} s", highlight=False)

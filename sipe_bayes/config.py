@@ -346,11 +346,13 @@ class Search(Table):
 
 
 class Config(Table):
-    """A whole configuration; ``load_config`` reads one. ``window`` in seconds, or "log" for whole logs."""
+    """A whole configuration; ``load_config`` reads one. ``window`` in seconds, or "log" for whole logs; None where the likelihood
+    has no windows."""
 
     model: Location
     estimator: Annotated[str, Strict(), AfterValidator(_estimator)] = "laplace"
-    window: Annotated[float | Literal["log"], BeforeValidator(_window)]
+    likelihood: Literal["segments", "state_space"] = "segments"
+    window: Annotated[float | Literal["log"] | None, BeforeValidator(_window)] = None
     seed: Annotated[int, Strict(), Field(ge=0)] = 0
     budget: Annotated[int, Strict(), Field(gt=0)] | None = None
     search: Search = Search()
@@ -391,6 +393,7 @@ class Config(Table):
         _check_unique("measurements", "target", [m.target for m in self.measurements])
         _check_unique("logs", "name", [log.name for log in self.logs])
         _check_unique("parameters", "name", [p.name for p in self.parameters])
+        self._check_likelihood()
         self._check_targets()
         if not any(m.fit for m in self.measurements):
             raise _problem("expected at least one with fit = true, got none; set one to true", "measurements")
@@ -398,6 +401,26 @@ class Config(Table):
             raise _problem("expected at least one with use = 'train', got none; mark one", "logs")
         self._check_holdout()
         return self
+
+    def _check_likelihood(self) -> None:
+        """Windows and coloured noise are of segments alone; held-out logs are scored by windows either way."""
+        if self.likelihood == "segments":
+            if self.window is None:
+                raise _problem("missing; add it", "window")
+            return
+        needless = "given with likelihood = 'state_space', which has no windows; drop it or use likelihood = 'segments'"
+        if self.window is not None:
+            raise _problem(needless, "window")
+        for i, log in enumerate(self.logs):
+            if log.window is not None and log.use == "train":
+                raise _problem(needless, "logs", i, "window")
+        if "model" in self.noise.model_fields_set and self.noise.model != "white":
+            raise _problem(
+                f"expected 'white' with likelihood = 'state_space', got {self.noise.model!r}; drop it or use "
+                "likelihood = 'segments'",
+                "noise",
+                "model",
+            )
 
     def _check_targets(self) -> None:
         owner: dict[str, str] = {}

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.likelihood import Segments, smoothed
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
 
-def noise_level(trajectories: Trajectories, likelihood: Segments) -> FloatArray:
+def noise_level(trajectories: Trajectories, likelihood: Segments | StateSpace) -> FloatArray:
     """Sd (O,) of each channel's noise: as ``likelihood.noise_sd`` states it; else zero for trajectories with recorded
     states; else the robust sd of what local quadratics over 60 ms leave of the recorded samples."""
     count = trajectories.observations.shape[2]

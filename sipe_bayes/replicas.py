@@ -7,7 +7,10 @@ course, a replica at another theta leaves it, and what is inferred from replicas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,16 +18,21 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.likelihood import Segments, first_states
+from sipe_bayes.likelihood import Segments, estimate_states, first_states
 from sipe_bayes.noise import Noise
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.simulator import Simulator
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories, Trajectory
 
 FloatArray = NDArray[np.float64]
 
+_BEGINNING = 0.2  # s of a log on which the estimate of its start depends, and more
 
-def observation_noise(diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments) -> Noise:
+
+def observation_noise(
+    diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments | StateSpace
+) -> Noise:
     """Noise of all O channels: what an estimator's ``diagnostics`` say of the channels that it fitted, ``noise_level`` of the
     others, as white."""
     sd = noise_level(trajectories, likelihood)
@@ -46,21 +54,68 @@ class Replicas:
 
     def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
         """One replica of every trajectory at theta (N,), with states where the recording has them; None where one diverges."""
+        return self.many(theta[None], rng)[0]
+
+    def many(self, theta: FloatArray, rng: np.random.Generator, estimated: bool = False) -> list[Trajectories | None]:
+        """What ``make`` gives for each theta (B, N), simulated in one batch.
+
+        estimated: a replica starts where the recording's own start would lie if the replica's noise were what its estimate is off
+        by, so that a recording is as far from its replicas as they are from one another."""
+        noises = [self._noise(rng) for _ in theta]
+        starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
+        motion, count = self.simulator.replay(theta, self.trajectories, starts), len(self.trajectories)
+        found = []
+        for b, noise in enumerate(noises):
+            rows = slice(b * count, (b + 1) * count)
+            states = None if motion.states is None else motion.states[rows]
+            found.append(self._measured(motion.observations[rows] + noise, motion.valid[rows], states))
+        return found
+
+    def _measured(
+        self, observations: FloatArray, valid: NDArray[np.bool_], states: FloatArray | None
+    ) -> Trajectories | None:
+        """Observations (R, T+1, O) where the recording has samples; None where one is not valid."""
         log = self.trajectories
-        motion = self.simulator.replay(theta[None], log, self.starts)
-        inside = np.arange(motion.valid.shape[1]) <= log.length[:, None]
-        if not (motion.valid | ~inside).all():
+        inside = np.arange(valid.shape[1]) <= log.length[:, None]
+        if not (valid | ~inside).all():
             return None
-        noise = np.stack([self._drawn(len(row), float(dt), rng) for row, dt in zip(inside, log.dt, strict=True)])
-        if isinstance(self.simulator, CallableSimulator):
-            noise[:, 0] = 0.0  # x is the second sample
-        seen = np.where(np.isfinite(log.observations), motion.observations + noise, np.nan)
+        seen = np.where(np.isfinite(log.observations), observations, np.nan)
         items = []
         for k, recorded in enumerate(log):
             n = len(recorded) + 1
-            states = None if recorded.states is None or motion.states is None else motion.states[k, :n]
-            items.append(Trajectory(seen[k, :n], recorded.actions, recorded.dt, states, recorded.name, log.channels))
+            own = None if recorded.states is None or states is None else states[k, :n]
+            items.append(Trajectory(seen[k, :n], recorded.actions, recorded.dt, own, recorded.name, log.channels))
         return Trajectories.stack(items)
+
+    def _noise(self, rng: np.random.Generator) -> FloatArray:
+        """Noise (R, T+1, O) of every trajectory."""
+        samples = self.trajectories.observations.shape[1]
+        noise = np.stack([self._drawn(samples, float(dt), rng) for dt in self.trajectories.dt])
+        if isinstance(self.simulator, CallableSimulator):
+            noise[:, 0] = 0.0  # x is the second sample
+        return noise
+
+    def _misled(self, noise: FloatArray) -> FloatArray:
+        """By how much (R, S) noise (R, T+1, O) on the recording moves the estimate of its start."""
+        if isinstance(self.simulator, CallableSimulator) or self.trajectories.states is not None:
+            return np.zeros_like(self.starts)
+        moved = np.zeros_like(self.starts)
+        for k, ((begin, before), own) in enumerate(zip(self._beginnings, noise, strict=True)):
+            assert isinstance(self.simulator, Simulator)
+            noisy = replace(begin, observations=begin.observations + own[: len(begin) + 1])
+            moved[k, : len(before)] = estimate_states(self.simulator, noisy)[0] - before
+        return moved
+
+    @cached_property
+    def _beginnings(self) -> list[tuple[Trajectory, FloatArray]]:
+        """The first moments of every recording, and the start that they tell."""
+        assert isinstance(self.simulator, Simulator)
+        found = []
+        for recorded in self.trajectories:
+            steps = min(len(recorded), math.ceil(_BEGINNING / recorded.dt))
+            begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
+            found.append((begin, estimate_states(self.simulator, begin)[0]))
+        return found
 
     def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
         """Noise (count, O) of samples dt seconds apart."""

@@ -159,17 +159,18 @@ class Simulator:
         """The recorded actions from the recorded starting states, for every theta (B, N): B * R trajectories, of theta 0 with
         each of the R recorded ones, then of theta 1 ..., each as long as the recorded one.
 
-        starts (R, S): starting states to use instead. Raises ValueError where nothing tells the starting states."""
+        starts (R, S), or (B * R, S) where they differ between thetas: starting states to use instead. Raises ValueError where nothing
+        tells the starting states."""
         theta, count = np.atleast_2d(theta), len(trajectories)
         if starts is None and trajectories.states is None:
             raise ValueError("trajectories: they hold no states to start from; record them or pass starts (R, S)")
         first = trajectories.states[:, 0] if starts is None else np.asarray(starts, float)  # type: ignore[index]
-        first = np.concatenate([np.zeros((count, 1)), first[:, 1:]], axis=1)
+        first = np.concatenate([np.zeros((len(first), 1)), first[:, 1:]], axis=1)
         batch, goals = len(theta), self.environment.recorded_goals(trajectories.observations[:, 0])
         result = self.rollout(
             np.repeat(theta, count, axis=0),
             np.tile(trajectories.actions, (batch, 1, 1)),
-            np.tile(first, (batch, 1)),
+            first if len(first) == batch * count else np.tile(first, (batch, 1)),
             np.tile(trajectories.dt, batch),
             list(trajectories.names or [None] * count) * batch,
             goals=None if goals is None else np.tile(goals, (batch, 1)),

@@ -348,7 +348,13 @@ def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
     assert result.stdout.count("\n") == 1
     assert result.stderr == ""  # no progress bar when piped
     found = strict_json(result.stdout)
-    assert {"parameters", "holdout", "train", "warnings", "rollouts", "seconds", "out"} <= set(found)
+    assert {"parameters", "holdout", "train", "warnings", "rollouts", "seconds", "out", "left_out"} <= set(found)
+    assert found["comparison"]["verdict"] == "better"
+    assert found["misfit"]["p"] > 0.05  # a right model: fails for one seed in twenty, and this is not one
+    assert set(found["misfit"]["share"]) == {"angle"}
+    assert [o["log"] for o in found["outside_prior"]] == ["log"]
+    assert found["outside_prior"][0]["p"] > 0.05
+    assert found["warnings"] == []
     wanted = {"name", "unit", "targets", "mean", "sd", "q05", "q50", "q95", "contraction", "flags"}
     assert [wanted - set(p) for p in found["parameters"]] == [set(), set()]
     for use, name in (("holdout", "rest"), ("train", "log")):
@@ -458,6 +464,51 @@ def test_table_for_people(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest
     assert (tmp_path / "runs" / "config-laplace").is_dir() or (tmp_path / "runs" / "swing-laplace").is_dir()
     for words in ("mass", "damping[log]", "90 % interval", "held out rest, angle: RMSE", "rollouts", "report: runs/"):
         assert words in result.stdout
+    table = result.stdout.index("90 % interval")
+    assert result.stdout.index("may be trusted within its interval") < table
+    assert result.stdout.index("is better than the model you had") < table
+
+
+def test_state_space_leaves_out_what_does_not_apply_and_says_so(tmp_path: Path, log: pd.DataFrame) -> None:
+    config = write_case(tmp_path, log)
+    text("window = 0.5", 'likelihood = "state_space"\n[search]\nrestarts = 1\ncandidates = 0')(tmp_path)
+    result = call(config, "--json", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    found = strict_json(result.stdout)
+    assert found["misfit"] is None
+    assert "state is unknown at every sample" in found["left_out"][0]
+    assert (found["comparison"]["verdict"], len(found["outside_prior"])) == ("better", 1)
+    assert found["noise"]["angle"]["tau"] == 0
+    for p in found["parameters"]:  # 5 sd: one in a million
+        assert abs(p["mean"] - TRUTH[p["name"]]) < 5 * p["sd"]
+    assert "Left out. Residuals" in (tmp_path / "out" / "report.html").read_text()
+    refused = call(config, "--estimator", "cem", "--out", tmp_path / "other")
+    assert refused.exit_code == 2
+    assert refused.stderr.count("\n") == 1
+
+
+def test_what_the_model_lacks_is_a_warning(tmp_path: Path, log: pd.DataFrame) -> None:
+    """A torque that is 0.2 N m stronger than logged."""
+    config = write_case(tmp_path, log.assign(torque=log["torque"] - 0.2))
+    found = strict_json(call(config, "--json", "--out", tmp_path / "out").stdout)
+    assert found["misfit"]["cause"] == "an offset of motor"
+    assert found["misfit"]["matters"]
+    assert "the residuals are not noise" in found["warnings"][0]
+    flagged = {p["name"] for p in found["parameters"] if "misfit" in p["flags"]}
+    assert flagged
+    assert "model lacks something" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("part", ["misfit", "outside_prior"])
+def test_a_check_that_fails_is_one_warning(
+    part: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise ValueError("the simulation diverges")
+
+    monkeypatch.setattr(f"sipe_bayes.calibration.{part}", fail)
+    found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
+    assert [w.endswith("is unknown: the simulation diverges") for w in found["warnings"]] == [True]
 
 
 # A killed run

@@ -93,6 +93,20 @@ def test_whole_log_as_one_window_and_earlier_posterior(tmp_path: Path) -> None:
     assert config.prior.source == tmp_path / "runs/one/posterior"
 
 
+STATE_SPACE = BASE.replace("window = 0.5", 'likelihood = "state_space"')
+
+
+def test_state_space_has_no_windows_but_may_score_held_out_logs_by_them(tmp_path: Path) -> None:
+    config = read(tmp_path, STATE_SPACE.replace('"b.csv"', '"b.csv"\nwindow = 0.3') + '[noise]\nmodel = "white"\n')
+    assert (config.likelihood, config.window) == ("state_space", None)
+    assert [config.window_of(log) for log in config.logs] == [None, 0.3]
+    with pytest.raises(ConfigError, match=r"key `logs\[0\].window`: given with likelihood = 'state_space'"):
+        read(tmp_path, STATE_SPACE.replace('"a.csv"', '"a.csv"\nwindow = 0.3'))
+    for model in ("ar1", "sandwich"):
+        with pytest.raises(ConfigError, match=f"key `noise.model`: expected 'white' .* got '{model}'; drop it"):
+            read(tmp_path, STATE_SPACE + f'[noise]\nmodel = "{model}"\n')
+
+
 def test_a_file_may_train_and_be_held_out_in_different_spans(tmp_path: Path) -> None:
     text = BASE.replace('"a.csv"', '"a.csv"\nspan = [0, 2]').replace('"b.csv"', '"a.csv"\nname = "rest"\nspan = [2, 3]')
     assert [log.span for log in read(tmp_path, text).logs] == [(0.0, 2.0), (2.0, 3.0)]
@@ -112,6 +126,13 @@ WRONG: list[tuple[str, str, str]] = [
     ('model = "pendulum.xml"\n', "", "`model`: missing; add it"),
     ('"pendulum.xml"', '"pendulun.xml"', "`model`: no such file, got .*did you mean 'pendulum.xml'"),
     ('"pendulum.xml"', "3", "`model`: .*got 3"),
+    ("window = 0.5\n", "", "`window`: missing; add it"),
+    (
+        "window = 0.5",
+        'window = 0.5\nlikelihood = "kalman"',
+        "`likelihood`: .*'segments' or 'state_space', got 'kalman'",
+    ),
+    ("window = 0.5", 'window = 0.5\nlikelihood = "state_space"', "`window`: .*no windows; drop it or use"),
     ("window = 0.5", "window = 0", "`window`: .*above zero.*got 0; try"),
     ("window = 0.5", 'window = "half"', "`window`: .*got 'half'"),
     ("window = 0.5", "window = 0.5\nestimator = 'laplac'", "`estimator`: .*'laplac'; did you mean 'laplace'"),

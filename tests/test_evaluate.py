@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.diagnostics.evaluate import channel_scores, errors
+from sipe_bayes.diagnostics.evaluate import _jackknifed, channel_scores, compare_errors, errors
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.parameters import Parameter
 from sipe_bayes.simulator import Simulator
@@ -43,3 +44,54 @@ def test_a_diverging_log_does_not_hide_the_others() -> None:
     rows = {row.log: row for row in channel_scores(windows, simulator.space.normalise(np.array([0.6, 0.05])))}
     assert rows["good"].rmse < 0.05
     assert not rows["wild"].rmse < 1e3
+
+
+def held_out(truth: list[float], *windows: float | None) -> Windows:
+    """Logs of a pendulum at ``truth``, one for each length of windows; the model as given has 0.6 kg and a damping of 0.05."""
+    simulator = pendulum()
+    logs = Trajectories.stack([log(simulator, truth, seed, f"log {seed}") for seed in range(len(windows))])
+    each = tuple((f"log {k}", window) for k, window in enumerate(windows))
+    return Windows(Segments(0.5, windows=each), simulator, logs)
+
+
+def test_a_model_that_helps_is_better_and_its_mirror_image_is_worse() -> None:
+    """From either model's side the same numbers come out, turned round; whatever the windows, also a log that is one."""
+    windows = held_out([0.9, 0.15], 0.5, None)
+    truth = windows.simulator.space.normalise(np.array([0.9, 0.15]))
+    found = compare_errors(windows, truth)
+    assert found is not None
+    assert (found.verdict, found.pieces) == ("better", 20)
+    assert 1 < found.low < found.ratio < found.high
+    rows = channel_scores(windows, truth)
+    assert found.ratio == pytest.approx(np.exp(np.mean([np.log(r.rmse_default / r.rmse) for r in rows])))
+    far = windows.simulator.space.normalise(np.array([0.3, 0.0]))
+    worse = compare_errors(held_out([0.6, 0.05], 0.5, None), far)
+    assert worse is not None
+    assert worse.verdict == "worse"
+    assert worse.low < worse.ratio < worse.high < 1
+
+
+def test_models_alike_are_not_better() -> None:
+    windows = held_out([0.6, 0.05], 0.5)
+    same = compare_errors(windows, windows.simulator.space.default_theta)
+    assert same is not None
+    assert (same.verdict, same.ratio, same.p) == ("not better", 1.0, 1.0)
+
+
+def test_models_that_err_alike_are_called_different_as_rarely_as_it_says() -> None:
+    """1000 comparisons of errors that are equally large and correlated along the log (rho 0.9, 100 samples a piece): a t-test at the 5 %
+    level on two logs' tenths should call 50 of them different, with sd 7; up to 90 allows for what dependence is left."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((1000, 2, 2, 1000))
+    for i in range(1, 1000):
+        noise[..., i] = 0.9 * noise[..., i - 1] + np.sqrt(0.19) * noise[..., i]
+    sums = (noise**2).reshape(1000, 2, 2, 10, 100).sum(-1)
+    called = [_jackknifed([one[0][:, :, None], one[1][:, :, None]]).verdict for one in sums]
+    print({word: called.count(word) for word in set(called)})
+    assert 15 < sum(word != "not better" for word in called) < 90
+
+
+def test_nothing_finite_is_no_comparison() -> None:
+    windows = held_out([0.6, 0.05], 0.5)
+    windows.measured[:] = np.inf
+    assert compare_errors(windows, windows.simulator.space.default_theta) is None

@@ -21,6 +21,7 @@ from sipe_bayes.inference.state import CheckpointError, State
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Posterior
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 from tests.pendulums import log, pendulum
 
@@ -151,6 +152,23 @@ def test_coloured_noise_that_the_estimator_takes_for_white() -> None:
     found = recalibrated.fit(recorded)
     print(found.stddev / own.stddev, recalibrated.diagnostics)
     assert (found.stddev / own.stddev > 1.4).all()
+    assert recalibrated.rollouts <= recalibrated.cost(recorded)
+
+
+def test_a_state_space_fit_is_recalibrated() -> None:
+    """White noise and a right model: the posterior was right before, so its mean stays within two of its sds, and its sds, which
+    20 refits know to 16 %, within a factor of two."""
+    simulator = pendulum()
+    recorded = log(simulator, [0.6, 0.08], 1, steps=100)
+    base = sipe.get_estimator(simulator, "laplace", likelihood=StateSpace(), restarts=1, candidates=0)
+    own = base.fit(recorded)
+    recalibrated = Recalibrated(base, refits=20)
+    found = recalibrated.fit(recorded)
+    ratio, off = found.stddev / own.stddev, (found.mean - own.mean) / own.stddev
+    print(ratio, off, recalibrated.diagnostics, recalibrated.warnings)
+    assert recalibrated.diagnostics["noise_sd"][0] == pytest.approx(0.01, rel=0.3)  # four standard errors
+    assert ((ratio > 0.5) & (ratio < 2)).all()
+    assert off.abs().max() < 2
     assert recalibrated.rollouts <= recalibrated.cost(recorded)
 
 

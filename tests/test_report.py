@@ -16,9 +16,11 @@ import torch
 
 from sipe_bayes import atomic
 from sipe_bayes.diagnostics import plots, report
+from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior
 from sipe_bayes.diagnostics.result import (
     Calibration,
     ChannelScore,
+    Comparison,
     ParameterSummary,
     Residual,
     Ridge,
@@ -27,6 +29,10 @@ from sipe_bayes.diagnostics.result import (
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, prior
 
+BETTER = Comparison(3.1, 2.6, 3.7, 1e-6, 10)
+LACKS = Misfit(
+    0.005, "drag at hinge", "put it in", "train_0", "angle_0", 0, 1, {"angle_0": 0.4}, {"p1": 3.0, "p2": 0.1}
+)
 EVIL = "<script>alert('x')</script>"
 
 
@@ -100,6 +106,7 @@ def make_calibration(size: int = 3, logs: int = 1, channels: int = 1, names: tup
         warnings=[f"{names[0]} lies at its lower bound"],
         signals=signals,
         residuals=residuals,
+        comparison=BETTER,
         ridges=[Ridge("the last two trade against each other", names[-2:])],
         noise={"angle_0": {"sd": 0.0123, "tau": 0.0, "unit": "rad"}},
         logs=[{"name": log, "use": use, "rate_hz": 100.0, "samples": 201, "gaps": [[0.4, 0.6]]} for log, use in keys],
@@ -376,12 +383,14 @@ def parameter(contraction: float = 0.9, *flags: str) -> ParameterSummary:
 @pytest.mark.parametrize(
     ("summary", "tone", "words"),
     [
-        (parameter(0.9), "good", "well determined"),
+        (parameter(0.9), "good", "determined"),
         (parameter(0.5), "fair", "weakly determined"),
         (parameter(0.05, "not_determined"), "bad", "not determined"),
         (parameter(0.99, "at_bound"), "bad", "at a bound"),
         (parameter(0.0, "no_effect", "not_determined"), "bad", "changes nothing, not determined"),
-        (parameter(0.99, "disagrees"), "bad", "logs disagree"),
+        (parameter(0.99, "disagrees"), "bad", "disagrees between logs"),
+        (parameter(0.99, "misfit"), "bad", "model lacks something"),
+        (parameter(0.99, "at_bound", "misfit"), "bad", "at a bound, model lacks something"),
         (parameter(0.99, "dead_range"), "fair", "part of its range changes nothing"),
         (dataclasses.replace(parameter(1.0), sd=0.0), "fair", "a point without uncertainty"),
     ],
@@ -392,32 +401,97 @@ def test_verdict_on_a_parameter(summary: ParameterSummary, tone: str, words: str
     assert words in found.text
 
 
+def test_a_member_of_a_ridge_is_determined_only_with_the_others() -> None:
+    ridge = [Ridge("mass / length = 2 is determined", ("mass", "length"))]
+    for flags in ((), ("not_determined",)):
+        found = report.parameter_verdict(parameter(0.3, *flags), ridge)
+        assert (found.tone, found.text) == ("fair", "only with length")
+    assert report.parameter_verdict(parameter(0.9), ridge).text == "determined"
+    assert report.parameter_verdict(parameter(0.3, "at_bound"), ridge).text == "at a bound"
+    assert report.parameter_verdict(parameter(0.0, "no_effect", "not_determined"), ridge).tone == "bad"
+    assert report.parameter_verdict(parameter(0.3, "not_determined"), [Ridge("", ("a", "b"))]).tone == "bad"
+
+
 def scores(*pairs: tuple[float, float]) -> list[ChannelScore]:
     return [ChannelScore("log", f"c{i}", "rad", ours, default) for i, (ours, default) in enumerate(pairs)]
 
 
+WORSE = Comparison(1 / 3.1, 1 / 3.7, 1 / 2.6, 1e-6, 10)
+ALIKE = Comparison(1.1, 0.8, 1.5, 0.6, 10)
+
+
 @pytest.mark.parametrize(
-    ("rows", "tone", "words"),
+    ("rows", "comparison", "tone", "words"),
     [
-        (scores((0.1, 0.31), (0.2, 0.62)), "good", "3.1 times smaller than"),
-        (scores((0.31, 0.1)), "bad", "NOT better than the model you had: its error is 3.1 times larger."),
-        (scores((0.1, 0.1)), "bad", "NOT better"),
-        (scores((0.1, 9.0), (0.3, 0.2)), "fair", "but larger in log (c1)"),
-        (scores((0.1, math.nan)), "fair", "no finite error to compare with"),
-        (scores((math.nan, 0.1)), "bad", "no finite error in log (c0)"),
-        ([], "fair", "No log was held out"),
+        (
+            scores((0.1, 0.31)),
+            BETTER,
+            "good",
+            "better than the model you had: its error is 3.1 times smaller (95 % interval 2.6 to",
+        ),
+        (
+            scores((0.31, 0.1)),
+            WORSE,
+            "bad",
+            "WORSE than the model you had: its error is 3.1 times larger (95 % interval 2.6 to 3.7",
+        ),
+        (
+            scores((0.1, 0.11)),
+            ALIKE,
+            "bad",
+            "NOT better than the model you had, beyond noise: its error is 1.1 times smaller",
+        ),
+        (scores((0.1, 9.0), (0.3, 0.2)), BETTER, "fair", "but it is larger in log (c1)"),
+        (scores((0.1, 0.102)), Comparison(1.02, 1.01, 1.03, 0.01, 10), "fair", "1.02 times smaller"),
+        (scores((0.1, math.nan)), None, "fair", "no finite error to compare with"),
+        (scores((math.nan, 0.1)), None, "bad", "no finite error in log (c0)"),
+        ([], None, "fair", "No log was held out"),
     ],
 )
-def test_verdict_on_the_prediction(rows: list[ChannelScore], tone: str, words: str) -> None:
-    found = report.prediction(rows)
+def test_verdict_on_the_prediction(
+    rows: list[ChannelScore], comparison: Comparison | None, tone: str, words: str
+) -> None:
+    found = report.prediction(rows, comparison)
     assert found.tone == tone
     assert words in found.text
+    assert (comparison is None) == ("t-test" not in found.text)
+
+
+def test_a_calibration_that_does_not_help_says_so_first(calibration: Calibration) -> None:
+    for comparison, first in ((WORSE, "WORSE"), (ALIKE, "NOT better"), (BETTER, "may be trusted")):
+        found = dataclasses.replace(calibration, comparison=comparison)
+        assert first in report.verdicts(found)[0].text
+        page = Page(report.render(found, [])).text
+        assert page.index(first) < page.index("90 % interval")
+
+
+def test_what_the_model_lacks_is_among_the_first_sentences(calibration: Calibration) -> None:
+    assert report.lack(calibration) is None
+    found = report.lack(dataclasses.replace(calibration, misfit=LACKS))
+    assert found is not None
+    assert found.tone == "bad"
+    assert "drag at hinge (40 % of the residual of angle_0, p = 0.005)" in found.text
+    small = report.lack(
+        dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, share={"angle_0": 0.04}, shift={}))
+    )
+    assert small is not None
+    assert small.tone == "fair"
+    assert "something small" in small.text
+    assert report.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, p=0.2))) is None
+    strange = dataclasses.replace(calibration, outside=[OutsidePrior(0.01, "train_0", "angle_0", 1.0)], misfit=LACKS)
+    found = report.lack(strange)
+    assert found is not None
+    assert "train_0" in found.text
+    assert "misfit" in strange.to_dict()
+    assert strange.to_dict()["misfit"]["matters"]
 
 
 def test_headline_counts_without_nuisance_parameters() -> None:
     good, weak, nuisance = parameter(0.9), parameter(0.5), parameter(0.9, "nuisance")
-    assert report.headline([good, weak, nuisance]).text == "1 of 2 parameters is well determined by these logs."
-    assert report.headline([good, good]).text == "All 2 parameters are well determined by these logs."
+    found = report.headline([good, weak, nuisance]).text
+    assert found == "1 of 2 values may be trusted within their intervals: mass; the table says why not the others."
+    assert report.headline([good, good]).text == "All 2 values may be trusted within their intervals."
+    assert report.headline([good]).tone == "good"
     assert report.headline([weak, weak]).tone == "bad"
     assert report.headline([nuisance]).tone == "fair"
 
@@ -427,10 +501,18 @@ def test_headline_counts_without_nuisance_parameters() -> None:
 
 def test_page_says_what_matters_first(page: str) -> None:
     text = Page(page).text
-    first = text.index("2 of 3 parameters are well determined by these logs.")
-    second = text.index("On held-out logs the error is 3.1 times smaller than with the model as given.")
-    assert first < second < text.index("1 warning") < text.index("90 % interval") < text.index("Marginals")
-    assert "p0 (at a bound)" in text
+    first = text.index("2 of 3 values may be trusted within their intervals: p1 and p2;")
+    second = text.index(
+        "On held-out logs the calibrated model is better than the model you had: its error is 3.1 times smaller"
+    )
+    assert first < second < text.index("90 % interval") < text.index("1 warning") < text.index("Parameters in detail")
+    assert second < text.index("at a bound") < text.index("1 warning")
+    assert "Left out." not in text
+
+
+def test_what_is_left_out_is_said(calibration: Calibration) -> None:
+    text = Page(report.render(dataclasses.replace(calibration, left_out=["Residuals: none here."]), [])).text
+    assert "Left out. Residuals: none here." in text
 
 
 def test_page_names_every_parameter_and_section(page: str, calibration: Calibration) -> None:

@@ -20,6 +20,7 @@ from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.simulator import Simulator
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -64,7 +65,7 @@ class Disagreement:
 
 def compare_logs(
     simulator: Simulator,
-    likelihood: Segments,
+    likelihood: Segments | StateSpace,
     trajectories: Trajectories,
     theta: FloatArray,
     seed: int = 0,

@@ -13,16 +13,23 @@ The null is simulated: noise as estimated, drawn anew, estimated anew, projected
 standardised by its mean and sd over these; the largest is compared with the largest of each. So the p-value holds for
 white and first-order autoregressive sensor noise, whatever the number of probes, up to the linearisation.
 
+A small p says that something is there, not that it is large: with it come the share of each channel's residual that the named
+cause explains and, of a probe, how far the estimate would move if the model had it.
+
 **Prior predictive.** Logs simulated from the prior, with noise: the log's local outlier factor among them (M. Breunig et al. 2000,
-https://doi.org/10.1145/342009.335388), channel by channel, ranked among their own; Bonferroni's factor for the channels.
+https://doi.org/10.1145/342009.335388), channel by channel. The p-value compares the log's largest with the largest of each simulation
+over all logs and channels, each started as far off as noise leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based multiple
+testing").
 
 Deviations: a probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
-misfit passes as slow noise. A cause that is named is the one that fits best, not one that is proven.
+misfit passes as slow noise. Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is
+named even if whiteness is odder, since it says more. A cause that is named is the one that fits best, not one that is proven.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -31,40 +38,82 @@ from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
+from sipe_bayes.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.replicas import Replicas
+from sipe_bayes.state_space import Chain
+from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 SIMULATED = 199
 LEVEL = 0.05
+SMALL = 0.1
+"""Share of a channel's residual below which what the model lacks counts as small."""
+FAR = 1.0
+"""Posterior sds: a parameter that would move further if the model had what it lacks is not to be trusted."""
 _STEP = 1e-3  # of a command's size: how far a probe is pushed
 _SOFT = 0.05  # of a velocity's size, where friction turns round
 _PIECES = 10
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _FLAT_PRECISION = 1e-6
-_SAMPLES, _NEIGHBOURS, _PREDICTIVE = 50, 20, 100
+_AT_ONCE = 16  # draws of the null whose products are formed together
+_SAMPLES, _NEIGHBOURS, _PREDICTIVE, _PER_BATCH = 50, 20, 59, 10
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """p: of residuals as odd as these under a right model with autoregressive noise. cause: what fits them best, in words; log,
-    channel, start, stop (s): where it shows most."""
+    """p: of residuals as odd as these under a right model with autoregressive noise. cause: what fits them best, in words; remedy:
+    what to do about it; log, channel, start, stop (s): where it shows most.
+
+    share: for each channel the share of the residual's variance that the cause explains; where samples follow one another, of the
+    whitened residual's that those before foretell; where noise is larger for a while, of its squares what that tenth of the time
+    has too many. shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
+    where that cannot be told."""
 
     p: float
     cause: str
+    remedy: str
     log: str
     channel: str
     start: float
     stop: float
+    share: dict[str, float] = field(default_factory=dict)
+    shift: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def alarm(self) -> bool:
+        """Whether p is at most ``LEVEL``."""
+        return self.p <= LEVEL
+
+    @property
+    def moved(self) -> list[str]:
+        """The parameters that would move by more than ``FAR``."""
+        return [name for name, sds in self.shift.items() if abs(sds) > FAR]
+
+    @property
+    def matters(self) -> bool:
+        """Whether there is an alarm and its cause is not small."""
+        return self.alarm and (max(self.share.values()) >= SMALL or bool(self.moved))
 
     @property
     def text(self) -> str:
         """In a sentence."""
+        there = (
+            f"{self.cause} ({100 * self.share[self.channel]:.2g} % of the residual of {self.channel}), most in {self.log} between "
+            f"{self.start:.3g} and {self.stop:.3g} s"
+        )
+        if not self.alarm:
+            return f"the residuals pass for noise (p = {self.p:.2g}); what they resemble most is {there}"
+        found = f"the residuals are not noise (p = {self.p:.2g}): they look like {there}"
+        if self.moved:
+            moved = ", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved)
+            return f"{found}; with it in the model the estimate would move, {moved}: {self.remedy}"
+        if self.matters:
+            return f"{found}; do not trust the intervals' width: {self.remedy}"
         return (
-            f"the residuals are not noise (p = {self.p:.2g}): they look like {self.cause}, most in {self.channel} of {self.log} between "
-            f"{self.start:.3g} and {self.stop:.3g} s; model it, or do not trust the intervals"
+            f"{found}; a small effect that moves no parameter by more than {FAR:g} sd: {self.remedy} if you need more"
         )
 
 
@@ -78,60 +127,126 @@ class OutsidePrior:
     time: float
 
     @property
+    def alarm(self) -> bool:
+        """Whether p is at most ``LEVEL``."""
+        return self.p <= LEVEL
+
+    @property
     def text(self) -> str:
         """In a sentence."""
+        if not self.alarm:
+            return f"log {self.log} is like simulations of the prior (p = {self.p:.2g})"
         return (
             f"log {self.log} is unlike every simulation of the prior (p = {self.p:.2g}), most in {self.channel} at {self.time:.3g} s: "
             "widen the bounds, or correct the model, units or signs"
         )
 
 
-def misfit(windows: Windows, theta: FloatArray, noise: Noise, *, seed: int = 0, simulated: int = SIMULATED) -> Misfit:
-    """How odd the residuals of fitted ``windows`` are at theta (N,) with the ``noise`` (C) found there. Costs a linearisation and a
-    rollout for each probe."""
-    return _Residuals(windows, theta, noise).misfit(np.random.default_rng(seed), simulated)
+def misfit(
+    windows: Windows,
+    theta: FloatArray,
+    noise: Noise,
+    *,
+    starts: FloatArray | None = None,
+    sd: FloatArray | None = None,
+    seed: int = 0,
+    simulated: int = SIMULATED,
+) -> Misfit:
+    """How odd the residuals of fitted ``windows`` are at theta (N,) with the ``noise`` (C) found there.
+
+    starts (W, D): of the windows, default the best. sd (N,): of the posterior in theta, default that of the linearisation. Costs a
+    linearisation and a rollout for each probe. Raises ValueError where the simulation diverges at theta."""
+    starts = best_starts(windows, theta, noise) if starts is None else starts
+    return _Residuals(windows, theta, noise, starts).misfit(np.random.default_rng(seed), simulated, sd)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A residual solved for theta and starts, without the K probes: statistics (K + 2 C,), what is left (W, L, C), step (N + K,),
+    score (K,) of each probe and its information, theta's answer (N, K) to the probes and its variance (N,)."""
+
+    statistics: FloatArray
+    left: FloatArray
+    step: FloatArray
+    score: FloatArray
+    information: FloatArray
+    answer: FloatArray
+    variance: FloatArray
+    arrow: Arrow
 
 
 class _Residuals:
     """The log linearised at the estimate, with K probes beside the N parameters."""
 
-    def __init__(self, windows: Windows, theta: FloatArray, noise: Noise) -> None:
-        self.windows, self.noise = windows, noise
-        starts = best_starts(windows, theta, noise)
+    def __init__(self, windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray) -> None:
+        self.windows, self.theta, self.noise = windows, theta, noise
         found = windows.linearise(theta, starts)
         if not found.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        self.names, effects = _probes(windows, theta, starts)
+        self.probes, effects = _probes(windows, theta, starts)
         n = windows.num_theta
         parts = (found.jacobian[..., :n], effects, found.jacobian[..., n:])
-        self.residual, self.jacobian, self.starts = found.residual, np.concatenate(parts, axis=-1), starts
-        self.count = n + len(self.names)
+        self.residual, self.jacobian = found.residual, np.concatenate(parts, axis=-1)
+        self.count = n + len(self.probes)
         self.coloured = bool((noise.tau > 0).any())
 
-    def misfit(self, rng: np.random.Generator, simulated: int) -> Misfit:
-        seen, detail = self.statistics(self.residual, self.noise)
-        null = np.stack([self.statistics(*self.drawn(rng))[0] for _ in range(simulated)])
+    def misfit(self, rng: np.random.Generator, simulated: int, sd: FloatArray | None) -> Misfit:
+        seen = self.solved(self.residual, self.moments(self.residual[..., None])[0][1], self.noise)
+        null = self.null(rng, simulated)
         middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
-        odd, largest = (seen - middle) / spread, ((null - middle) / spread).max(1)
-        worst = int(odd.argmax())
-        p = (1 + int((largest >= odd[worst]).sum())) / (1 + simulated)
-        return self._described(p, worst, detail)
+        odd, largest = (seen.statistics - middle) / spread, ((null - middle) / spread).max(1)
 
-    def drawn(self, rng: np.random.Generator) -> tuple[FloatArray, Noise]:
-        """A residual (W, L, C) of the noise alone, and the noise as it is then estimated."""
-        drawn = np.zeros_like(self.residual)
+        def p(statistic: int) -> float:
+            return float((1 + (largest >= odd[statistic]).sum()) / (1 + simulated))
+
+        worst, k = int(odd.argmax()), len(self.probes)
+        if k:
+            best = int(odd[:k].argmax())
+            named = self._probe_named(p(worst), best, seen, sd)
+            if best == worst or (p(best) <= LEVEL and max(named.share.values()) >= SMALL):
+                return named
+        return self._colour_named(p(worst), worst - k, seen)
+
+    def null(self, rng: np.random.Generator, simulated: int) -> FloatArray:
+        """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated."""
+        draws, rows = self.drawn(rng, simulated), []
+        for part in np.array_split(np.arange(simulated), max(1, simulated // _AT_ONCE)):
+            for s, (plain, probed) in zip(part, self.moments(draws[..., part]), strict=True):
+                noise = self._estimated(plain)
+                rows.append(self.solved(draws[..., s], probed, noise).statistics)
+        return np.stack(rows)
+
+    def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
+        """Residuals (W, L, C, S) of the noise alone."""
+        out = np.zeros((*self.residual.shape, simulated))
         for c, s in enumerate(self.windows.sequences):
             a = coefficients(s.gaps, float(self.noise.tau[c]))[s.gap]
-            white, flat = rng.standard_normal(len(s.index)), np.empty(len(s.index))
-            scale, before = np.sqrt(1 - a**2), 0.0
-            for i in range(len(flat)):
-                before = flat[i] = a[i] * before + scale[i] * white[i]
-            column = drawn[:, :, c].reshape(-1)
+            flat = rng.standard_normal((len(s.index), simulated)) * np.sqrt(1 - a**2)[:, None]
+            for i in np.flatnonzero(a):
+                flat[i] += a[i] * flat[i - 1]
+            column = np.zeros((self.residual[:, :, c].size, simulated))
             column[s.index] = self.noise.sd[c] * flat
-            drawn[:, :, c] = column.reshape(drawn.shape[:2])
-        n = self.windows.num_theta
-        kept = np.concatenate([self.jacobian[..., :n], self.jacobian[..., self.count :]], axis=-1)
-        moments = Moments(drawn, kept, n, self.windows.sequences)
+            out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
+        return out
+
+    def moments(self, residuals: FloatArray) -> list[tuple[Moments, Moments]]:
+        """For each of residuals (W, L, C, S) the products without the probes and with them; the Jacobian's are formed once."""
+        n, count, many = self.windows.num_theta, self.count, residuals.shape[-1]
+        parts = (self.jacobian[..., :count], residuals, self.jacobian[..., count:])
+        rows = np.concatenate(parts, axis=-1)
+        whole = Moments(np.zeros(rows.shape[:3]), rows, count + many, self.windows.sequences)
+        starts = count + many + np.arange(2 * self.windows.num_start)
+        return [
+            (
+                _chosen(whole, np.concatenate([np.arange(n), starts, [count + s]]), n),
+                _chosen(whole, np.concatenate([np.arange(count), starts, [count + s]]), count),
+            )
+            for s in range(many)
+        ]
+
+    def _estimated(self, moments: Moments) -> Noise:
+        """The noise that a fit would have found in a draw of it."""
+        n = moments.num_theta
         flat_prior, none = _FLAT_PRECISION * np.eye(n), self.windows.no_starts()
         pulls = Pulls(flat_prior, np.zeros(n), self.windows.start_precision, none, np.full(n, True))
         unknown, channels = np.full(len(self.noise.sd), np.nan), self.windows.settings.noise_sd
@@ -140,65 +255,112 @@ class _Residuals:
         trajectories = self.windows.trajectories
         longest = float((trajectories.length * trajectories.dt).max())
         shortest = float(self.windows.dt.min())
-        return drawn, estimate_noise(moments, self.noise, pulls, unknown, self.coloured, shortest, longest)
+        return estimate_noise(moments, self.noise, pulls, unknown, self.coloured, shortest, longest)
 
-    def statistics(self, residual: FloatArray, noise: Noise) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-        """Cube roots of K score statistics, C sums of squared autocorrelations and C largest mean squares of a piece; and
-        (residual left (W, L, C) without probes, with each probe alone (K, W, L, C), noise sd, noise tau)."""
-        n, k = self.windows.num_theta, len(self.names)
-        moments = Moments(residual, self.jacobian, self.count, self.windows.sequences)
-        no_pull = self.windows.no_starts()
-        arrow = eliminate(moments.normal(noise), self.count, self.windows.start_precision, no_pull)
+    def solved(self, residual: FloatArray, moments: Moments, noise: Noise) -> _Solved:
+        """Cube roots of K score statistics, C sums of squared autocorrelations and C largest mean squares of a piece, with what
+        they are made of; residual (W, L, C) and its products with the probes."""
+        n = self.windows.num_theta
+        arrow = eliminate(moments.normal(noise), self.count, self.windows.start_precision, self.windows.no_starts())
         inner = arrow.precision + _FLAT_PRECISION * np.eye(self.count)
-        base = np.linalg.solve(inner[:n, :n], arrow.gradient[:n])
-        cross = np.linalg.solve(inner[:n, :n], inner[:n, n:])
+        inverse = np.linalg.inv(inner[:n, :n])
+        base, cross = inverse @ arrow.gradient[:n], inverse @ inner[:n, n:]
         gradient = arrow.gradient[n:] - inner[n:, :n] @ base
         information = np.diag(inner)[n:] - np.einsum("ik,ik->k", inner[:n, n:], cross)
         usable = information > 1e-6 * np.diag(inner)[n:] + 2 * _FLAT_PRECISION
-        scores = np.where(usable, gradient**2 / np.maximum(information, 1e-300), 0.0)
-
-        def left(step: FloatArray) -> FloatArray:
-            moved = self.jacobian[..., : self.count] @ step
-            starts = np.einsum("wlcd,wd->wlc", self.jacobian[..., self.count :], arrow.starts(step))
-            return np.where(self.windows.observed, residual - moved - starts, 0.0)
-
-        plain = left(np.asarray(np.concatenate([base, np.zeros(k)]), np.float64))
-        best = int(scores.argmax()) if k else 0
-        amplitude = gradient[best] / information[best] if k and usable[best] else 0.0
-        step = np.asarray(base, np.float64)
-        if k:
-            step = np.concatenate([step - amplitude * cross[:, best], amplitude * np.eye(k)[best]])
-        white = [self._white(plain, c, noise) for c in range(len(noise.sd))]
+        information = np.where(usable, information, np.inf)
+        base = np.concatenate([base, np.zeros(self.count - n)])
+        left = self._left(residual, base, arrow.starts(base))
+        white = [self._white(left, c, noise) for c in range(len(noise.sd))]
         whiteness = [_autocorrelation(z) for z in white]
         pieces = [max(float((p**2).mean()) for p in np.array_split(z, _PIECES)) for z in white]
-        return np.cbrt(np.concatenate([scores, whiteness, pieces])), (plain, left(step), noise.sd, noise.tau)
+        statistics = np.cbrt(np.concatenate([gradient**2 / information, whiteness, pieces]))
+        return _Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
+
+    def _left(self, residual: FloatArray, step: FloatArray, starts: FloatArray) -> FloatArray:
+        """What a step of theta and probes (N + K,) and one of the starts (W, D) leave of a residual (W, L, C)."""
+        moved = self.jacobian[..., : self.count] @ step
+        turned = np.einsum("wlcd,wd->wlc", self.jacobian[..., self.count :], starts)
+        return np.where(self.windows.observed, residual - moved - turned, 0.0)
 
     def _white(self, residual: FloatArray, c: int, noise: Noise) -> FloatArray:
         flat = residual[:, :, c].reshape(-1)
         return whiten(flat, self.windows.sequences[c], float(noise.sd[c]), float(noise.tau[c]))
 
-    def _described(self, p: float, worst: int, detail: tuple[FloatArray, ...]) -> Misfit:
-        plain, explained, sd, tau = detail
-        noise, k, channels = Noise(sd, tau), len(self.names), self.windows.fitted
-        gains = [self._white(plain, c, noise) ** 2 for c in range(len(channels))]
-        if worst < k:
-            gains = [g - self._white(explained, c, noise) ** 2 for c, g in enumerate(gains)]
-            channel, cause = int(np.argmax([g.sum() for g in gains])), self.names[worst]
+    def _probe_named(self, p: float, probe: int, seen: _Solved, sd: FloatArray | None) -> Misfit:
+        n, names = self.windows.num_theta, self.windows.simulator.space.names
+        amplitude = seen.score[probe] / seen.information[probe]
+        step = seen.step + amplitude * np.concatenate([-seen.answer[:, probe], np.eye(len(self.probes))[probe]])
+        explained = self._left(self.residual, step, seen.arrow.starts(step))
+        gains = [
+            self._white(seen.left, c, self.noise) ** 2 - self._white(explained, c, self.noise) ** 2
+            for c in range(len(self.noise.sd))
+        ]
+        before, after = ((x**2).sum((0, 1)) for x in (seen.left, explained))
+        share = np.clip(1 - after / np.maximum(before, 1e-300), 0, 1)
+        sd = np.sqrt(seen.variance) if sd is None else sd
+        shift = (np.clip(self.theta + step[:n] - seen.step[:n], 0, 1) - self.theta) / np.maximum(sd, 1e-12)
+        name, remedy = self.probes[probe]
+        return self._placed(p, name, remedy, gains, share, dict(zip(names, shift.tolist(), strict=True)))
+
+    def _colour_named(self, p: float, statistic: int, seen: _Solved) -> Misfit:
+        """statistic: of 2 C, autocorrelations first."""
+        channels = len(self.noise.sd)
+        white = [self._white(seen.left, c, self.noise) for c in range(channels)]
+        share, gains = np.zeros(channels), [np.zeros(len(z)) for z in white]
+        c = statistic % channels
+        if statistic < channels:
+            gains[c] = white[c] ** 2 - (white[c] - _foretold(white[c])) ** 2
+            share[c] = gains[c].sum() / (white[c] ** 2).sum()
+            cause = "samples that follow one another, as an effect does that no probe stands for"
+            coloured = "look at the residuals' plot for what moves with them"
+            remedy = coloured if self.coloured else f'use noise = "ar1"; then {coloured}'
         else:
-            channel = (worst - k) % len(channels)
-            whiteness = worst - k < len(channels)
-            cause = "samples that follow one another" if whiteness else "noise that is not as large everywhere"
-        index = self.windows.sequences[channel].index
+            gains[c] = white[c] ** 2
+            most = max(float(piece.sum()) for piece in np.array_split(gains[c], _PIECES))
+            share[c] = most / gains[c].sum() - 1 / _PIECES
+            cause = "noise that is larger for a while"
+            remedy = "look at what happened there; leave that span out if it was a disturbance"
+        return self._placed(p, cause, remedy, gains, np.maximum(share, 0.0), {})
+
+    def _placed(
+        self,
+        p: float,
+        cause: str,
+        remedy: str,
+        gains: list[FloatArray],
+        share: FloatArray,
+        shift: dict[str, float],
+    ) -> Misfit:
+        """gains: per channel what each sample contributes."""
+        windows, channel = self.windows, int(np.argmax([g.sum() for g in gains]))
+        index = windows.sequences[channel].index
         window, place = index // self.residual.shape[1], index % self.residual.shape[1]
-        seconds = (self.windows.start[window] + place) * self.windows.dt[window]
-        log = self.windows.log[window]
-        best, where = -np.inf, (0, 0.0, 0.0)
-        for piece in np.array_split(np.arange(len(index)), _PIECES * (int(log.max()) + 1)):
-            if len(piece) and gains[channel][piece].sum() > best:
-                best = float(gains[channel][piece].sum())
-                where = (int(log[piece[0]]), float(seconds[piece[0]]), float(seconds[piece[-1]]))
-        name = self.windows.trajectories.names[where[0]]
-        return Misfit(p, cause, name, channels[channel], where[1], max(where[1], where[2]))
+        seconds = (windows.start[window] + place) * windows.dt[window]
+        log, best, where = windows.log[window], -np.inf, np.zeros(1, int)
+        for k in np.unique(log):
+            for piece in np.array_split(np.flatnonzero(log == k), _PIECES):
+                if len(piece) and gains[channel][piece].sum() > best:
+                    best, where = float(gains[channel][piece].sum()), piece
+        name = windows.trajectories.names[int(log[where[0]])]
+        span = float(seconds[where[0]]), float(seconds[where[-1]])
+        shares = dict(zip(windows.fitted, share.tolist(), strict=True))
+        return Misfit(p, cause, remedy, name, windows.fitted[channel], *span, shares, shift)
+
+
+def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
+    """Moments of some columns [theta | x_w | x_{w-1} | r] of others; the first ``num_theta`` are theta's."""
+    chosen, width = copy.copy(moments), moments.num_theta + 2 * moments.num_start + 1
+    products = moments.products.reshape(-1, moments.windows, width, width)[..., columns[:, None], columns]
+    chosen.products, chosen.num_theta = products.reshape(len(products), -1), num_theta
+    return chosen
+
+
+def _foretold(z: FloatArray) -> FloatArray:
+    """What least squares on the samples before, at ``_LAGS``, says of z (n,)."""
+    lags = [lag for lag in _LAGS if lag < len(z) // 4]
+    before = np.stack([np.concatenate([np.zeros(lag), z[:-lag]]) for lag in lags], axis=1)
+    return np.asarray(before @ np.linalg.lstsq(before, z, rcond=None)[0])
 
 
 def _autocorrelation(z: FloatArray) -> float:
@@ -208,64 +370,75 @@ def _autocorrelation(z: FloatArray) -> float:
     return float(len(z) * sum((z[lag:] @ z[:-lag] / square) ** 2 for lag in lags))
 
 
-def _probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[str], FloatArray]:
-    """Names of K probes and their effects (W, L, C, K) on the predictions."""
-    simulator, lanes = windows.simulator, windows.num_windows
+def _probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[tuple[str, str]], FloatArray]:
+    """(name, remedy) of K probes and their effects (W, L, C, K) on the predictions; those of an actuator in one batch."""
     states = windows.states(starts)
-    motion = simulator.rollout(
-        np.tile(theta, (lanes, 1)), windows.actions, states, windows.dt, windows.names, goals=windows.goals
-    )
+
+    def simulated(actions: FloatArray) -> Trajectories:
+        """Of actions (B W, T, A)."""
+        many = len(actions) // windows.num_windows
+        goals = None if windows.goals is None else np.tile(windows.goals, (many, 1))
+        first, dt, names = np.tile(states, (many, 1)), np.tile(windows.dt, many), windows.names * many
+        return windows.simulator.rollout(theta[None], actions, first, dt, names, goals=goals)
+
+    motion = simulated(windows.actions)
     assert motion.states is not None
     plain = motion.observations[..., windows.channels]
     inside = np.arange(windows.actions.shape[1]) < windows.steps[:, None]
-    names, effects = [], []
-    for name, column, change in _changes(windows, motion.states[:, :-1], inside):
-        moved = windows.actions.copy()
-        moved[..., column] += change
-        answer = simulator.rollout(
-            np.tile(theta, (lanes, 1)), moved, states, windows.dt, windows.names, goals=windows.goals
-        )
-        effect = (answer.observations[..., windows.channels] - plain) / _STEP
-        effect = np.where(windows.observed, effect, 0.0)
-        if np.isfinite(effect).all() and np.abs(effect).max() > 0:
-            names.append(name)
-            effects.append(effect)
-    shape = (*plain.shape, 0)
-    return names, np.stack(effects, axis=-1) if effects else np.zeros(shape)
-
-
-def _changes(windows: Windows, states: FloatArray, inside: NDArray[np.bool_]) -> list[tuple[str, int, FloatArray]]:
-    """(what it stands for, column, change (W, T)) of commands, small against their size; states (W, T, S)."""
-    simulator, model = windows.simulator, windows.simulator.model
-    own = getattr(simulator.environment, "actuators", None)
-    found: list[tuple[str, int, FloatArray]] = []
+    found, effects = [], []
     for column in range(windows.actions.shape[-1]):
-        label = own[column] if own is not None else f"actuator {column}"
-        command = windows.actions[..., column]
-        size = float(np.sqrt((command[inside] ** 2).mean())) or 1.0
-        before = np.concatenate([command[:, :1], command[:, :-1]], axis=1)
-        shapes = {
-            f"a delay of {label}": before - command,
-            f"an offset of {label}": np.ones_like(command),
-            f"a gain of {label} that is not constant": command * np.abs(command),
+        changes = _changes(windows, motion.states[:, :-1], inside, column)
+        if not changes:
+            continue
+        moved = np.tile(windows.actions, (len(changes), 1, 1))
+        moved[..., column] += np.concatenate([change for *_, change in changes])
+        answer = simulated(moved).observations[..., windows.channels].reshape(len(changes), *plain.shape)
+        for (name, remedy, _), seen in zip(changes, answer, strict=True):
+            effect = np.where(windows.observed, (seen - plain) / _STEP, 0.0)
+            if np.isfinite(effect).all() and np.abs(effect).max() > 0:
+                found.append((name, remedy))
+                effects.append(effect)
+    return found, np.stack(effects, axis=-1) if effects else np.zeros((*plain.shape, 0))
+
+
+def _changes(
+    windows: Windows, states: FloatArray, inside: NDArray[np.bool_], column: int
+) -> list[tuple[str, str, FloatArray]]:
+    """(what it stands for, what to do about it, change (W, T)) of one command, small against its size; states (W, T, S)."""
+    simulator = windows.simulator
+    own = getattr(simulator.environment, "actuators", None)
+    label = own[column] if own is not None else f"actuator {column}"
+    command = windows.actions[..., column]
+    size = float(np.sqrt((command[inside] ** 2).mean())) or 1.0
+    before = np.concatenate([command[:, :1], command[:, :-1]], axis=1)
+    model = "put it into the model"
+    shapes = {
+        f"a delay of {label}": (_unknown(f"actuator:{label}.delay"), before - command),
+        f"an offset of {label}": (_unknown(f"actuator:{label}.offset"), np.ones_like(command)),
+        f"a gain of {label} that is not constant": (model, command * np.abs(command)),
+    }
+    joint = _joint(simulator.model, label) if own is not None else None
+    if joint is not None:
+        name, position, velocity = joint
+        q, v = states[..., position], states[..., velocity]
+        turn = np.tanh(v / (_SOFT * max(float(np.sqrt((v[inside] ** 2).mean())), 1e-9)))
+        shapes |= {
+            f"dry friction at {name}": (_unknown(f"joint:{name}.frictionloss"), turn),
+            f"friction under load at {name}": (model, np.abs(command) * turn),
+            f"drag at {name}": (model, v * np.abs(v)),
+            f"a spring at {name}": (_unknown(f"joint:{name}.stiffness"), q),
+            f"a stiffening spring at {name}": (model, q**3),
         }
-        joint = _joint(model, label) if own is not None else None
-        if joint is not None:
-            name, position, velocity = joint
-            q, v = states[..., position], states[..., velocity]
-            turn = np.tanh(v / (_SOFT * max(float(np.sqrt((v[inside] ** 2).mean())), 1e-9)))
-            shapes |= {
-                f"dry friction at {name}": turn,
-                f"friction under load at {name}": np.abs(command) * turn,
-                f"drag at {name}": v * np.abs(v),
-                f"a spring at {name}": q,
-                f"a stiffening spring at {name}": q**3,
-            }
-        for what, shape in shapes.items():
-            scale = float(np.sqrt((shape[inside] ** 2).mean()))
-            if np.isfinite(scale) and scale > 0:
-                found.append((what, column, _STEP * size * shape / scale))
+    found = []
+    for what, (remedy, shape) in shapes.items():
+        scale = float(np.sqrt((shape[inside] ** 2).mean()))
+        if np.isfinite(scale) and scale > 0:
+            found.append((what, remedy, _STEP * size * shape / scale))
     return found
+
+
+def _unknown(target: str) -> str:
+    return f"make {target} a parameter, or widen its bounds"
 
 
 def _joint(model: mujoco.MjModel, actuator: str) -> tuple[str, int, int] | None:
@@ -280,40 +453,54 @@ def _joint(model: mujoco.MjModel, actuator: str) -> tuple[str, int, int] | None:
     return name, 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
 
 
-def outside_prior(windows: Windows, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
-    """For each log its place among 100 simulations of the prior with ``noise`` (O channels); those that diverge are left out.
+def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
+    """For each log its place among 59 simulations of the prior with ``noise`` (O channels); those that diverge are left out.
     Raises ValueError where fewer than half are left."""
-    replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
-    thetas = prior.sample((_PREDICTIVE,), generator=torch.Generator().manual_seed(seed)).numpy()
-    made = [one for one in (replicas.make(theta, rng) for theta in thetas) if one is not None]
+    logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
     if len(made) < _PREDICTIVE // 2:
         raise ValueError(
             f"prior: {len(made)} of {_PREDICTIVE} simulations did not diverge, half are needed; narrow the bounds"
         )
-    found = []
-    for k, log in enumerate(windows.trajectories):
-        looks = []
-        for c in windows.channels:
+    far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
+    farthest = np.zeros((len(logs), len(windows.channels)))
+    for k, log in enumerate(logs):
+        for i, c in enumerate(windows.channels):
             there = np.flatnonzero(np.isfinite(log.observations[:, c]))
+            if not len(there):
+                continue
             kept = there[np.linspace(0, len(there) - 1, min(_SAMPLES, len(there))).round().astype(int)]
-            simulated = np.stack([one.observations[k, kept, c] for one in made])
-            p = _rank(simulated, log.observations[kept, c])
+            simulated = np.stack([one[k, kept, c] for one in made])
+            far[k, i] = _outlier_factors(simulated, log.observations[kept, c])
             gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(simulated.std(0), 1e-12)
-            looks.append((p, windows.simulator.environment.channels[c], float(kept[gap.argmax()] * log.dt)))
-        p, channel, time = min(looks)
-        found.append(OutsidePrior(min(1.0, p * len(looks)), log.name, channel, time))
+            farthest[k, i] = kept[gap.argmax()] * log.dt
+    largest = far[..., 1:].max((0, 1))
+    found = []
+    for k, name in enumerate(logs.names):
+        i = int(far[k, :, 0].argmax())
+        p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
+        found.append(
+            OutsidePrior(p, name, windows.simulator.environment.channels[windows.channels[i]], float(farthest[k, i]))
+        )
     return found
 
 
-def _rank(simulated: FloatArray, log: FloatArray) -> float:
-    """Share of simulations (n, F), the log (F,) one of them, that are as far out as it is."""
+def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
+    """Observations (R, T+1, O) of the logs at draws of the prior."""
+    replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
+    thetas = prior.sample((_PREDICTIVE,), generator=torch.Generator().manual_seed(seed)).numpy()
+    batches = np.array_split(thetas, max(1, _PREDICTIVE // _PER_BATCH))
+    return [
+        one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
+    ]
+
+
+def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:
+    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another."""
     from sklearn.neighbors import LocalOutlierFactor
 
-    every = np.concatenate([log[None], simulated])
-    sd = simulated.std(0)
+    every, sd = np.concatenate([log[None], simulated]), simulated.std(0)
     varies = sd > 1e-12
     if not varies.any():
-        return 1.0
-    factor = LocalOutlierFactor(min(_NEIGHBOURS, len(simulated) - 1)).fit(every[:, varies] / sd[varies])
-    far = -factor.negative_outlier_factor_
-    return float((far >= far[0]).sum() / len(far))
+        return np.zeros(len(every))
+    factor = LocalOutlierFactor(n_neighbors=min(_NEIGHBOURS, len(simulated) - 1))
+    return np.asarray(-factor.fit(every[:, varies] / sd[varies]).negative_outlier_factor_)

@@ -22,7 +22,7 @@ import numpy as np
 
 from sipe_bayes.atomic import write_bytes
 from sipe_bayes.diagnostics import plots
-from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary
+from sipe_bayes.diagnostics.result import Calibration, ChannelScore, Comparison, ParameterSummary, Ridge
 from sipe_bayes.parameters import Parameter
 
 WELL_DETERMINED = 0.8
@@ -30,6 +30,8 @@ WELL_DETERMINED = 0.8
 prior's."""
 ALIKE = 1.05
 """Errors within this factor of one another count as the same."""
+_ONE = "The one value may be trusted within its interval"
+_NAMED = 6  # parameters that a sentence lists
 MIXED = 1.05
 """R-hat above which chains are called not mixed."""
 
@@ -37,7 +39,8 @@ _PROBLEMS = {
     "at_bound": "at a bound",
     "no_effect": "changes nothing",
     "not_determined": "not determined",
-    "disagrees": "logs disagree",
+    "disagrees": "disagrees between logs",
+    "misfit": "model lacks something",
 }
 
 
@@ -103,17 +106,22 @@ class Verdict:
     text: str
 
 
-def parameter_verdict(parameter: ParameterSummary) -> Verdict:
-    """What to think of one parameter: its flags where they name a problem, else how far the logs determine
-    it."""
-    problems = [text for flag, text in _PROBLEMS.items() if flag in parameter.flags]
+def parameter_verdict(parameter: ParameterSummary, ridges: Sequence[Ridge] = ()) -> Verdict:
+    """What to think of one parameter: what is wrong with it, else how far the logs determine it. One that is poorly determined but
+    belongs to one of the ``ridges`` is determined with the others of it."""
+    others = [n for r in ridges if parameter.name in r.parameters for n in r.parameters if n != parameter.name]
+    shared = bool(others) and parameter.contraction < WELL_DETERMINED and "no_effect" not in parameter.flags
+    told = {flag: text for flag, text in _PROBLEMS.items() if not (shared and flag == "not_determined")}
+    problems = [text for flag, text in told.items() if flag in parameter.flags]
     if problems:
         return Verdict("bad", ", ".join(problems))
+    if shared:
+        return Verdict("fair", f"only with {listed(list(dict.fromkeys(others)))}")
     if not parameter.sd > 0:
         return Verdict("fair", "a point without uncertainty")
     partly = "; part of its range changes nothing" if "dead_range" in parameter.flags else ""
     if parameter.contraction >= WELL_DETERMINED:
-        return Verdict("fair" if partly else "good", "well determined" + partly)
+        return Verdict("fair" if partly else "good", "determined" + partly)
     return Verdict("fair", "weakly determined" + partly)
 
 
@@ -125,23 +133,23 @@ def improvement(scores: Iterable[ChannelScore]) -> float:
     return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
 
 
-def headline(parameters: Sequence[ParameterSummary]) -> Verdict:
-    """How many of the parameters, nuisance ones aside, the logs determine."""
+def headline(parameters: Sequence[ParameterSummary], ridges: Sequence[Ridge] = ()) -> Verdict:
+    """Which of the parameters, nuisance ones aside, may be trusted."""
     wanted = [p for p in parameters if "nuisance" not in p.flags]
-    good = sum(parameter_verdict(p).tone == "good" for p in wanted)
+    good = [p.name for p in wanted if parameter_verdict(p, ridges).tone == "good"]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
-    if good == len(wanted):
-        text = f"All {good} parameters are" if good > 1 else "The one parameter is"
-        return Verdict("good", f"{text} well determined by these logs.")
     if not good:
-        text = f"None of the {len(wanted)} parameters is" if len(wanted) > 1 else "The one parameter is not"
-        return Verdict("bad", f"{text} well determined by these logs.")
-    verb = "is" if good == 1 else "are"
-    return Verdict("fair", f"{good} of {len(wanted)} parameters {verb} well determined by these logs.")
+        return Verdict("bad", "No value may be trusted within its interval; the table says why.")
+    if len(good) == len(wanted):
+        text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
+        return Verdict("good", f"{text}.")
+    named = listed(good) if len(good) <= _NAMED else f"{listed(good[:_NAMED])} and others"
+    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals: {named}"
+    return Verdict("fair", f"{text}; the table says why not the others.")
 
 
-def prediction(scores: Sequence[ChannelScore]) -> Verdict:
+def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) -> Verdict:
     """Whether the calibrated model foretells held-out logs better than the model as given."""
     if not scores:
         text = "No log was held out, so nothing here shows how well the model predicts a log it has not seen."
@@ -150,17 +158,47 @@ def prediction(scores: Sequence[ChannelScore]) -> Verdict:
     if lost:
         where = listed([f"{s.log} ({s.channel})" for s in lost])
         return Verdict("bad", f"On held-out logs the calibrated model has no finite error in {where}.")
-    ratio = improvement(scores)
-    if not math.isfinite(ratio):
+    if comparison is None:
         return Verdict("fair", "On held-out logs the model as given has no finite error to compare with.")
-    if ratio < ALIKE:
-        text = "On held-out logs the calibrated model is NOT better than the model you had: its error is "
-        return Verdict("bad", f"{text}{times(ratio)}.")
-    text = f"On held-out logs the error is {times(ratio)} than with the model as given"
+    found = f"{_margin(comparison)}; paired t-test on {comparison.pieces} pieces of the logs, p = {comparison.p:.2g})"
+    if comparison.verdict == "worse":
+        return Verdict(
+            "bad", f"On held-out logs the calibrated model is WORSE than the model you had: its error is {found}."
+        )
+    if comparison.verdict == "not better":
+        text = "On held-out logs the calibrated model is NOT better than the model you had, beyond noise: its error is "
+        return Verdict("bad", f"{text}{found}.")
     worse = [f"{s.log} ({s.channel})" for s in scores if s.rmse > ALIKE * s.rmse_default]
+    text = f"On held-out logs the calibrated model is better than the model you had: its error is {found}"
     if worse:
-        return Verdict("fair", f"{text} on average, but larger in {listed(worse)}.")
-    return Verdict("good", f"{text}.")
+        return Verdict("fair", f"{text}; but it is larger in {listed(worse)}.")
+    return Verdict("good" if comparison.ratio >= ALIKE else "fair", f"{text}.")
+
+
+def _margin(comparison: Comparison) -> str:
+    """The ratio in words with its 95 % interval, in the direction in which it lies."""
+    ratio, low, high = comparison.ratio, comparison.low, comparison.high
+    if ratio < 1:
+        ratio, low, high = 1 / ratio, 1 / high, 1 / low
+    digits = 3 if ratio < ALIKE else 2
+    word = "smaller" if comparison.ratio >= 1 else "larger"
+    return f"{number(ratio, digits)} times {word} (95 % interval {number(low, digits)} to {number(high, digits)}"
+
+
+def lack(calibration: Calibration) -> Verdict | None:
+    """What the model lacks, where that matters, and logs outside the prior; the warnings say more."""
+    outside = [o.log for o in calibration.outside if o.alarm]
+    if outside:
+        return Verdict(
+            "bad", f"No values within the bounds give logs like {listed(outside)}: widen them, or correct the model."
+        )
+    found = calibration.misfit
+    if found is None or not found.alarm:
+        return None
+    share = f"{100 * found.share[found.channel]:.2g} % of the residual of {found.channel}"
+    if not found.matters:
+        return Verdict("fair", f"The model lacks something small: it looks like {found.cause} ({share}).")
+    return Verdict("bad", f"The model lacks something: it looks like {found.cause} ({share}, p = {found.p:.2g}).")
 
 
 def mixing_verdict(calibration: Calibration) -> Verdict | None:
@@ -179,21 +217,12 @@ def mixing_verdict(calibration: Calibration) -> Verdict | None:
 
 
 def verdicts(calibration: Calibration) -> list[Verdict]:
-    """The sentences at the top of the report, the headline first."""
-    mixed = mixing_verdict(calibration)
-    first = [headline(calibration.parameters), prediction(calibration.holdout)]
-    return [*first, mixed] if mixed else first
-
-
-def _trust(parameters: Sequence[ParameterSummary]) -> list[dict[str, str]]:
-    """Who belongs to which answer, in words."""
-    wanted = [(p.name, parameter_verdict(p)) for p in parameters if "nuisance" not in p.flags]
-    lines = [
-        ("good", "Well determined", [name for name, v in wanted if v.tone == "good"]),
-        ("fair", "With care", [f"{name} ({v.text})" for name, v in wanted if v.tone == "fair"]),
-        ("bad", "Do not rely on", [f"{name} ({v.text})" for name, v in wanted if v.tone == "bad"]),
-    ]
-    return [{"tone": tone, "label": label, "names": "; ".join(who)} for tone, label, who in lines if who]
+    """The sentences at the top of the report; the first says so where the calibration does not help."""
+    predicted = prediction(calibration.holdout, calibration.comparison)
+    first = [headline(calibration.parameters, calibration.ridges), predicted]
+    if predicted.tone == "bad":
+        first.reverse()
+    return [v for v in (*first, lack(calibration), mixing_verdict(calibration)) if v]
 
 
 # Rows of the tables
@@ -210,8 +239,8 @@ def _values(summary: ParameterSummary, parameter: Parameter) -> dict[str, str]:
     return texts | {"sd": significant(summary.sd, summary.sd, scale) if summary.sd > 0 else ""}
 
 
-def _parameter_row(summary: ParameterSummary, parameter: Parameter) -> dict[str, Any]:
-    verdict = parameter_verdict(summary)
+def _parameter_row(summary: ParameterSummary, parameter: Parameter, ridges: Sequence[Ridge]) -> dict[str, Any]:
+    verdict = parameter_verdict(summary, ridges)
     return {
         "name": summary.name,
         "unit": plots.unit_text(summary.unit),
@@ -343,7 +372,7 @@ def pictures(calibration: Calibration) -> list[Picture]:
 
 def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, Any]:
     space = calibration.posterior.space
-    rows = [(p, _parameter_row(p, space[space.index(p.name)])) for p in calibration.parameters]
+    rows = [(p, _parameter_row(p, space[space.index(p.name)], calibration.ridges)) for p in calibration.parameters]
     sentences = verdicts(calibration)
     tones = {v.tone for v in sentences}
     sections: dict[str, list[Picture]] = {}
@@ -359,7 +388,6 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, A
         "tone": "bad" if "bad" in tones else "fair" if "fair" in tones or calibration.warnings else "good",
         "headline": sentences[0].text,
         "sentences": sentences[1:],
-        "trust": _trust(calibration.parameters),
         "warnings": calibration.warnings,
         "parameters": [row for p, row in rows if "nuisance" not in p.flags],
         "nuisance": [row for p, row in rows if "nuisance" in p.flags],
@@ -368,6 +396,7 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, A
             ("Training logs", [_score_row(s) for s in calibration.train]),
         ],
         "ridges": [ridge.text for ridge in calibration.ridges],
+        "left_out": calibration.left_out,
         "sections": sections,
         "noise": [_noise_row(channel, noise) for channel, noise in calibration.noise.items()],
         "mixing": _mixing_rows(calibration) if calibration.mixing else None,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior
     from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]
@@ -17,7 +18,7 @@ FloatArray = NDArray[np.float64]
 @dataclass(frozen=True)
 class ParameterSummary:
     """One parameter's marginal in its unit. contraction = 1 - sd / prior sd; flags are single words: ``at_bound``,
-    ``no_effect``, ``dead_range``, ``not_determined``, ``disagrees``, ``nuisance``."""
+    ``no_effect``, ``dead_range``, ``not_determined``, ``disagrees``, ``misfit`` (what the model lacks moves it), ``nuisance``."""
 
     name: str
     unit: str
@@ -46,6 +47,27 @@ class ChannelScore:
     unit: str
     rmse: float
     rmse_default: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Whether the held-out errors are smaller than those of the model as given. ratio: how many times, as the geometric mean over
+    logs and channels; low, high: its 95 % interval; p: of a ratio as far from 1 where the models predict alike; both from a paired
+    t-test over ``pieces`` of the logs."""
+
+    ratio: float
+    low: float
+    high: float
+    p: float
+    pieces: int
+
+    @property
+    def verdict(self) -> str:
+        """``better``, ``not better`` or ``worse``, at the 5 % level."""
+        return "not better" if self.p > 0.05 else "better" if self.ratio > 1 else "worse"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"verdict": self.verdict, **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -97,8 +119,10 @@ def _finite(value: Any) -> Any:
 
 @dataclass
 class Calibration:
-    """The outcome of ``sipe calibrate``. noise: channel -> {"sd", "tau" (s), "unit"}; mixing: {"rhat", "ess", ...} of
-    mcmc or None; logs: what was read and what was done to it; run: configuration, versions, seed, checksums."""
+    """The outcome of ``sipe calibrate``. comparison: of the held-out errors, None without any; misfit: None where the residuals could
+    not be looked at; outside: one for each training log; noise: channel -> {"sd", "tau" (s), "unit"}; mixing: {"rhat", "ess", ...}
+    of mcmc or None; logs: what was read and what was done to it; left_out: sentences about parts that do not apply; run:
+    configuration, versions, seed, checksums."""
 
     name: str
     estimator: str
@@ -111,6 +135,10 @@ class Calibration:
     signals: list[Signal] = field(default_factory=list)
     residuals: list[Residual] = field(default_factory=list)
     ridges: list[Ridge] = field(default_factory=list)
+    comparison: Comparison | None = None
+    misfit: Misfit | None = None
+    outside: list[OutsidePrior] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)
     mixing: dict[str, Any] | None = None
     logs: list[dict[str, Any]] = field(default_factory=list)
@@ -125,7 +153,12 @@ class Calibration:
             "parameters": [p.to_dict() for p in self.parameters],
             "holdout": [asdict(s) for s in self.holdout],
             "train": [asdict(s) for s in self.train],
+            "comparison": None if self.comparison is None else self.comparison.to_dict(),
+            "misfit": None if self.misfit is None else {**asdict(self.misfit), "matters": self.misfit.matters},
+            "outside_prior": [asdict(o) for o in self.outside],
+            "ridges": [asdict(r) for r in self.ridges],
             "warnings": list(self.warnings),
+            "left_out": list(self.left_out),
             "noise": self.noise,
             "logs": self.logs,
             "mixing": None if self.mixing is None else {k: _finite(v) for k, v in self.mixing.items()},

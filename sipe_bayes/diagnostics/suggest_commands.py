@@ -62,7 +62,7 @@ def suggest(
         known = _known(problem, posterior)
         found = suggestions.rank(
             problem.simulator,
-            problem.likelihood,
+            problem.segments,
             plans,
             _noise(problem, posterior),
             known,
@@ -107,7 +107,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
     from sipe_bayes.noise import Noise
 
     channels = list(problem.simulator.environment.channels)
-    fitted = list(problem.likelihood.fit or channels)
+    fitted = list(problem.segments.fit or channels)
     record = None if path is None else path.parent / "result.json"
     if record is not None and record.is_file():
         noise = json.loads(record.read_text(encoding="utf-8"))["noise"]

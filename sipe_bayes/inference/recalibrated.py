@@ -53,6 +53,7 @@ from sipe_bayes.noise import Noise
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.replicas import Replicas, observation_noise
 from sipe_bayes.simulator import Simulator
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -96,10 +97,10 @@ class Recalibrated(Estimator):
             prior=estimator.prior,
             budget=budget,
             seed=seed,
-            likelihood=estimator.likelihood,
             checkpoint=checkpoint,
             progress=progress,
         )
+        self.likelihood = estimator.likelihood  # checked there, a StateSpace too
         n = len(self.space)
         default = max(_FEWEST, _PER_PARAMETER * (n + 2))
         self.refits = whole("refits", default if refits is None else refits, 3 * n + 10)
@@ -304,14 +305,15 @@ def noise_is_unknown(simulator: Any, likelihood: Any, trajectories: Trajectories
 
 def fitted_noise(
     simulator: Any,
-    likelihood: Segments,
+    likelihood: Segments | StateSpace,
     trajectories: Trajectories,
     prior: Posterior,
     theta: FloatArray | None = None,
     budget: int = NOISE_BUDGET,
 ) -> tuple[Noise, int]:
-    """Autoregressive noise of all O channels by a fit of ``laplace``, from theta (N,) where given, and its rollouts."""
-    coloured = replace(likelihood, noise="ar1")
+    """Noise of all O channels by a fit of ``laplace``, from theta (N,) where given, and its rollouts: autoregressive, or that of the
+    measurement with a ``StateSpace``."""
+    coloured = replace(likelihood, noise="ar1") if isinstance(likelihood, Segments) else likelihood
     fit = Laplace(simulator, likelihood=coloured, prior=prior, initial=theta, budget=budget)
     fit.fit(trajectories)
     return observation_noise(fit.diagnostics, trajectories, likelihood), fit.rollouts
