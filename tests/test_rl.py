@@ -19,7 +19,7 @@ import sipe_bayes as sipe
 from sipe_bayes.cli import app
 from sipe_bayes.posterior import prior
 from sipe_bayes.rl.ddpg import Agent
-from sipe_bayes.rl.evaluation import check_agents, evaluate, install, write_card
+from sipe_bayes.rl.evaluation import AGENTS, check_agents, evaluate, install, write_card
 from sipe_bayes.rl.normaliser import Normaliser
 from sipe_bayes.rl.policy import Policy, PolicyError, load_policy
 from sipe_bayes.rl.randomization import Randomization
@@ -425,3 +425,20 @@ def test_commands_train_write_cards_and_check_them(tmp_path: Path) -> None:
     checked = runner.invoke(app, ["agents", str(out), "--episodes", "3"])
     assert checked.exit_code == 1
     assert "BEYOND" in checked.output
+
+
+def test_the_readmes_table_is_that_of_the_cards() -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    cards = sorted(AGENTS.glob("*-expert.json"))
+    assert len(cards) >= 4
+    for path in cards:
+        row = next(line for line in text.splitlines() if line.startswith(f"| `{path.stem.removesuffix('-expert')}` |"))
+        for file, kind in (
+            (path, "evaluation"),
+            (path.with_name(path.name.replace("expert", "suboptimal")), "evaluation"),
+            (path, "idle"),
+            (path, "random"),
+        ):
+            found = json.loads(file.read_text(encoding="utf-8"))[kind]
+            rate = "" if found["success_rate"] is None else f" ({found['success_rate']:.2f})"
+            assert f"| {found['mean']:,.0f} ± {found['standard_error']:.0f}{rate} |" in row
