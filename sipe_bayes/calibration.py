@@ -380,7 +380,7 @@ def _summaries(
             flags.append("at_bound")
         if conflict is not None and conflict.parameter == p.name:
             flags.append("disagrees")
-        if lacking is not None and lacking.matters and (p.name in lacking.moved or not lacking.shift):
+        if lacking is not None and lacking.matters and (p.name in lacking.moved or not lacking.moved):
             flags.append("misfit")
         if p.log is not None:
             flags.append("nuisance")

@@ -17,8 +17,9 @@ is kept which earns most in episodes of its own randomisation; the target is nev
 Variations of a randomisation, the truth's excepted: ``wider`` (``Posterior.wider``), ``observation_noise`` and ``action_delay``.
 
 Deviations. The paper trains on the default model's variants, which it does not name; here the target is the default or the
-in-distribution variant, whose theta no prior mean guesses. It has neither the prior nor the default model in its figure. Agents are small, as many are trained: hidden layers of 128 units, an update for every
-second control step (half-cheetah, one seed, 150,000 steps: a return of 5,570; with 256 units and an update each step: 5,290). Those on tasks with goals learn with the settings of hindsight experience replay (Andrychowicz et al. 2017,
+in-distribution variant, whose theta no prior mean guesses. It has neither the prior nor the default model in its figure. Without goals the
+agents are small, as many are trained: one hidden layer of 128 units, an update for every second control step (half-cheetah, one seed,
+150,000 steps: a return of 5,570; with 256 and 256 units and an update each step: 5,290). Those on tasks with goals learn with the settings of hindsight experience replay (Andrychowicz et al. 2017,
 https://arxiv.org/abs/1707.01495), without demonstrations.
 """
 
@@ -57,7 +58,7 @@ _SMALL_AGENT: dict[str, Any] = {
     "updates_per_step": 0.5,
 }
 _AGENT: dict[str, Any] = {
-    "hidden": (128, 128),
+    "hidden": (128,),
     "learning_rate": 1e-3,
     "start_steps": 5_000,
     "normalise": True,
@@ -66,7 +67,6 @@ _AGENT: dict[str, Any] = {
     "updates_per_step": 0.5,
 }
 _GOAL_AGENT: dict[str, Any] = {
-    "hidden": (128, 128),
     "discount": 0.95,
     "tau": 0.05,
     "learning_rate": 1e-3,

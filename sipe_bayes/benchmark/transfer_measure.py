@@ -111,8 +111,8 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
     )
     simulator, truth = Simulator(task, num_threads=1), task.theta(cell.variant)
 
-    def earned(acting: Any, episodes: int) -> dict[str, Any]:
-        return evaluation.evaluate(acting, simulator, episodes, _TARGET_SEED, truth)
+    def earned(policy: Any, episodes: int, action_noise: float | None = None) -> dict[str, Any]:
+        return evaluation.evaluate(policy, simulator, episodes, _TARGET_SEED, truth, action_noise=action_noise)
 
     rows, curve = read_curve(own), []
     for step, own_return, *_ in rows:
@@ -133,7 +133,7 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
         sd=drawn.posterior.stddev.tolist(),
         checksums={"model": simulator.checksum(), "randomization": drawn.fingerprint},
         evaluation=found,
-        random=earned(evaluation.random(task, cell.seed), EPISODES),
+        random=earned(evaluation.random(task, cell.seed), EPISODES, 0.0),
         curve=curve,
         kept=kept,
         converged=solves(task, mine[1], mine[3]),

@@ -78,7 +78,8 @@ def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
     """theta (N,) against the model as given; None where there is nothing finite to compare.
 
     The mean over logs and channels of log(RMSE as given / RMSE of theta), with the jackknife's standard error over tenths of each
-    log, which takes the errors of both models and all channels out together (a paired t-test on pieces of time)."""
+    log, which takes the errors of both models and all channels out together (a paired t-test on pieces of time). It speaks of these logs,
+    not of others that the machine might give; in a log of few windows the pieces of one share its start, and p is too small."""
     square = _squares(windows, np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)]))
     parts = []  # of each log: sums (2, pieces, C)
     for k in range(len(windows.trajectories)):

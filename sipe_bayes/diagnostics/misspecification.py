@@ -21,7 +21,8 @@ https://doi.org/10.1145/342009.335388), channel by channel. The p-value compares
 over all logs and channels, each started as far off as noise leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based multiple
 testing").
 
-Deviations: a probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
+Deviations: the log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
+estimates. A probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
 misfit passes as slow noise. Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is
 named even if whiteness is odder, since it says more. A cause that is named is the one that fits best, not one that is proven.
 """
@@ -137,7 +138,7 @@ class OutsidePrior:
         if not self.alarm:
             return f"log {self.log} is like simulations of the prior (p = {self.p:.2g})"
         return (
-            f"log {self.log} is unlike every simulation of the prior (p = {self.p:.2g}), most in {self.channel} at {self.time:.3g} s: "
+            f"log {self.log} is unlike simulations of the prior (p = {self.p:.2g}), most in {self.channel} at {self.time:.3g} s: "
             "widen the bounds, or correct the model, units or signs"
         )
 
@@ -273,7 +274,7 @@ class _Residuals:
         left = self._left(residual, base, arrow.starts(base))
         white = [self._white(left, c, noise) for c in range(len(noise.sd))]
         whiteness = [_autocorrelation(z) for z in white]
-        pieces = [max(float((p**2).mean()) for p in np.array_split(z, _PIECES)) for z in white]
+        pieces = [max((float((p**2).mean()) for p in np.array_split(z, _PIECES) if len(p)), default=0.0) for z in white]
         statistics = np.cbrt(np.concatenate([gradient**2 / information, whiteness, pieces]))
         return _Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
 
@@ -359,6 +360,8 @@ def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
 def _foretold(z: FloatArray) -> FloatArray:
     """What least squares on the samples before, at ``_LAGS``, says of z (n,)."""
     lags = [lag for lag in _LAGS if lag < len(z) // 4]
+    if not lags:
+        return np.zeros_like(z)
     before = np.stack([np.concatenate([np.zeros(lag), z[:-lag]]) for lag in lags], axis=1)
     return np.asarray(before @ np.linalg.lstsq(before, z, rcond=None)[0])
 

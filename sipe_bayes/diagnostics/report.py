@@ -159,7 +159,7 @@ def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) ->
         where = listed([f"{s.log} ({s.channel})" for s in lost])
         return Verdict("bad", f"On held-out logs the calibrated model has no finite error in {where}.")
     if comparison is None:
-        return Verdict("fair", "On held-out logs the model as given has no finite error to compare with.")
+        return Verdict("fair", "On held-out logs the errors of the two models cannot be compared.")
     found = f"{_margin(comparison)}; paired t-test on {comparison.pieces} pieces of the logs, p = {comparison.p:.2g})"
     if comparison.verdict == "worse":
         return Verdict(
@@ -190,12 +190,14 @@ def lack(calibration: Calibration) -> Verdict | None:
     outside = [o.log for o in calibration.outside if o.alarm]
     if outside:
         return Verdict(
-            "bad", f"No values within the bounds give logs like {listed(outside)}: widen them, or correct the model."
+            "bad",
+            f"Simulations of the prior give no logs like {listed(outside)}: widen the bounds, or correct the model.",
         )
     found = calibration.misfit
     if found is None or not found.alarm:
         return None
-    share = f"{100 * found.share[found.channel]:.2g} % of the residual of {found.channel}"
+    channel = max(found.share, key=lambda name: found.share[name])
+    share = f"{100 * found.share[channel]:.2g} % of the residual of {channel}"
     if not found.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {found.cause} ({share}).")
     return Verdict("bad", f"The model lacks something: it looks like {found.cause} ({share}, p = {found.p:.2g}).")

@@ -7,7 +7,7 @@ theta, truncated to the unit cube. Where a parameter sits at a bound, the normal
 of the quadratic model: the truncated density is right up to the bound.
 
 With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from the autoregressive
-noise (``noise.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts the misfit down to slow
+noise (``noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts the misfit down to slow
 noise and may leave the parameters behind it undetermined; plain least squares keeps what predicts best.
 
 Several starting points (the model as given and the best of a few draws from the prior) are followed; optima that are

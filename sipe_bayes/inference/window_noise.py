@@ -44,7 +44,7 @@ def present_noise(windows: Windows, residual: FloatArray) -> Noise:
     return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
 
 
-def fitted_noise(
+def updated_noise(
     windows: Windows,
     moments: Moments,
     before: Noise,

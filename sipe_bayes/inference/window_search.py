@@ -29,13 +29,13 @@ from sipe_bayes.inference.poll import SHORTEST, Around, cost, poll
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.window_noise import (
     beyond_rounding,
-    fitted_noise,
     fixed_sd,
     free_noise,
     longest_tau,
     present_noise,
     pulls,
     same_noise,
+    updated_noise,
 )
 from sipe_bayes.likelihood import Linearisation, Windows
 from sipe_bayes.noise import Arrow, Moments, Noise, eliminate, restricted
@@ -162,7 +162,7 @@ def step(search: Search, windows: Windows, state: State) -> State:
     if rough:
         noise = present_noise(windows, linearisation.residual)
     elif state["due"]:
-        noise = fitted_noise(windows, moments, before, theta, starts, prior, windows.settings.noise == "ar1")
+        noise = updated_noise(windows, moments, before, theta, starts, prior, windows.settings.noise == "ar1")
     value = energy_of(windows, noise, prior, theta, starts, linearisation.residual)
     tolerance = max(_ROUGH * value, _TOLERANCE) if rough else _TOLERANCE
     here = Fit(theta, starts, value, state["damping"], residual=linearisation.residual)
@@ -279,7 +279,7 @@ def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
     evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True))) - prior_energy
     white = noise.sd
     if sandwiched:
-        noise = fitted_noise(windows, moments, noise, theta, starts, prior, coloured=True)
+        noise = updated_noise(windows, moments, noise, theta, starts, prior, coloured=True)
     mean, covariance = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
     centres = []
     for weight, point in noise_cloud(moments, noise, here, free_noise(windows), longest_tau(windows)):

@@ -36,7 +36,7 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
     for f in fields(Settings):
         default, hint, more = f.default, hints[f.name], dict[str, Any]()
         if isinstance(default, tuple):
-            default, hint, more = ",".join(map(str, default)), Any, {"parser": _sizes, "metavar": "N,N"}
+            default, hint, more = [",".join(map(str, default))], list[str], {"metavar": "N,N"}
         option = typer.Option(default, help=f.metadata["help"], **more)
         own.append(inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=hint))
     command.__signature__ = inspect.Signature(own)  # type: ignore[attr-defined]
@@ -44,11 +44,14 @@ def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def _sizes(text: str) -> tuple[int, ...]:
+def _sizes(given: list[str]) -> tuple[int, ...]:
+    *before, text = given
+    if before:
+        raise ValueError(f"--hidden {text}: given {len(given)} times; write all layers at once, such as 400,300")
     try:
         return tuple(int(size) for size in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"expected layers' sizes such as 400,300, got {text!r}") from None
+        raise ValueError(f"--hidden {text}: expected the layers' sizes, such as 400,300") from None
 
 
 @_with_settings
@@ -87,7 +90,8 @@ def train(
         if threads < 1:
             raise ValueError(f"--threads {threads}: expected at least 1; raise it or leave it out")
         torch.set_num_threads(threads)
-        folder, chosen = out or Path("runs") / f"{task}-ddpg-{seed}", Settings(**settings)
+        folder = out or Path("runs") / f"{task}-ddpg-{seed}"
+        chosen = Settings(**{**settings, "hidden": _sizes(settings["hidden"])})
         shown = None if demonstrations is None else Trajectories.load(demonstrations)
         drawn = None if randomization is None else load_randomization(randomization)
         with Progress(unit="steps") as progress:

@@ -14,11 +14,12 @@ had them in their repository; before: 400 and 300, 1e-3, 100. Random actions at 
 Options (``sipe_bayes.rl.settings``), each off unless asked for and each a deviation: ``normalise`` (observations), ``layer_norm``
 (critic's hidden layers; Ba, Kiros, Hinton, "Layer Normalization", 2016, https://arxiv.org/abs/1607.06450), ``n_step``
 (returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``cloning`` (the actor's loss also has the
-mean squared distance, in half ranges, from what the demonstrations do: Nair et al., "Overcoming Exploration in Reinforcement Learning with
-Demonstrations", 2018, https://arxiv.org/abs/1709.10089, without their filter and in units of the mean |Q|, as Fujimoto, Gu, "A Minimalist
-Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860), ``end_hopeless`` (episodes of the training end
-where the humanoid has fallen, as the published class's), ``lanes`` (environments stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of hindsight
-experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
+squared distance, in half ranges, from what the batch's demonstrations do, their mean: Nair et al., "Overcoming Exploration in
+Reinforcement Learning with Demonstrations", 2018, https://arxiv.org/abs/1709.10089, without their filter and in units of the
+mean |Q|, as Fujimoto, Gu, "A Minimalist Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860),
+``end_hopeless`` (episodes of the training end where the humanoid has fallen, as the published class's), ``lanes`` (environments
+stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of
+hindsight experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
 
 The two networks are small and of one kind, so gradients are written out by hand on flat vectors of parameters: the
 actor's step needs no gradient of the critic's weights, and Adam and the targets take a call each.

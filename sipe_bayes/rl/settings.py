@@ -53,8 +53,10 @@ class Settings:
                 raise ValueError(f"{f.name}: expected a number {bounds}, got {value}")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"hidden: expected the sizes of one or more layers, got {self.hidden}")
-        if self.cloning and not self.demonstration_share:
-            raise ValueError(f"cloning: {self.cloning} needs demonstrations; set demonstration_share, or leave it out")
+        if self.cloning and not self.demonstrated:
+            raise ValueError(
+                f"cloning: {self.cloning} needs demonstrations; raise demonstration_share, or leave it out"
+            )
         if self.clip_targets and self.discount == 1:
             raise ValueError("clip_targets: expected a discount below 1, got 1; leave one of them out")
 

@@ -45,6 +45,7 @@ Report = Callable[[str, int, int], None]
 CHECKPOINT = "checkpoint/state.safetensors"
 COUNTS = "counts.json"
 CURVE = ("step", "return_mean", "return_sd", "success_rate", "wall_seconds", "updates_per_second")
+_LATER = ("cloning", "end_hopeless")  # settings without which earlier runs go on
 _EVALUATION_SEED = 2_000_000  # of the curve's starts: other ones than a card's
 
 
@@ -88,7 +89,7 @@ def train(
         "task": task.name,
         "model": trainer.episodes.simulator.checksum(),
         "seed": seed,
-        "settings": settings.to_dict(),
+        "settings": {k: v for k, v in settings.to_dict().items() if v or k not in _LATER},
         "drawn": randomization is not None and randomization.fingerprint,
         "demonstrations": _checksum(demonstrations),
         "evaluate_every": evaluate_every,
