@@ -127,8 +127,9 @@ def agent(task: Task, seed: int = 0) -> Policy:
 
 @pytest.fixture
 def agents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder in place of that of the agents."""
+    """A folder in place of that of the agents, and no stored sets."""
     monkeypatch.setattr(demonstration, "_FOLDER", tmp_path)
+    monkeypatch.setattr(demonstration, "SHIPPED", tmp_path / "none")
     return tmp_path
 
 

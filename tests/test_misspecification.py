@@ -178,7 +178,7 @@ def test_a_log_outside_the_prior_is_named_and_one_inside_is_not() -> None:
     assert not one.alarm
     assert "is like simulations of the prior" in one.text
     assert other.p == pytest.approx(1 / 60)
-    assert "log degrees is unlike every simulation" in other.text
+    assert "log degrees is unlike simulations" in other.text
     assert "units or signs" in other.text
 
 

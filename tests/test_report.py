@@ -443,7 +443,7 @@ ALIKE = Comparison(1.1, 0.8, 1.5, 0.6, 10)
         ),
         (scores((0.1, 9.0), (0.3, 0.2)), BETTER, "fair", "but it is larger in log (c1)"),
         (scores((0.1, 0.102)), Comparison(1.02, 1.01, 1.03, 0.01, 10), "fair", "1.02 times smaller"),
-        (scores((0.1, math.nan)), None, "fair", "no finite error to compare with"),
+        (scores((0.1, math.nan)), None, "fair", "cannot be compared"),
         (scores((math.nan, 0.1)), None, "bad", "no finite error in log (c0)"),
         ([], None, "fair", "No log was held out"),
     ],
