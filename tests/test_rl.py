@@ -308,6 +308,8 @@ def test_a_training_may_end_episodes_of_the_fallen() -> None:
         begun.append(int((~trainer.replay.transition[:100]).sum()))
         upright = ~task.hopeless(trainer.episodes.states)
         assert upright.any() == ends
+    with pytest.raises(ValueError, match="end_hopeless: expected a task that knows"):
+        Trainer(sipe.make_task("Door"), Settings(end_hopeless=True))
     assert begun[0] == 0
     assert 4 <= begun[1] <= 20
     assert not task.hopeless(task.initial_states(np.random.default_rng(0), 3)[0]).any()

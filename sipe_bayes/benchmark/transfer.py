@@ -18,8 +18,7 @@ Variations of a randomisation, the truth's excepted: ``wider`` (``Posterior.wide
 
 Deviations. The paper trains on the default model's variants, which it does not name; here the target is the default or the
 in-distribution variant, whose theta no prior mean guesses. It has neither the prior nor the default model in its figure. Without goals the
-agents are small, as many are trained: one hidden layer of 128 units, an update for every second control step (half-cheetah, one seed,
-150,000 steps: a return of 5,570; with 256 and 256 units and an update each step: 5,290). Those on tasks with goals learn with the settings of hindsight experience replay (Andrychowicz et al. 2017,
+agents are small, as many are trained: one hidden layer of 128 units, an update for every second control step. Those on tasks with goals learn with the settings of hindsight experience replay (Andrychowicz et al. 2017,
 https://arxiv.org/abs/1707.01495), without demonstrations.
 """
 

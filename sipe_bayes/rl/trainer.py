@@ -48,6 +48,8 @@ class Trainer:
                 f"demonstration_share: {settings.demonstration_share} with demonstrations "
                 f"{'missing' if demonstrations is None else 'given'}; give both or neither"
             )
+        if settings.end_hopeless and type(task).hopeless is Task.hopeless:
+            raise ValueError(f"end_hopeless: expected a task that knows when it is lost, got {task.name}; leave it out")
         self.task, self.settings = task, settings
         streams = np.random.SeedSequence(seed).spawn(5 + settings.lanes)
         initial, self._noise, self._picks, self._draws, *lanes, last = (np.random.default_rng(s) for s in streams)
