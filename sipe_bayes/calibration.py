@@ -24,7 +24,8 @@ from sipe_bayes.diagnostics.evaluate import (
     white_noise,
 )
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
-from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior, misfit, outside_prior
+from sipe_bayes.diagnostics.misspecification import Misfit, misfit
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.diagnostics.result import Calibration, ChannelScore, ParameterSummary, Residual, Ridge
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError

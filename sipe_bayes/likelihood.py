@@ -25,7 +25,7 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.noise import Moments, Noise, whiten
+from sipe_bayes.noise import Moments, Noise, chosen_sd, whiten
 from sipe_bayes.sequences import Sequence, sequences
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -291,6 +291,11 @@ class Windows:
         size = np.sqrt(np.nanmean(np.where(self.observed, self.measured, np.nan) ** 2, axis=(0, 1)))
         moving = size[size > 0]
         return _ROUNDING * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
+
+    @property
+    def fixed_sd(self) -> FloatArray:
+        """Given noise sd (C,) of the fitted channels, NaN where it is inferred."""
+        return chosen_sd(self.settings.noise_sd, self.channels)
 
     @property
     def theta_step(self) -> float:

@@ -46,6 +46,13 @@ class Noise:
     tau: FloatArray
 
 
+def chosen_sd(given: tuple[float | None, ...] | None, channels: list[int]) -> FloatArray:
+    """Noise sds (C,) of some channels, NaN where none is given."""
+    if given is None:
+        return np.full(len(channels), np.nan)
+    return np.array([np.nan if given[c] is None else given[c] for c in channels], float)
+
+
 def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
     """Whitened residuals (..., n) of one channel's residual (..., W * L)."""
     a = coefficients(sequence.gaps, tau)[sequence.gap]

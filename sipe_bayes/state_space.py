@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.likelihood import START_SD, BudgetExhausted, chosen_channels, estimate_states, moved, past_commands
+from sipe_bayes.noise import chosen_sd
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
 from sipe_bayes.tridiagonal import ChainLinearisation
@@ -153,10 +154,7 @@ class Chain:
     @property
     def fixed_sd(self) -> FloatArray:
         """Given noise sd (C,) of the fitted channels, NaN where it is inferred."""
-        given = self.settings.noise_sd
-        if given is None:
-            return np.full(len(self.channels), np.nan)
-        return np.array([np.nan if given[c] is None else given[c] for c in self.channels], float)
+        return chosen_sd(self.settings.noise_sd, self.channels)
 
     @property
     def least(self) -> tuple[FloatArray, FloatArray]:

@@ -152,6 +152,11 @@ class Trajectories(Sequence[Trajectory]):
         names_of_channels = channels.pop() if channels else ()
         return cls(observations, actions, dt, length, valid, states, names, names_of_channels, rewards)
 
+    @property
+    def longest(self) -> float:
+        """Seconds of the longest; of the correlation times of its noise, the longest that can be told."""
+        return float((self.length * self.dt).max())
+
     def __len__(self) -> int:
         return len(self.actions)
 

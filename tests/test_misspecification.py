@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sipe_bayes.diagnostics.evaluate import best_starts
-from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior, _Residuals, misfit, outside_prior
+from sipe_bayes.diagnostics.misspecification import Misfit, _Residuals, misfit
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.noise import Moments, Noise

@@ -16,7 +16,8 @@ import torch
 
 from sipe_bayes import atomic
 from sipe_bayes.diagnostics import plots, report
-from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior
+from sipe_bayes.diagnostics.misspecification import Misfit
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.result import (
     Calibration,
     ChannelScore,

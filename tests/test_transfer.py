@@ -232,9 +232,12 @@ def refused(found: Result, *words: str) -> None:
 
 
 def test_results_of_another_kind_are_left_alone(undisturbed: Path, tmp_path: Path) -> None:
-    other = replace(load(undisturbed)[0], training=601)
-    other.write(tmp_path / "transfer")
+    """Trained for longer, and by an agent that learns faster."""
+    first = load(undisturbed)[0]
+    replace(first, training=601).write(tmp_path / "transfer")
     refused(measured(tmp_path, *TWO), "with training 601 and not 600", "choose another folder")
+    replace(first, agent={**first.agent, "learning_rate": 1e-2}).write(tmp_path / "transfer")
+    refused(measured(tmp_path, *TWO), "with agent learning_rate 0.01 and not learning_rate 0.001", "choose another")
     refused(sipe("status", str(tmp_path / "nowhere")), "no transfer was started")
     refused(sipe("report", str(tmp_path / "nowhere")), "holds no transfer")
 

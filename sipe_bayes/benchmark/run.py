@@ -106,10 +106,10 @@ def _finished(mine: Record, folder: Path, retry_failed: bool) -> bool:
 
 
 def _differing(one: Any, other: Any) -> Any:
-    """Of two sets of versions, what differs in the first."""
+    """Of two dictionaries, what differs in the first."""
     if not isinstance(one, dict):
         return one
-    return ", ".join(f"{k} {v}" for k, v in one.items() if other.get(k) != v) or "fewer packages"
+    return ", ".join(f"{k} {v}" for k, v in one.items() if other.get(k) != v) or "fewer entries"
 
 
 def units_of(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:

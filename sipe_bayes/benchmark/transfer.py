@@ -93,7 +93,7 @@ class TransferRecord(Record):
     FOLDER: ClassVar[str] = "transfer"
     NONE: ClassVar[str] = "no transfer; make one with `sipe transfer run"
     NEVER: ClassVar[str] = "no transfer was started in it; start one with `sipe transfer run"
-    FIXED: ClassVar[tuple[str, ...]] = ("training", *Record.FIXED)
+    FIXED: ClassVar[tuple[str, ...]] = ("training", "agent", *Record.FIXED)
 
     training: int = 0
     agent: dict[str, Any] = field(default_factory=dict)

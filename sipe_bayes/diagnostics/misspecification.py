@@ -1,6 +1,6 @@
-"""Can the model explain the log? Residuals that are not noise, and a log that no parameters within the bounds would give.
+"""Can the model explain the log? Residuals that are not noise.
 
-**Residuals.** At the estimate, with parameters and windows' starts free to follow (linearised) and autoregressive noise, two kinds of
+At the estimate, with parameters and windows' starts free to follow (linearised) and autoregressive noise, two kinds of
 statistics are looked at. *Probes*: a force that the model may lack, as a change u + b phi(t) of an actuator's command with
 phi = dry friction tanh(v / v0), friction under load |u| tanh(v / v0), drag v |v|, delay u(t - 1) - u(t), a spring q, a stiffening
 spring q^3, an offset 1 and a gain that is not constant u |u|; v and q are the velocity and position of the joint that it drives. The
@@ -16,11 +16,6 @@ white and first-order autoregressive sensor noise, whatever the number of probes
 A small p says that something is there, not that it is large: with it come the share of each channel's residual that the named
 cause explains and, of a probe, how far the estimate would move if the model had it.
 
-**Prior predictive.** Logs simulated from the prior, with noise: the log's local outlier factor among them (M. Breunig et al. 2000,
-https://doi.org/10.1145/342009.335388), channel by channel. The p-value compares the log's largest with the largest of each simulation
-over all logs and channels, each started as far off as noise leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based multiple
-testing").
-
 Deviations: the log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
 estimates. A probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
 misfit passes as slow noise. Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is
@@ -34,15 +29,11 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.likelihood import Windows
 from sipe_bayes.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
-from sipe_bayes.posterior import Posterior
-from sipe_bayes.replicas import Replicas
-from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -60,7 +51,6 @@ _PIECES = 10
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _FLAT_PRECISION = 1e-6
 _AT_ONCE = 16  # draws of the null whose products are formed together
-_SAMPLES, _NEIGHBOURS, _PREDICTIVE, _PER_BATCH = 50, 20, 59, 10
 
 
 @dataclass(frozen=True)
@@ -115,31 +105,6 @@ class Misfit:
             return f"{found}; do not trust the intervals' width: {self.remedy}"
         return (
             f"{found}; a small effect that moves no parameter by more than {FAR:g} sd: {self.remedy} if you need more"
-        )
-
-
-@dataclass(frozen=True)
-class OutsidePrior:
-    """p: of a log as far from the prior's simulations as this one; channel, time (s): where it is farthest."""
-
-    p: float
-    log: str
-    channel: str
-    time: float
-
-    @property
-    def alarm(self) -> bool:
-        """Whether p is at most ``LEVEL``."""
-        return self.p <= LEVEL
-
-    @property
-    def text(self) -> str:
-        """In a sentence."""
-        if not self.alarm:
-            return f"log {self.log} is like simulations of the prior (p = {self.p:.2g})"
-        return (
-            f"log {self.log} is unlike simulations of the prior (p = {self.p:.2g}), most in {self.channel} at {self.time:.3g} s: "
-            "widen the bounds, or correct the model, units or signs"
         )
 
 
@@ -250,13 +215,10 @@ class _Residuals:
         n = moments.num_theta
         flat_prior, none = _FLAT_PRECISION * np.eye(n), self.windows.no_starts()
         pulls = Pulls(flat_prior, np.zeros(n), self.windows.start_precision, none, np.full(n, True))
-        unknown, channels = np.full(len(self.noise.sd), np.nan), self.windows.settings.noise_sd
-        if channels is not None:
-            unknown = np.array([np.nan if channels[c] is None else channels[c] for c in self.windows.channels], float)
-        trajectories = self.windows.trajectories
-        longest = float((trajectories.length * trajectories.dt).max())
-        shortest = float(self.windows.dt.min())
-        return estimate_noise(moments, self.noise, pulls, unknown, self.coloured, shortest, longest)
+        windows, shortest = self.windows, float(self.windows.dt.min())
+        return estimate_noise(
+            moments, self.noise, pulls, windows.fixed_sd, self.coloured, shortest, windows.trajectories.longest
+        )
 
     def solved(self, residual: FloatArray, moments: Moments, noise: Noise) -> _Solved:
         """Cube roots of K score statistics, C sums of squared autocorrelations and C largest mean squares of a piece, with what
@@ -454,56 +416,3 @@ def _joint(model: mujoco.MjModel, actuator: str) -> tuple[str, int, int] | None:
         return None
     name = model.joint(joint).name or f"joint {joint}"
     return name, 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
-
-
-def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
-    """For each log its place among 59 simulations of the prior with ``noise`` (O channels); those that diverge are left out.
-    Raises ValueError where fewer than half are left."""
-    logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
-    if len(made) < _PREDICTIVE // 2:
-        raise ValueError(
-            f"prior: {len(made)} of {_PREDICTIVE} simulations did not diverge, half are needed; narrow the bounds"
-        )
-    far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
-    farthest = np.zeros((len(logs), len(windows.channels)))
-    for k, log in enumerate(logs):
-        for i, c in enumerate(windows.channels):
-            there = np.flatnonzero(np.isfinite(log.observations[:, c]))
-            if not len(there):
-                continue
-            kept = there[np.linspace(0, len(there) - 1, min(_SAMPLES, len(there))).round().astype(int)]
-            simulated = np.stack([one[k, kept, c] for one in made])
-            far[k, i] = _outlier_factors(simulated, log.observations[kept, c])
-            gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(simulated.std(0), 1e-12)
-            farthest[k, i] = kept[gap.argmax()] * log.dt
-    largest = far[..., 1:].max((0, 1))
-    found = []
-    for k, name in enumerate(logs.names):
-        i = int(far[k, :, 0].argmax())
-        p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
-        found.append(
-            OutsidePrior(p, name, windows.simulator.environment.channels[windows.channels[i]], float(farthest[k, i]))
-        )
-    return found
-
-
-def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
-    """Observations (R, T+1, O) of the logs at draws of the prior."""
-    replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
-    thetas = prior.sample((_PREDICTIVE,), generator=torch.Generator().manual_seed(seed)).numpy()
-    batches = np.array_split(thetas, max(1, _PREDICTIVE // _PER_BATCH))
-    return [
-        one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
-    ]
-
-
-def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:
-    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another."""
-    from sklearn.neighbors import LocalOutlierFactor
-
-    every, sd = np.concatenate([log[None], simulated]), simulated.std(0)
-    varies = sd > 1e-12
-    if not varies.any():
-        return np.zeros(len(every))
-    factor = LocalOutlierFactor(n_neighbors=min(_NEIGHBOURS, len(simulated) - 1))
-    return np.asarray(-factor.fit(every[:, varies] / sd[varies]).negative_outlier_factor_)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from sipe_bayes.diagnostics.misspecification import Misfit, OutsidePrior
+    from sipe_bayes.diagnostics.misspecification import Misfit
+    from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
     from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]

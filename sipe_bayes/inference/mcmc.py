@@ -38,7 +38,7 @@ from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
-from sipe_bayes.inference.window_noise import free_noise, longest_tau
+from sipe_bayes.inference.window_noise import free_noise
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
 from sipe_bayes.marginal import Marginal
 from sipe_bayes.noise import Noise, Pulls
@@ -190,7 +190,7 @@ class MCMC(Estimator):
         shortest = float(windows.dt.min())
         sd = np.log(picked["sd"])
         low = np.concatenate([sd - 5, np.full(len(sd), np.log(0.1 * shortest))])
-        high = np.concatenate([sd + 5, np.full(len(sd), np.log(longest_tau(windows)))])
+        high = np.concatenate([sd + 5, np.full(len(sd), np.log(windows.trajectories.longest))])
         return low, high
 
     def describe(self, state: State) -> str:

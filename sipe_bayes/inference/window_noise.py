@@ -15,14 +15,6 @@ FloatArray = NDArray[np.float64]
 _SAME_NOISE = 0.03  # relative
 
 
-def fixed_sd(windows: Windows) -> FloatArray:
-    """Given noise sd (C,) of the fitted channels, NaN where it is estimated."""
-    given = windows.settings.noise_sd
-    if given is None:
-        return np.full(len(windows.channels), np.nan)
-    return np.array([np.nan if given[c] is None else given[c] for c in windows.channels], float)
-
-
 def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
     """Prior and bounds at (theta, starts); ``force`` (N,): the data's pull on theta, which holds it at a bound."""
     flat = FLAT_PRECISION * np.eye(len(theta))
@@ -39,7 +31,7 @@ def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: Fl
 
 def present_noise(windows: Windows, residual: FloatArray) -> Noise:
     """White noise with the root-mean-square of a residual (W, L, C), or the given sds."""
-    fixed, counts = fixed_sd(windows), windows.observed.sum(axis=(0, 1))
+    fixed, counts = windows.fixed_sd, windows.observed.sum(axis=(0, 1))
     size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1))
     return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
 
@@ -56,16 +48,16 @@ def updated_noise(
     start_pull = -windows.start_precision * starts
     arrow = eliminate(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
     context = pulls(windows, prior, theta, starts, arrow.gradient)
-    shortest, longest = float(windows.dt.min()), longest_tau(windows)
-    found = estimate_noise(moments, before, context, fixed_sd(windows), coloured, shortest, longest)
-    sd = np.where(np.isnan(fixed_sd(windows)), np.maximum(found.sd, windows.rounding), found.sd)
+    shortest, longest = float(windows.dt.min()), windows.trajectories.longest
+    found = estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest)
+    sd = np.where(np.isnan(windows.fixed_sd), np.maximum(found.sd, windows.rounding), found.sd)
     return Noise(sd, found.tau)
 
 
 def beyond_rounding(windows: Windows, noise: Noise) -> Noise:
     """The noise with channels at the least sd, the simulation's rounding, as if they were one sample."""
     least, counts = windows.rounding * (1 + _SAME_NOISE), windows.observed.sum(axis=(0, 1))
-    least = np.where(np.isnan(fixed_sd(windows)), least, 0.0)
+    least = np.where(np.isnan(windows.fixed_sd), least, 0.0)
     return Noise(np.where(noise.sd <= least, noise.sd * np.sqrt(np.maximum(counts, 1)), noise.sd), noise.tau)
 
 
@@ -73,13 +65,8 @@ def free_noise(windows: Windows) -> NDArray[np.int64]:
     """Which of (log sd (C), log tau (C)) are unknown; none of a chain of states, whose noise stays at its optimum."""
     if isinstance(windows, Chain):
         return np.empty(0, int)
-    free = np.isnan(fixed_sd(windows))
+    free = np.isnan(windows.fixed_sd)
     return np.flatnonzero(np.concatenate([free, np.full(len(free), windows.settings.noise != "white")]))
-
-
-def longest_tau(windows: Windows) -> float:
-    """The longest correlation time that the logs could show: the longest log's duration."""
-    return float((windows.trajectories.length * windows.trajectories.dt).max())
 
 
 def same_noise(a: Noise, b: Noise) -> bool:

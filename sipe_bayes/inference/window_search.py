@@ -29,9 +29,7 @@ from sipe_bayes.inference.poll import SHORTEST, Around, cost, poll
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.window_noise import (
     beyond_rounding,
-    fixed_sd,
     free_noise,
-    longest_tau,
     present_noise,
     pulls,
     same_noise,
@@ -120,7 +118,7 @@ def _by_loss(loss: FloatArray) -> NDArray[np.int64]:
 
 def _begin(windows: Windows, theta: FloatArray) -> State:
     """A search that starts at theta, with a first guess of white noise."""
-    fixed = fixed_sd(windows)
+    fixed = windows.fixed_sd
     spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
     sd = np.where(np.isnan(fixed), np.maximum(0.1 * spread, 1e-9), fixed)
     return {
@@ -282,7 +280,7 @@ def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
         noise = updated_noise(windows, moments, noise, theta, starts, prior, coloured=True)
     mean, covariance = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
     centres = []
-    for weight, point in noise_cloud(moments, noise, here, free_noise(windows), longest_tau(windows)):
+    for weight, point in noise_cloud(moments, noise, here, free_noise(windows), windows.trajectories.longest):
         if sandwiched:
             middle = sandwich(optimum.jacobian, arrow.start_slope, white, windows.sequences, point)
             centre, spread = search.normal(theta, *_sandwiched(arrow, middle))

@@ -66,8 +66,12 @@ class Settings:
         return round(self.demonstration_share * self.batch)
 
     def deviations(self) -> dict[str, Any]:
-        """The settings that are not at their defaults."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        """The settings that are not at their defaults, as JSON reads them back."""
+        return {
+            f.name: list(value) if isinstance(value, tuple) else value
+            for f in fields(self)
+            if (value := getattr(self, f.name)) != f.default
+        }
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

@@ -1,0 +1,104 @@
+"""Would any parameters within the bounds give such a log? Its place among logs simulated from the prior, with noise.
+
+The log's local outlier factor among them (M. Breunig et al. 2000, https://doi.org/10.1145/342009.335388), channel by channel. The
+p-value compares the log's largest with the largest of each simulation over all logs and channels, each started as far off as noise
+leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based
+multiple testing").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.diagnostics.misspecification import LEVEL
+from sipe_bayes.likelihood import Windows
+from sipe_bayes.noise import Noise
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.replicas import Replicas
+from sipe_bayes.state_space import Chain
+
+FloatArray = NDArray[np.float64]
+
+_SAMPLES, _NEIGHBOURS, _PREDICTIVE, _PER_BATCH = 50, 20, 59, 10
+
+
+@dataclass(frozen=True)
+class OutsidePrior:
+    """p: of a log as far from the prior's simulations as this one; channel, time (s): where it is farthest."""
+
+    p: float
+    log: str
+    channel: str
+    time: float
+
+    @property
+    def alarm(self) -> bool:
+        """Whether p is at most ``LEVEL``."""
+        return self.p <= LEVEL
+
+    @property
+    def text(self) -> str:
+        """In a sentence."""
+        if not self.alarm:
+            return f"log {self.log} is like simulations of the prior (p = {self.p:.2g})"
+        return (
+            f"log {self.log} is unlike simulations of the prior (p = {self.p:.2g}), most in {self.channel} at {self.time:.3g} s: "
+            "widen the bounds, or correct the model, units or signs"
+        )
+
+
+def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
+    """For each log its place among 59 simulations of the prior with ``noise`` (O channels); those that diverge are left out.
+    Raises ValueError where fewer than half are left."""
+    logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
+    if len(made) < _PREDICTIVE // 2:
+        raise ValueError(
+            f"prior: {len(made)} of {_PREDICTIVE} simulations did not diverge, half are needed; narrow the bounds"
+        )
+    far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
+    farthest = np.zeros((len(logs), len(windows.channels)))
+    for k, log in enumerate(logs):
+        for i, c in enumerate(windows.channels):
+            there = np.flatnonzero(np.isfinite(log.observations[:, c]))
+            if not len(there):
+                continue
+            kept = there[np.linspace(0, len(there) - 1, min(_SAMPLES, len(there))).round().astype(int)]
+            simulated = np.stack([one[k, kept, c] for one in made])
+            far[k, i] = _outlier_factors(simulated, log.observations[kept, c])
+            gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(simulated.std(0), 1e-12)
+            farthest[k, i] = kept[gap.argmax()] * log.dt
+    largest = far[..., 1:].max((0, 1))
+    found = []
+    for k, name in enumerate(logs.names):
+        i = int(far[k, :, 0].argmax())
+        p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
+        found.append(
+            OutsidePrior(p, name, windows.simulator.environment.channels[windows.channels[i]], float(farthest[k, i]))
+        )
+    return found
+
+
+def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
+    """Observations (R, T+1, O) of the logs at draws of the prior."""
+    replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
+    thetas = prior.sample((_PREDICTIVE,), generator=torch.Generator().manual_seed(seed)).numpy()
+    batches = np.array_split(thetas, max(1, _PREDICTIVE // _PER_BATCH))
+    return [
+        one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
+    ]
+
+
+def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:
+    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another."""
+    from sklearn.neighbors import LocalOutlierFactor
+
+    every, sd = np.concatenate([log[None], simulated]), simulated.std(0)
+    varies = sd > 1e-12
+    if not varies.any():
+        return np.zeros(len(every))
+    factor = LocalOutlierFactor(n_neighbors=min(_NEIGHBOURS, len(simulated) - 1))
+    return np.asarray(-factor.fit(every[:, varies] / sd[varies]).negative_outlier_factor_)
