@@ -131,7 +131,9 @@ class Simulator:
         theta, actions, initial_state = (
             np.broadcast_to(a, (batch, *a.shape[1:])) for a in (theta, actions, initial_state)
         )
-        steps, timesteps = (np.array(x) for x in zip(*(self.physics_steps(d) for d in dts.tolist()), strict=True))
+        distinct, which = np.unique(dts, return_inverse=True)
+        found = [self.physics_steps(d) for d in distinct.tolist()]
+        steps, timesteps = (np.array(x)[which] for x in zip(*found, strict=True))
         horizon = actions.shape[1]
         whole = _Motion.empty(batch, horizon, self)
         with quiet():
@@ -266,17 +268,21 @@ class Simulator:
             for chunk in np.array_split(group, math.ceil(len(group) / most)):
                 yield skip, chunk
 
-    def _models(self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]) -> NDArray[np.int64]:
-        """Which pooled model each lane uses, written in place."""
+    def _models(self, theta: FloatArray, timesteps: FloatArray, logs: list[str | None]) -> NDArray[np.int64]:
+        """Which pooled model each lane uses, written in place; lanes that follow their like cost nothing."""
+        named = np.array(logs, object)
+        differs = (theta[1:] != theta[:-1]).any(1) | (timesteps[1:] != timesteps[:-1]) | (named[1:] != named[:-1])
+        first = np.flatnonzero(np.concatenate([[True], differs]))
         index: dict[bytes, int] = {}
-        lanes = np.empty(len(theta), int)
-        for lane, (row, timestep, log) in enumerate(zip(theta, timesteps.tolist(), logs, strict=True)):
-            key = row.tobytes() + timestep.hex().encode() + str(log).encode()
+        slots = np.empty(len(first), int)
+        for i, lane in enumerate(first):
+            timestep, log = float(timesteps[lane]), logs[lane]
+            key = theta[lane].tobytes() + timestep.hex().encode() + str(log).encode()
             if key not in index:
                 index[key] = len(index)
-                self._write(index[key], key, row, timestep, log)
-            lanes[lane] = index[key]
-        return lanes
+                self._write(index[key], key, theta[lane], timestep, log)
+            slots[i] = index[key]
+        return np.repeat(slots, np.diff(first, append=len(theta)))
 
     def _write(self, slot: int, key: bytes, theta: FloatArray, timestep: float, log: str | None) -> None:
         if slot == len(self._pool):

@@ -11,7 +11,7 @@ from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.trajectory import Trajectories
 from tests.pendulums import log, pendulum
 
-SEEDS = range(20)
+SEEDS = range(12)
 
 
 def alarms(heavier: float, rho: float) -> list[str]:
@@ -37,15 +37,15 @@ def alarms(heavier: float, rho: float) -> list[str]:
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_agreeing_logs_pass_in_silence(rho: float) -> None:
-    """At the 1 % level, 3 or more alarms in 20 have a probability of 0.1 %."""
+    """At the 1 % level, 2 or more alarms in 12 have a probability of 0.6 %."""
     named = alarms(1.0, rho)
-    assert named.count("") >= 18, named
+    assert named.count("") >= 11, named
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_a_heavier_rod_is_named(rho: float) -> None:
     named = alarms(1.1, rho)
-    assert named.count("rod_mass") >= 18, named
+    assert named.count("rod_mass") >= 11, named
 
 
 def test_cochrans_q_against_a_plain_reference() -> None:

@@ -195,7 +195,7 @@ def test_finds_the_optimum_within_the_budget(acquisition: str) -> None:
     posterior within 0.05 of it; a few far draws are what little was evaluated elsewhere."""
     simulator = pendulum()
     truth = simulator.space.normalise(TRUTH)
-    estimator = BayesOpt(simulator, budget=BUDGET, acquisition=acquisition, effective_draws=500)
+    estimator = BayesOpt(simulator, budget=BUDGET, acquisition=acquisition, effective_draws=200)
     posterior = estimator.fit(recorded(simulator))
     print(estimator.diagnostics, posterior.best.numpy() - truth, posterior.mean.numpy() - truth, posterior.stddev)
     assert estimator.rollouts == BUDGET

@@ -19,7 +19,7 @@ import sipe_bayes as sipe
 from sipe_bayes.cli import app
 from sipe_bayes.posterior import prior
 from sipe_bayes.rl.ddpg import Agent
-from sipe_bayes.rl.evaluation import AGENTS, check_agents, evaluate, install, write_card
+from sipe_bayes.rl.evaluation import AGENTS, beside, check_agents, evaluate, install, write_card
 from sipe_bayes.rl.normaliser import Normaliser
 from sipe_bayes.rl.policy import Policy, PolicyError, load_policy
 from sipe_bayes.rl.randomization import Randomization
@@ -360,7 +360,8 @@ def test_evaluation_is_that_of_single_episodes() -> None:
 def test_cards_are_checked(tmp_path: Path) -> None:
     path = tmp_path / "Pendulum-expert.safetensors"
     policy().save(path)
-    write_card(path, sipe.make_task("Pendulum"), {"seed": 0}, episodes=20)
+    task = sipe.make_task("Pendulum")
+    write_card(path, task, {"seed": 0}, beside(task, 20), episodes=20)
     (row,) = check_agents(tmp_path, episodes=20)
     assert row["agrees"], row
     card = json.loads(path.with_suffix(".json").read_text())

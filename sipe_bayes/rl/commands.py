@@ -146,7 +146,7 @@ def _write_cards(
 
     from sipe_bayes.envs.registry import make_task
     from sipe_bayes.rl.demonstrate import facts_of
-    from sipe_bayes.rl.evaluation import write_card
+    from sipe_bayes.rl.evaluation import beside, write_card
     from sipe_bayes.rl.train import choose, read_curve
 
     rows = read_curve(folder)
@@ -162,7 +162,8 @@ def _write_cards(
         "versions": {"python": platform.python_version(), **packages},
     }
     made, cards = make_task(task), {}
+    others = beside(made, episodes)
     for name, step in choose(rows, steps).items():
         more = {"agent": name, "kept_at_step": step, **facts}
-        cards[name] = write_card(folder / f"{name}.safetensors", made, more, episodes)
+        cards[name] = write_card(folder / f"{name}.safetensors", made, more, others, episodes)
     return cards

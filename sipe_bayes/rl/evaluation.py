@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -100,15 +100,23 @@ def random(task: Task, seed: int = 0) -> Controller:
     return lambda observations: rng.uniform(task.action_low, task.action_high, (len(observations), task.num_actions))
 
 
-def write_card(path: Path, task: Task, facts: dict[str, Any], episodes: int = EPISODES) -> dict[str, Any]:
-    """Evaluate the agent in the file ``path``, write its card beside it and return that."""
-    simulator = Simulator(task, 1)
+_WITHOUT_SENSE: dict[str, Callable[[Task], Controller]] = {"idle": idle, "random": random}
+
+
+def beside(task: Task, episodes: int = EPISODES) -> dict[str, dict[str, Any]]:
+    """What a policy that does nothing and one that acts at random earn: ``idle`` and ``random`` of a card."""
+    return {name: evaluate(make(task), task, episodes, action_noise=0.0) for name, make in _WITHOUT_SENSE.items()}
+
+
+def write_card(
+    path: Path, task: Task, facts: dict[str, Any], others: dict[str, dict[str, Any]], episodes: int = EPISODES
+) -> dict[str, Any]:
+    """Evaluate the agent in the file ``path``, write its card beside it and return that. others: ``beside`` of the task."""
     card = {
         "task": task.name,
         **facts,
-        "evaluation": evaluate(load_policy(path, task.name), simulator, episodes),
-        "idle": evaluate(idle(task), simulator, episodes, action_noise=0.0),
-        "random": evaluate(random(task), simulator, episodes, action_noise=0.0),
+        "evaluation": evaluate(load_policy(path, task.name), task, episodes),
+        **others,
         "solved_at": {"measure": task.solved.measure, "threshold": task.solved.threshold},
     }
     write_text(path.with_suffix(".json"), to_json(card, indent=2))
