@@ -134,6 +134,20 @@ def test_the_estimator_gets_the_reference_under_the_actions_of_training(environm
     np.testing.assert_array_equal(run.trainer.episodes.theta, 0.25)
 
 
+def test_demonstrations_are_learnt_from_and_tell_runs_apart() -> None:
+    of = sipe.make_task("FetchPush")
+    shown, settings = sipe.demonstrations("FetchPush", count=2), replace(SMALL, demonstration_share=0.25)
+    plan = Plan(200, 2, 1, HORIZON, 1, settings)
+    one, other = (LoopRun(told(of), "default", plan, 1, demonstrations=shown[[i]]) for i in range(2))
+    assert one.fingerprint != other.fingerprint
+    for run, i in ((one, 0), (other, 1)):
+        run.iterate(None)
+        known = {row.tobytes() for row in np.float32(shown.actions[i])}
+        assert sum(row.tobytes() in known for row in run.trainer._batch().actions) >= 2  # of 8
+    with pytest.raises(ValueError, match=r"demonstration_share: 0\.25 with demonstrations missing"):
+        LoopRun(told(of), "default", plan, 1)
+
+
 def test_budgets_follow_the_training() -> None:
     """A fit gets what is left of its share so far, a search takes steps until it is level."""
     fitted = told(budget=100)

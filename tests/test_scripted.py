@@ -11,8 +11,10 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli import app
+from sipe_bayes.posterior import Dirac, prior
 from sipe_bayes.rl import scripted
 from sipe_bayes.rl.demonstrate import demonstrate, facts_of, record
+from sipe_bayes.rl.randomization import Draws
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
 
@@ -47,6 +49,24 @@ def test_demonstrations_are_the_first_attempts_that_succeed() -> None:
     again = simulator.rollout(task.theta("default"), shown.actions, shown.states[:, 0], goals=goals)
     for name in ("observations", "states", "rewards", "valid"):
         np.testing.assert_array_equal(getattr(again, name), getattr(shown, name))
+
+
+def test_demonstrations_in_simulators_drawn_from_what_is_believed() -> None:
+    """A point where the published model is gives what it gives; the prior gives each attempt a theta of its own, the same again."""
+    task = sipe.make_task("FetchPush")
+    simulator, act = Simulator(task, 1), scripted.demonstrator(task)
+    plain, _ = record(simulator, act, range(2), 3)
+    there, _ = record(simulator, act, range(2), 3, Draws(simulator, Dirac(task.theta("default"), task.space)))
+    np.testing.assert_array_equal(there.states, plain.states)
+    drawn, _ = record(simulator, act, range(2), 3, Draws(simulator, prior(task.space)))
+    later, _ = record(simulator, act, range(1, 2), 3, Draws(simulator, prior(task.space)))
+    np.testing.assert_array_equal(drawn.states[1], later.states[0])
+    np.testing.assert_array_equal(drawn.observations[:, 0], plain.observations[:, 0])
+    for states in (drawn.states[0], drawn.states[1]):
+        again = simulator.rollout(
+            task.theta("default"), drawn.actions, drawn.states[:, 0], goals=drawn.observations[:, 0, -3:]
+        )
+        assert not any(np.array_equal(other, states) for other in again.states)
 
 
 def test_a_controller_that_fails_is_given_up() -> None:

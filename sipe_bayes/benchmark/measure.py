@@ -145,18 +145,20 @@ def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
 
 
 def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
-    from sipe_bayes.benchmark.transfer import agent_of
+    from sipe_bayes.benchmark.transfer import agent_of, demonstrations_of
     from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, train_in_the_loop
 
     own = folder / POLICIES / file_name(cell.id)
     fresh, clock = not (own / CHECKPOINT).exists(), _Clock()
+    estimator = _estimator(cell, simulator)
     found = clock.time(
         lambda: train_in_the_loop(
-            _estimator(cell, simulator),
+            estimator,
             cell.variant,
             cell.training,
             trajectory_steps=cell.horizon,
             settings=agent_of(cell),
+            demonstrations=demonstrations_of(cell, simulator, estimator.prior),
             folder=own,
             resume=True,
         )

@@ -23,6 +23,7 @@ from sipe_bayes.benchmark.transfer import (
     TRUTH,
     TransferRecord,
     agent_of,
+    demonstrations_of,
     estimate_of,
 )
 from sipe_bayes.benchmark.work import Done
@@ -101,15 +102,16 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
     began = time.process_time()
     task, own = make_task(cell.task), folder / POLICIES / file_name(cell.id)
     drawn, every = randomization(cell, folder), max(cell.training // POINTS, task.episode_steps)
+    simulator, truth = Simulator(task, num_threads=1), task.theta(cell.variant)
     policy = train(
         *(task, cell.training, cell.seed, own, agent_of(cell)),
         resume=True,
         randomization=drawn,
+        demonstrations=demonstrations_of(cell, simulator, drawn.posterior),
         evaluate_every=every,
         evaluation_episodes=POINT_EPISODES,
         checkpoint_every=every,
     )
-    simulator, truth = Simulator(task, num_threads=1), task.theta(cell.variant)
 
     def earned(policy: Any, episodes: int, action_noise: float | None = None) -> dict[str, Any]:
         return evaluation.evaluate(policy, simulator, episodes, _TARGET_SEED, truth, action_noise=action_noise)

@@ -24,6 +24,7 @@ from sipe_bayes.episodes import Episodes
 from sipe_bayes.output import to_json
 from sipe_bayes.rl import planning, scripted
 from sipe_bayes.rl.planning import Report
+from sipe_bayes.rl.randomization import Draws
 from sipe_bayes.rl.scripted import Demonstrator
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -90,9 +91,11 @@ def facts_of(path: Path) -> dict[str, Any]:
     return {"file": path.name, **found}
 
 
-def demonstrate(simulator: Simulator, act: Demonstrator, count: int, seed: int = 0) -> Demonstrations:
-    """The first ``count`` successful episodes at the published parameters; raises ValueError for arguments out of range, and
-    RuntimeError where too few attempts succeed."""
+def demonstrate(
+    simulator: Simulator, act: Demonstrator, count: int, seed: int = 0, draws: Draws | None = None
+) -> Demonstrations:
+    """The first ``count`` successful episodes, each at parameters of its own from ``draws``, without them at the published ones;
+    raises ValueError for arguments out of range, and RuntimeError where too few attempts succeed."""
     if count < 1 or seed < 0:
         raise ValueError(f"count and seed: expected at least 1 and 0, got {count} and {seed}")
     kept: dict[int, Trajectory] = {}
@@ -100,7 +103,7 @@ def demonstrate(simulator: Simulator, act: Demonstrator, count: int, seed: int =
     while len(kept) < count:
         if tried >= _PATIENCE * count:
             raise RuntimeError(f"count: {len(kept)} of {tried} attempts succeeded, expected {count}; ask for fewer")
-        batch, succeeded = record(simulator, act, range(tried, tried + count), seed)
+        batch, succeeded = record(simulator, act, range(tried, tried + count), seed, draws)
         kept |= {tried + i: batch[i] for i in np.flatnonzero(succeeded).tolist()}
         tried += count
     chosen = sorted(kept)[:count]
@@ -108,13 +111,16 @@ def demonstrate(simulator: Simulator, act: Demonstrator, count: int, seed: int =
 
 
 def record(
-    simulator: Simulator, act: Demonstrator, attempts: Sequence[int], seed: int = 0
+    simulator: Simulator, act: Demonstrator, attempts: Sequence[int], seed: int = 0, draws: Draws | None = None
 ) -> tuple[Trajectories, BoolArray]:
     """An episode for each of the ``attempts`` (B), and which (B,) ended in success without diverging."""
     task = simulator.environment
     assert isinstance(task, Task)
     rngs = [np.random.default_rng([seed, attempt, 0, _KEY]) for attempt in attempts]
-    lanes, count = Episodes(simulator, task.theta("default"), rngs, allow_outside=True), len(rngs)
+    theta, count = task.theta("default"), len(rngs)
+    if draws is not None:
+        theta = np.concatenate([draws(np.random.default_rng([seed, attempt, 1, _KEY]), 1) for attempt in attempts])
+    lanes = Episodes(simulator, theta, rngs, allow_outside=True)
     horizon, success, valid = task.episode_steps, np.zeros(count, bool), np.ones((count, task.episode_steps + 1), bool)
     observations, states, actions, rewards = [lanes.observations.copy()], [lanes.states.copy()], [], []
     for t in range(horizon):

@@ -21,7 +21,7 @@ from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.policy import Policy
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.rl.train import Report
+from sipe_bayes.rl.train import Report, checksum
 from sipe_bayes.rl.trainer import Trainer
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -111,7 +111,14 @@ class _Recorder:
 class LoopRun:
     """The state of a run: the trainer, the estimator, what theta are drawn from, and the history."""
 
-    def __init__(self, estimator: Estimator, reference: str | FloatArray, plan: Plan, threads: int) -> None:
+    def __init__(
+        self,
+        estimator: Estimator,
+        reference: str | FloatArray,
+        plan: Plan,
+        threads: int,
+        demonstrations: Trajectories | None = None,
+    ) -> None:
         self.task = task = _task(estimator)
         self.truth = task.theta(reference) if isinstance(reference, str) else _theta(task, reference)
         self.plan, self.horizon = plan, plan.horizon(task)
@@ -121,6 +128,7 @@ class LoopRun:
             "estimator": estimator.settings(),
             "reference": self.truth.tolist(),
             **asdict(plan),
+            "demonstrations": checksum(demonstrations),
         }
         self.fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode()).hexdigest()
         self.simulator = Simulator(task, threads)  # of the reference and of evaluations
@@ -128,7 +136,8 @@ class LoopRun:
         self.spent = self.reference_rollouts = 0
         self.idle = False  # a search that is over
         self.history: list[Row] = []
-        self.trainer = Trainer(task, plan.settings, estimator.seed, Randomization(self.posterior), threads=threads)
+        drawn = Randomization(self.posterior)
+        self.trainer = Trainer(task, plan.settings, estimator.seed, drawn, demonstrations, threads)
         assert self.trainer.draws is not None
         self.draw = self.trainer.draws
 

@@ -52,6 +52,7 @@ from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report
+from sipe_bayes.trajectory import Trajectories
 
 CHECKPOINT = "checkpoint/state.safetensors"
 
@@ -65,6 +66,7 @@ def train_in_the_loop(
     trajectories: int = 1,
     trajectory_steps: int | None = None,
     settings: Settings | None = None,
+    demonstrations: Trajectories | None = None,
     evaluation_episodes: int = 10,
     folder: str | Path | None = None,
     resume: bool = False,
@@ -76,7 +78,7 @@ def train_in_the_loop(
     estimator: a fresh one on a simulator of a task, such as ``sipe.get_estimator("Pendulum", "simopt", budget=1000)``; it brings
     prior, budget and seed, and is the run's own from then on. reference: a variant's name or theta (N,), which may lie outside
     [0, 1]. updates: iterations. trajectories: taken from the reference for each; trajectory_steps: of each, default an
-    episode or its first 250. evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
+    episode or its first 250. demonstrations: from which ``settings.demonstration_share`` of each batch is taken. evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
     folder: where ``history.csv``, ``result.json``, ``policy.safetensors``, ``posterior`` and a checkpoint, written at each update, are
     kept; resume: go on from there, to the result of an undisturbed run.
 
@@ -88,7 +90,7 @@ def train_in_the_loop(
     Raises ValueError for arguments out of range, a folder that holds another run or, without ``resume``, any.
     """
     plan = Plan(steps, updates, trajectories, trajectory_steps, evaluation_episodes, settings or Settings())
-    run = LoopRun(estimator, reference, plan, threads)
+    run = LoopRun(estimator, reference, plan, threads, demonstrations)
     kept = None if folder is None else _Folder(Path(folder), run, resume)
     while len(run.history) < updates:
         run.iterate(report)

@@ -91,7 +91,7 @@ def train(
         "seed": seed,
         "settings": {k: v for k, v in settings.to_dict().items() if v or k not in _LATER},
         "drawn": randomization is not None and randomization.fingerprint,
-        "demonstrations": _checksum(demonstrations),
+        "demonstrations": checksum(demonstrations),
         "evaluate_every": evaluate_every,
         "evaluation_episodes": evaluation_episodes,
     }
@@ -217,7 +217,8 @@ def read_curve(folder: Path) -> list[list[Any]]:
     return [[int(step), *(float(x) if x else None for x in rest)] for step, *rest in rows]
 
 
-def _checksum(given: Trajectories | None) -> str:
+def checksum(given: Trajectories | None) -> str:
+    """Of demonstrations, "" without any."""
     if given is None:
         return ""
     digest = hashlib.sha256(given.observations.tobytes())
