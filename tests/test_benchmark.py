@@ -125,6 +125,15 @@ def test_patterns(pattern: str, matched: bool) -> None:
     assert matches(Cell("HalfCheetahLinks", "adr").id, pattern) is matched
 
 
+def test_the_humanoids_trajectories_are_shorter_unless_asked_for() -> None:
+    assert [Cell(task, "adr").horizon for task in ("FetchPush", "HalfCheetahJoints", "HumanoidJoints")] == [
+        50,
+        250,
+        100,
+    ]
+    assert Cell("HumanoidJoints", "adr", steps=200).horizon == 200
+
+
 def test_select_keeps_the_order_and_each_cell_once() -> None:
     found = select("quick", ["*/simopt/*", "door/*"])
     assert [c.id for c in found] == [c.id for c in suite("quick") if c.task == "Door" or c.estimator == "simopt"]
@@ -191,6 +200,14 @@ def test_status(undisturbed: Path) -> None:
     assert spent["cpu_use"] == spent["cpu_seconds"] / spent["seconds"] > 0
     assert spent["units"] == 7
     assert "6 cells, 6 done, 0 failed, 0 missing" in lines(found)[0]
+    twice = {
+        **found,
+        "runs": [
+            {**spent, "seconds": 1800.0, "cpu_seconds": 3600.0},
+            {**spent, "seconds": 5400.0, "cpu_seconds": 900.0},
+        ],
+    }
+    assert lines(twice)[-1] == "all runs: 2.00 h, 1.25 h of CPU"
     assert json.loads(sipe("benchmark", "status", str(undisturbed), "--json").output)["done"] == 6
 
 

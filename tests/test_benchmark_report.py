@@ -223,6 +223,12 @@ def test_contents_say_what_was_run_and_what_is_missing(found: report_contents.Co
     assert facts["versions"] == "mujoco 4.0.0"
     assert "toy" in facts["estimators"]
     assert facts["time"].startswith(f"{3 * len(every()) / 60:.1f} min of CPU")
+    assert facts["trajectories"] == "50 control steps; by excitation"
+    longer = [dataclasses.replace(r, steps=200) if r.task == "Door" else r for r in every()]
+    assert (
+        dict(report_contents._facts(longer))["trajectories"]
+        == "50 (FetchPush, Relocate); 200 (Door) control steps; by excitation"
+    )
     titles = [section.title for section in found.sections]
     assert titles[0] == "Direct estimation, in distribution"
     assert {

@@ -143,7 +143,7 @@ def _facts(records: Sequence[Record]) -> list[tuple[str, str]]:
         ("variants", ", ".join(text for name, text in _VARIANTS.items() if any(r.variant == name for r in records))),
         ("seeds", _numbers(r.seed for r in records)),
         ("budget", f"{_numbers(r.budget for r in records)} rollouts"),
-        ("trajectories", f"{_numbers(r.steps for r in records)} control steps; by {_listed(r.log for r in records)}"),
+        ("trajectories", f"{_horizons(records)} control steps; by {_listed(r.log for r in records)}"),
         ("time", f"{_duration(method)} of CPU for the methods, {_duration(shared)} for shared simulations"),
         ("versions", "; ".join(f"{p} {_listed(r.versions.get(p, '') for r in records)}" for p in _packages(records))),
     ]
@@ -153,6 +153,16 @@ def _facts(records: Sequence[Record]) -> list[tuple[str, str]]:
 
 def _packages(records: Sequence[Record]) -> list[str]:
     return list(dict.fromkeys(package for r in records for package in r.versions if r.versions[package]))
+
+
+def _horizons(records: Sequence[Record]) -> str:
+    """How long the trajectories are, by task where that differs."""
+    tasks: dict[int, set[str]] = {}
+    for record in records:
+        tasks.setdefault(record.steps, set()).add(record.task)
+    if len(tasks) == 1:
+        return f"{next(iter(tasks)):,}"
+    return "; ".join(f"{steps:,} ({', '.join(order_tasks(tasks[steps]))})" for steps in sorted(tasks))
 
 
 def _numbers(values: Iterator[int]) -> str:

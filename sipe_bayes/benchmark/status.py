@@ -78,6 +78,9 @@ def lines(found: dict[str, Any]) -> list[str]:
         if row["cpu_use_simulating"] is not None:
             use += f", {_percent(row['cpu_use_simulating'])} while simulating ({row['simulating']['seconds']:.0f} s)"
         said.append(f"{row['started']}: {use}: {row['command']}")
+    if len(found["runs"]) > 1:
+        seconds, cpu = (sum(row[name] for row in found["runs"]) for name in ("seconds", "cpu_seconds"))
+        said.append(f"all runs: {seconds / 3600:.2f} h, {cpu / 3600:.2f} h of CPU")
     return said
 
 
