@@ -59,9 +59,9 @@ def row(
 
 
 def trainer(task: str, given: Randomization | None, learning: bool) -> Trainer:
-    """One that acts by its actor and, if ``learning``, learns already."""
+    """One that acts by its actor and, if ``learning``, learns already; without demonstrations, which cost both sides alike."""
     made = sipe.make_task(task)
-    chosen = settings(made, 4 * 300)
+    chosen = replace(settings(made, 4 * 300), demonstration_share=0.0)
     found = Trainer(made, chosen if learning else replace(chosen, updates_per_step=0.0), 0, given)
     while found.steps < chosen.start_steps + 64:
         found.advance()
