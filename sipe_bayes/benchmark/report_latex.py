@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jinja2
-import matplotlib
 
 from sipe_bayes.atomic import write_bytes, write_text
 from sipe_bayes.benchmark import report_html
@@ -101,10 +100,9 @@ def breakable(cell_id: str) -> Raw:
 
 
 def pdf(picture: Picture) -> bytes:
-    """A figure as a PDF file with outlines as fonts; the same bytes for the same figure."""
+    """A figure as a PDF file; the same bytes for the same figure."""
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"pdf.fonttype": 42}):
-        picture.figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
+    picture.figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
     return buffer.getvalue()
 
 
