@@ -305,6 +305,11 @@ def test_policy_cell(tmp_path: Path) -> None:
     (folder,) = (tmp_path / measure.POLICIES).iterdir()
     assert (folder / "policy.safetensors").exists()
     assert not (folder / "checkpoint").exists()
+    refused(
+        measured(tmp_path, "--select", "pendulum/simopt/policy/*/seed0", "--training", "9001"),
+        "with training 9000 and not 9001",
+        "choose another folder",
+    )
 
 
 def test_out_of_distribution(tmp_path: Path) -> None:

@@ -13,16 +13,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from sipe_bayes.benchmark import transfer_measure
+from sipe_bayes.benchmark import transfer, transfer_measure
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.measure import POLICIES, _netcdf
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
-from sipe_bayes.benchmark.transfer import SETTING, SUITES, TransferRecord, estimate_of, select, settings, varied
+from sipe_bayes.benchmark.transfer import (
+    SETTING,
+    SUITES,
+    TransferRecord,
+    demonstrations_of,
+    estimate_of,
+    select,
+    settings,
+    varied,
+)
 from sipe_bayes.benchmark.transfer_report import bars, curves, label, relative, rows, table
 from sipe_bayes.benchmark.transfer_run import load, summary
 from sipe_bayes.cli import app
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.posterior import Dirac, Posterior, prior
+from sipe_bayes.simulator import Simulator
 
 SMALL = ["--suite", "quick", "--training", "600", "--budget", "60", "--steps", "20"]
 TWO = ["--select", "pendulum/truth", "--select", "pendulum/laplace"]
@@ -86,6 +96,28 @@ def test_every_task_has_an_agent_that_learns_within_its_training(task: str) -> N
         assert chosen.start_steps <= training / 2
         assert chosen.capacity // chosen.lanes > make_task(task).episode_steps
         assert chosen.capacity >= training
+
+
+@pytest.mark.parametrize("task", ["FetchPush", "FetchPickAndPlace"])
+def test_what_an_agent_is_shown_is_from_where_it_trains(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At each variant's truth, and over the prior, scripts succeed often enough."""
+    monkeypatch.setattr(transfer, "_DEMONSTRATIONS", 3)
+    made = make_task(task)
+    simulator = Simulator(made, 1)
+    truths = [Dirac(made.theta(variant), made.space) for variant in ("default", "in_distribution")]
+    shown = [demonstrations_of(replace(CELL, task=task), simulator, p) for p in (*truths, prior(made.space))]
+    assert [None if found is None else len(found) for found in shown] == [3, 3, 3]
+    assert shown[0] is not None
+    assert shown[1] is not None
+    assert not np.array_equal(shown[0].states, shown[1].states)
+    assert settings(made, 150_000).demonstrated
+
+
+@pytest.mark.parametrize("task", ["FetchSlide", "Pendulum", "HalfCheetahLinks"])
+def test_nothing_is_shown_where_no_script_fits(task: str) -> None:
+    made = make_task(task)
+    assert demonstrations_of(replace(CELL, task=task), Simulator(made, 1), prior(made.space)) is None
+    assert not settings(made, 150_000).demonstrated
 
 
 def test_variations_are_in_the_id_and_not_of_the_truth() -> None:

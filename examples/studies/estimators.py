@@ -233,8 +233,11 @@ def _line(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("run", "table"))
+    parser.add_argument("command", nargs="?", choices=("run", "table"), help="default both")
     parser.add_argument("--select", default="", help="part of task/method/seed")
     given = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    run(given.select) if given.command == "run" else table()
+    if given.command != "table":
+        run(given.select)
+    if given.command != "run":
+        table()

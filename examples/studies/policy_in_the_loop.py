@@ -166,10 +166,13 @@ def accuracy(cells: list[dict[str, Any]]) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("run", "table"))
+    parser.add_argument("command", nargs="?", choices=("run", "table"), help="default both")
     parser.add_argument("--steps", type=int, default=150_000, help="control steps of a cell's training")
     parser.add_argument("--budget", type=int, default=1000, help="rollouts of a cell's estimator")
     parser.add_argument("--select", default="", help="part of method/seed")
     given = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    run(given.steps, given.budget, given.select) if given.command == "run" else table(given.steps, given.budget)
+    if given.command != "table":
+        run(given.steps, given.budget, given.select)
+    if given.command != "run":
+        table(given.steps, given.budget)

@@ -7,7 +7,7 @@
 A cell is what `sipe check TASK ESTIMATOR` does: one demonstration's commands and start, truths from the prior, a log simulated at each
 of them with the noise, a posterior of each log. `npe` and `bayessim` are trained once, on 2,000 simulations, and then condition on 400
 logs; `laplace` and `mcmc`, on StateSpace, are fitted to 100. Ranks are uniform where the smallest p-value over a task's N parameters is at least
-.05 / N: the whole curve of each lies in its simultaneous band of 95 % (Bonferroni over parameters). Coverage is that of 90 %
+.05 / N: the whole curve of each lies in its simultaneous band of 1 - .05 / N, all of them together in one of 95 %. Coverage is that of 90 %
 intervals, pooled over parameters, its standard error clustered by log.
 """
 
@@ -39,6 +39,8 @@ def measure(task: str, estimator: str) -> None:
         RUNS / f"{task}-{estimator}",
         lambda what, done, of: print(what, flush=True) if done % 10 == 0 else None,
     )
+    versions = {p: version(p) for p in ("mujoco", "numpy", "torch", "sbi")}
+    write_text(RUNS / f"{task}-{estimator}" / "versions.json", to_json(versions) + "\n")
     print(found.sentence(), flush=True)
 
 
@@ -64,6 +66,7 @@ def row(task: str, estimator: str, found: dict[str, Any]) -> dict[str, Any]:
         "contraction": sum(s["contraction"] for s in found["sharpness"].values()) / len(parameters),
         "rollouts": found["rollouts"],
         "seconds": found["seconds"],
+        "versions": json.loads((RUNS / f"{task}-{estimator}" / "versions.json").read_text(encoding="utf-8")),
     }
 
 
@@ -73,7 +76,8 @@ def line(found: dict[str, Any]) -> str:
         for name, one in found["not_uniform"].items()
     )
     said = "uniform" if found["uniform"] else f"not uniform ({wrong})"
-    cells = [found["task"], found["estimator"], str(found["logs"]), said, f"{found['smallest_p']:.2g}"]
+    logs = f"{found['logs']}" + (f", {found['failed']} failed" if found["failed"] else "")
+    cells = [found["task"], found["estimator"], logs, said, f"{found['smallest_p']:.2g}"]
     cells += [f"{found['coverage_90']:.3f} ± {found['standard_error']:.3f}", f"{found['tarp_p']:.2g}"]
     return " | ".join(["", *cells, f"{found['contraction']:.2f}", ""]).strip()
 
@@ -91,7 +95,6 @@ def table() -> None:
         "command": "python examples/studies/sbc.py run, then table",
         "steps": STEPS,
         "noise": NOISE,
-        "versions": {p: version(p) for p in ("mujoco", "numpy", "torch", "sbi")},
         "missing": missing,
         "cells": rows,
     }
@@ -102,13 +105,16 @@ def table() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("run", "table"))
+    parser.add_argument("command", nargs="?", choices=("run", "table"), help="default both")
     parser.add_argument("--select", default="", help="part of TASK/ESTIMATOR")
     given = parser.parse_args()
-    if given.command == "table":
+    cells = [(task, name) for task in TASKS for name in METHODS if given.select in f"{task}/{name}"]
+    if not cells:
+        parser.error(
+            f"--select {given.select}: expected part of one of {', '.join(f'{t}/{m}' for t in TASKS for m in METHODS)}"
+        )
+    if given.command != "table":
+        for cell in cells:
+            measure(*cell)
+    if given.command != "run":
         table()
-    else:
-        for task in TASKS:
-            for estimator in METHODS:
-                if given.select in f"{task}/{estimator}":
-                    measure(task, estimator)

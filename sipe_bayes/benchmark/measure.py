@@ -56,7 +56,11 @@ def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
 
 def blank_record(cell: Cell, command: str) -> Record:
     """A cell's record before it is measured."""
-    return blank(Record, cell, command)
+    if not cell.with_policy:
+        return blank(Record, cell, command)
+    from sipe_bayes.benchmark.transfer import agent_of
+
+    return blank(Record, cell, command, training=cell.training, agent=agent_of(cell).deviations())
 
 
 def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, str]:

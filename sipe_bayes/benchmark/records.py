@@ -33,13 +33,20 @@ class Record:
     counted by the estimator. scores: ``diagnostics.scores.Scores.to_dict``. determined: which parameters the log determines (the
     rule: ``benchmark.log``); None out of distribution. history: rows of rollouts, mean_accuracy, mean_crps (None with a policy)
     along the way, the last one the result. log: who acted, "expert" or "excitation", or "policy". converged: of a cell with a
-    policy, whether the last one solves simulators drawn from the estimate; solved_reference: whether it solves the reference.
+    policy, whether the last one solves simulators drawn from the estimate; solved_reference: whether it solves the reference; training:
+    its control steps; agent: settings that are not DDPG's defaults.
     """
 
     FOLDER: ClassVar[str] = ""  # of records and plan, in a folder of results
     NONE: ClassVar[str] = "no records; make some with `sipe benchmark run"
     NEVER: ClassVar[str] = "no run was started in it; start one with `sipe benchmark run"
-    FIXED: ClassVar[tuple[str, ...]] = ("budget", "steps", "versions")  # alike in all runs of a cell in one folder
+    FIXED: ClassVar[tuple[str, ...]] = (
+        "budget",
+        "steps",
+        "training",
+        "agent",
+        "versions",
+    )  # alike in all runs of a cell in one folder
 
     id: str
     task: str
@@ -67,6 +74,8 @@ class Record:
     log: str = ""
     converged: bool | None = None
     solved_reference: bool | None = None
+    training: int = 0
+    agent: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     checksums: dict[str, str] = field(default_factory=dict)
     command: str = ""

@@ -40,7 +40,7 @@ def run(
 ) -> int:
     """Measure the cells that have no record in ``folder`` yet; returns how many failed. start: makes the executor, once the folder
     is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
-    budgets or lengths, or that another run is at work in, and OSError where it cannot be written."""
+    budgets, lengths or agents, or that another run is at work in, and OSError where it cannot be written."""
     with claimed(folder):
         left = lacking(cells, folder, retry_failed)
         plan(folder, [cell.id for cell in cells])

@@ -35,6 +35,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sipe_bayes.models.training import check_device
 from sipe_bayes.rl.normaliser import Normaliser
 from sipe_bayes.rl.policy import Policy
 from sipe_bayes.rl.replay import Batch
@@ -47,14 +48,14 @@ Float32Array = NDArray[np.float32]
 class Network:
     """An MLP with ReLU, perhaps normalised hidden layers, in one flat vector (P,); forward and backward by hand."""
 
-    def __init__(self, sizes: tuple[int, ...], layer_norm: bool = False) -> None:
+    def __init__(self, sizes: tuple[int, ...], layer_norm: bool = False, device: str = "cpu") -> None:
         self.sizes, self.layer_norm = sizes, layer_norm
         self._shapes: list[tuple[int, ...]] = []
         for i, (before, after) in enumerate(pairwise(sizes)):
             self._shapes += [(after, before), (after,)]
             if layer_norm and i < len(sizes) - 2:
                 self._shapes += [(after,), (after,)]
-        self.parameters = torch.zeros(sum(int(np.prod(s)) for s in self._shapes))
+        self.parameters = torch.zeros(sum(int(np.prod(s)) for s in self._shapes), device=device)
         self.gradients = torch.zeros_like(self.parameters)
         self.layers, self._slopes = self._views(self.parameters), self._views(self.gradients)
 
@@ -104,7 +105,7 @@ class Network:
 
     def twin(self) -> Network:
         """Another network with the same parameters."""
-        other = Network(self.sizes, self.layer_norm)
+        other = Network(self.sizes, self.layer_norm, str(self.parameters.device))
         other.parameters.copy_(self.parameters)
         return other
 
@@ -118,7 +119,8 @@ class Network:
 
 
 class Agent:
-    """Actor, critic, their targets and optimisers, for observations (B, O) and actions (B, A) between two bounds."""
+    """Actor, critic, their targets and optimisers, for observations (B, O) and actions (B, A) between two bounds. device: where they
+    learn; what goes in and comes out are numpy's arrays."""
 
     def __init__(
         self,
@@ -128,12 +130,13 @@ class Agent:
         action_high: float,
         settings: Settings,
         rng: np.random.Generator,
+        device: str = "cpu",
     ) -> None:
-        self.settings, self.observation_size = settings, observation_size
+        self.settings, self.observation_size, self._device = settings, observation_size, check_device(device)
         self.action_low, self.action_high = action_low, action_high
         self._half, self._middle = (action_high - action_low) / 2, (action_high + action_low) / 2
-        self.actor = Network((observation_size, *settings.hidden, action_size))
-        self.critic = Network((observation_size + action_size, *settings.hidden, 1), settings.layer_norm)
+        self.actor = Network((observation_size, *settings.hidden, action_size), device=device)
+        self.critic = Network((observation_size + action_size, *settings.hidden, 1), settings.layer_norm, device)
         self.actor.initialise(rng)
         self.critic.initialise(rng)
         self.target_actor, self.target_critic = self.actor.twin(), self.critic.twin()
@@ -143,27 +146,31 @@ class Agent:
 
     def act(self, observations: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, O), without noise."""
-        x = torch.from_numpy(self._seen(observations.astype(np.float32)))
-        return np.asarray(self._bounded(self.actor.forward(x)[0].tanh_()).numpy(), float)
+        x = self._on_device(self._seen(observations.astype(np.float32)))
+        return np.asarray(self._bounded(self.actor.forward(x)[0].tanh_()).cpu().numpy(), float)
 
     def update(self, batch: Batch) -> None:
         """One step of the critic, the actor and the targets."""
-        observations, following = (
-            torch.from_numpy(self._seen(x)) for x in (batch.observations, batch.next_observations)
+        observations, following, actions, returns, discounts = (
+            self._on_device(x)
+            for x in (
+                *(self._seen(x) for x in (batch.observations, batch.next_observations)),
+                *(batch.actions, batch.returns, batch.discounts),
+            )
         )
-        targets = self._targets(following, torch.from_numpy(batch.returns), torch.from_numpy(batch.discounts))
-        pairs = torch.cat([observations, torch.from_numpy(batch.actions)], 1)
+        targets = self._targets(following, returns, discounts)
+        pairs = torch.cat([observations, actions], 1)
         values, tape = self.critic.forward(pairs)
         self.critic.backward(tape, (values - targets).mul_(2 / len(values)))
         self._critic_optimiser.step()
-        self._climb(observations, batch.actions)
+        self._climb(observations, actions)
         for network, target in ((self.actor, self.target_actor), (self.critic, self.target_critic)):
             target.parameters.lerp_(network.parameters, self.settings.tau)
         self.updates += 1
 
     def policy(self, task: str, goal_size: int = 0) -> Policy:
         """What has been learnt so far."""
-        layers = tuple((w.numpy().copy(), b.numpy().copy()) for w, b in self.actor.layers)
+        layers = tuple((w.cpu().numpy().copy(), b.cpu().numpy().copy()) for w, b in self.actor.layers)
         low, high = self.action_low, self.action_high
         if self.normaliser is None:
             return Policy(task, layers, low, high, goal_size=goal_size)
@@ -172,7 +179,7 @@ class Agent:
 
     def state(self) -> dict[str, Any]:
         """Arrays and numbers from which ``restore`` goes on bit for bit."""
-        found: dict[str, Any] = {name: tensor.numpy().copy() for name, tensor in self._tensors().items()}
+        found: dict[str, Any] = {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
         if self.normaliser is not None:
             found |= {f"normaliser.{k}": v for k, v in self.normaliser.state().items()}
         return {**found, "updates": self.updates}
@@ -194,6 +201,9 @@ class Agent:
     def _seen(self, observations: Float32Array) -> Float32Array:
         return observations if self.normaliser is None else self.normaliser.apply(observations)
 
+    def _on_device(self, array: Float32Array) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
+
     def _bounded(self, squashed: Tensor) -> Tensor:
         return squashed * self._half + self._middle
 
@@ -204,7 +214,7 @@ class Agent:
         found = torch.addcmul(returns[:, None], discounts[:, None], values)
         return found.clamp_(-1 / (1 - self.settings.discount), 0.0) if self.settings.clip_targets else found
 
-    def _climb(self, observations: Tensor, actions: Float32Array) -> None:
+    def _climb(self, observations: Tensor, actions: Tensor) -> None:
         """The actor's step: along the critic's slope in the action, times what squashes it."""
         outputs, tape = self.actor.forward(observations)
         squashed = outputs.tanh_()
@@ -216,7 +226,7 @@ class Agent:
             inner = inner.add_(squashed, alpha=2 * self.settings.action_penalty / squashed.numel())
         if self.settings.cloning:
             shown = self.settings.demonstrated
-            away = squashed[-shown:] - torch.from_numpy(actions[-shown:] - self._middle).div_(self._half)
+            away = squashed[-shown:] - (actions[-shown:] - self._middle).div_(self._half)
             inner[-shown:] += 2 * self.settings.cloning * values.abs().mean() / shown * away
         self.actor.backward(tape, inner.mul_(1 - squashed * squashed))
         self._actor_optimiser.step()

@@ -128,7 +128,7 @@ class LoopRun:
             "estimator": estimator.settings(),
             "reference": self.truth.tolist(),
             **asdict(plan),
-            "demonstrations": checksum(demonstrations),
+            **({} if demonstrations is None else {"demonstrations": checksum(demonstrations)}),
         }
         self.fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode()).hexdigest()
         self.simulator = Simulator(task, threads)  # of the reference and of evaluations

@@ -78,7 +78,8 @@ def train_in_the_loop(
     estimator: a fresh one on a simulator of a task, such as ``sipe.get_estimator("Pendulum", "simopt", budget=1000)``; it brings
     prior, budget and seed, and is the run's own from then on. reference: a variant's name or theta (N,), which may lie outside
     [0, 1]. updates: iterations. trajectories: taken from the reference for each; trajectory_steps: of each, default an
-    episode or its first 250. demonstrations: from which ``settings.demonstration_share`` of each batch is taken. evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
+    episode or its first 250. demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is
+    taken; given with a share alone. evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
     folder: where ``history.csv``, ``result.json``, ``policy.safetensors``, ``posterior`` and a checkpoint, written at each update, are
     kept; resume: go on from there, to the result of an undisturbed run.
 

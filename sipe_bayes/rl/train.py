@@ -63,12 +63,14 @@ def train(
     evaluation_episodes: int = 10,
     checkpoint_every: int = 25_000,
     threads: int = 1,
+    device: str = "cpu",
     report: Report | None = None,
 ) -> Policy:
     """Train for ``steps`` control steps and return the expert; see the module for what ``folder`` holds then.
 
-    randomization: what each episode draws; without one all run in the published model. resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than before; the result is that
-    of an uninterrupted run. Raises ValueError for arguments out of range, and for a folder that holds another run or,
+    randomization: what each episode draws; without one all run in the published model. device: where the networks learn, "cpu" or
+    "cuda"; a run may go on on the other. resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than
+    before; the result is that of an uninterrupted run. Raises ValueError for arguments out of range, and for a folder that holds another run or,
     without ``resume``, any.
     """
     task = make_task(task) if isinstance(task, str) else task
@@ -84,7 +86,7 @@ def train(
         raise ValueError(
             f"--out {folder}: holds a run already; add --resume to go on with it, or choose another folder"
         )
-    trainer = Trainer(task, settings, seed, randomization, demonstrations, threads)
+    trainer = Trainer(task, settings, seed, randomization, demonstrations, threads, device)
     described = {
         "task": task.name,
         "model": trainer.episodes.simulator.checksum(),

@@ -31,7 +31,7 @@ class Trainer:
     """An agent, its replay buffer and the lanes that it acts in. ``steps`` counts control steps, of all lanes together.
 
     randomization: what each episode draws; without one it runs in the published model. demonstrations: trajectories with rewards, from which
-    ``settings.demonstration_share`` of each batch is taken.
+    ``settings.demonstration_share`` of each batch is taken. device: of the networks.
     """
 
     def __init__(
@@ -42,6 +42,7 @@ class Trainer:
         randomization: Randomization | None = None,
         demonstrations: Trajectories | None = None,
         threads: int = 1,
+        device: str = "cpu",
     ) -> None:
         if bool(settings.demonstration_share) != (demonstrations is not None):
             raise ValueError(
@@ -54,7 +55,7 @@ class Trainer:
         streams = np.random.SeedSequence(seed).spawn(5 + settings.lanes)
         initial, self._noise, self._picks, self._draws, *lanes, last = (np.random.default_rng(s) for s in streams)
         size = len(task.channels)
-        self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial)
+        self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial, device)
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
         ending = {"allow_outside": True, "end_hopeless": settings.end_hopeless}
