@@ -92,6 +92,7 @@ def test_the_environments_parameters_decide() -> None:
         assert np.abs(found.observations - quietly("Pendulum", steps=30).observations).max() > 0.01
 
 
+@pytest.mark.usefixtures("agents")
 @pytest.mark.parametrize("name", list(TASKS))
 def test_every_task_can_be_excited(name: str) -> None:
     """From the task's own starting states, within the bounds of its actions; meshes are compiled once a task."""
