@@ -402,6 +402,8 @@ def test_settings_out_of_range_are_refused() -> None:
             Settings(**settings)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="capacity: expected room for more than an episode of 200"):
         Trainer(sipe.make_task("Pendulum"), Settings(capacity=100))
+    with pytest.raises(ValueError, match="device: 'tpu' is not available here; use 'cpu'"):
+        Trainer(sipe.make_task("Pendulum"), Settings(), device="tpu")
     assert Settings(lanes=4).deviations() == {"lanes": 4}
 
 
