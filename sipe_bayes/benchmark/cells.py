@@ -16,8 +16,8 @@ its file and one line. The prior and its mean are cells as well: no table stands
 Deviations. The paper sweeps and runs its ablation on unnamed variants; here they are the in-distribution one, as the default model
 lies at the centre of the range, where knowing nothing is a perfect guess. Its five environments with a policy are not all named;
 here they are one of each kind. Its search is taken as a full grid, without the combinations in which a value has no effect. The settings with a
-policy train the agents of ``benchmark.transfer``. The humanoid's trajectories take 100 control steps: one costs a millisecond of CPU, and
-with the 250 of the half-cheetah it would take half of the direct suite's time.
+policy train the agents of ``benchmark.transfer``. The humanoid's trajectories take 100 control steps, not 250: each costs a millisecond
+of CPU, ten times a half-cheetah's.
 """
 
 from __future__ import annotations

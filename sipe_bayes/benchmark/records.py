@@ -40,13 +40,8 @@ class Record:
     FOLDER: ClassVar[str] = ""  # of records and plan, in a folder of results
     NONE: ClassVar[str] = "no records; make some with `sipe benchmark run"
     NEVER: ClassVar[str] = "no run was started in it; start one with `sipe benchmark run"
-    FIXED: ClassVar[tuple[str, ...]] = (
-        "budget",
-        "steps",
-        "training",
-        "agent",
-        "versions",
-    )  # alike in all runs of a cell in one folder
+    # alike in all runs of a cell in one folder:
+    FIXED: ClassVar[tuple[str, ...]] = ("budget", "steps", "training", "agent", "versions")
 
     id: str
     task: str
