@@ -93,7 +93,8 @@ _GOAL_AGENT: dict[str, Any] = {
 @dataclass(frozen=True)
 class TransferRecord(Record):
     """Of one agent. As ``Record``, with: estimator: the randomisation; setting: "transfer" and its variations; values: the variations;
-    mean and sd: of the randomisation, in theta; seconds: of the training. evaluation: ``rl.evaluation.evaluate`` of EPISODES episodes in the target, and random: the same of a policy that acts at
+    mean and sd: of the randomisation, in theta; seconds: of the training. evaluation: ``rl.evaluation.evaluate`` of EPISODES
+    episodes in the target, and random: the same of a policy that acts at
     random; curve: rows of step, own_return (in simulators drawn from the randomisation), target_return and target_success; kept: the step
     of the evaluated policy; converged: whether it solves simulators drawn from the randomisation, solved_reference: whether it solves the
     target; redrawn: theta that no model can have, diverged: episodes, in training.
