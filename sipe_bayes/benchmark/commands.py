@@ -123,7 +123,8 @@ def simulate(
     variant: Annotated[str, typer.Option(help="Whose trajectory is replayed.")] = "in_distribution",
     seed: Annotated[int, typer.Option(help="Of the simulations and the trajectory.")] = 0,
     steps: Annotated[
-        int | None, typer.Option(help="Control steps; default an episode, at most 250, the humanoid's 100.")
+        int | None,
+        typer.Option(help="Control steps; default an episode, at most 250, 100 of the humanoid and the hand."),
     ] = None,
     verify: Annotated[
         bool, typer.Option("--verify", help="Check what is there; exit code 1 where it is wrong.")
