@@ -21,7 +21,7 @@ are predicted by the step that led to the sample, so that process noise does not
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import mujoco
@@ -39,6 +39,8 @@ BoolArray = NDArray[np.bool_]
 
 _THETA_STEP = 1e-4  # finite differences, of the unit cube
 _STATE_STEP = 1e-5  # rad or m, rad/s or m/s
+KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known: position, velocity, activation
+_LEAST_MOVEMENT = 1e-2
 _LEAST_SD = 1e-6  # of a channel's or coordinate's size: noise below it is not told from rounding
 
 
@@ -47,12 +49,18 @@ class StateSpace:
     """States unknown at every sample; measurement and process noise inferred. For ``laplace`` and ``mcmc``.
 
     fit: names of the channels that count, default all. noise_sd: given sd per channel in its unit, None where it is
-    inferred.
+    inferred. starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known, the others are left
+    aside.
     """
 
     fit: tuple[str, ...] | None = None
     noise_sd: tuple[float | None, ...] | None = None
+    starts: str = "estimated"
     noise: ClassVar[str] = "white"
+
+    def __post_init__(self) -> None:
+        if self.starts not in ("estimated", "recorded"):
+            raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
 
     def bind(self, simulator: Any, trajectories: Trajectories) -> Any:
         """The Chain of the trajectories; raises ValueError for logs or simulators that do not fit."""
@@ -86,14 +94,21 @@ class Chain:
         self.actions = trajectories.actions[self.log, last][:, None]
         self._read(trajectories)
         environment, model = simulator.environment, simulator.model
+        known = settings.starts == "recorded"
+        if known and trajectories.states is None:
+            raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
-        reference = np.concatenate([_measured_states(simulator, t) for t in trajectories])
+        logs = [replace(t, states=None) if known else t for t in trajectories]
+        reference = np.concatenate([_measured_states(simulator, t) for t in logs])
+        if known:
+            reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
         reference[:, 0] = 0.0
         timestep = np.array([simulator.physics_steps(float(d))[1] for d in self.dt])
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt) if model.nhistory else []
         self.reference = environment.history(model, reference, past, timestep)
         self.sizes = (model.nv, model.nv, model.na)
-        self.prior_precision = np.where(self.first[:, None], np.repeat(START_SD, self.sizes) ** -2.0, 0.0)
+        start_sd = KNOWN_SD if known else START_SD
+        self.prior_precision = np.where(self.first[:, None], np.repeat(start_sd, self.sizes) ** -2.0, 0.0)
 
     def _read(self, trajectories: Trajectories) -> None:
         environment = self.simulator.environment
@@ -145,7 +160,7 @@ class Chain:
     def placed(self) -> BoolArray:
         """Which coordinates (D,) belong to a degree of freedom or an activation that a channel or a recorded state tells."""
         nv = self.sizes[0]
-        if self.trajectories.states is not None:
+        if self.trajectories.states is not None and self.settings.starts == "estimated":
             return np.full(self.num_start, True)
         seen = np.isin(np.arange(self.num_start), [c for c in self.coordinates if c is not None])
         either = seen[:nv] | seen[nv : 2 * nv]
@@ -163,6 +178,27 @@ class Chain:
         spread = self.difference(self.reference, self.reference[:1])
         states = np.sqrt((spread**2).mean(0))
         return _floor(sizes), _floor(states)
+
+    def predicted(self, theta: FloatArray) -> FloatArray | None:
+        """States (K, S) that the commands lead to at theta (N,) from where each log begins; None where that diverges."""
+        logs, first = self.trajectories, self.reference[self.first]
+        theta, names = np.tile(theta, (len(logs), 1)), list(logs.names)
+        goals = None if self.goals is None else self.goals[self.first]
+        self._spend(len(logs))
+        result = self.simulator.rollout(theta, logs.actions, first, logs.dt, names, goals=goals)
+        assert result.states is not None
+        if not result.valid[self.log, self.sample].all():
+            return None
+        return self.moved(self.reference, self.difference(result.states[self.log, self.sample], self.reference))
+
+    def movement(self, states: FloatArray) -> FloatArray:
+        """How far (D,) states (K, S) move in a control step: root mean squares, at least a hundredth of the largest of positions,
+        velocities or activations."""
+        steps = self.difference(states[1:], states[:-1])[self.linked]
+        found = np.sqrt((steps**2).mean(0))
+        kinds = [part for part in np.split(found, np.cumsum(self.sizes)[:-1]) if len(part)]
+        usual = np.concatenate([np.full(len(part), part.max()) for part in kinds])
+        return np.maximum(np.maximum(found, _LEAST_MOVEMENT * usual), self.least[1])
 
     def moved(self, states: FloatArray, tangent: FloatArray) -> FloatArray:
         """States (..., S) moved by tangents (..., D)."""
@@ -189,16 +225,14 @@ class Chain:
         valid (B, K). at (K,): which of the chain's states these are, default all."""
         at = np.arange(len(self.log)) if at is None else at
         batch = len(theta)
-        cost = self._part + batch * len(self.trajectories) * len(at) / len(self.log)
-        if self.rollouts + math.ceil(cost) > self.budget:
-            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost:.0f}")
-        self.rollouts, self._part = self.rollouts + int(cost), cost % 1.0
+        self._spend(batch * len(self.trajectories) * len(at) / len(self.log))
+        lanes, names = np.repeat(theta, len(at), axis=0), [self.names[k] for k in at] * batch
         result = self.simulator.rollout(
-            np.repeat(theta, len(at), axis=0),
+            lanes,
             np.tile(self.actions[at], (batch, 1, 1)),
             states.reshape(batch * len(at), -1),
             np.tile(self.dt[at], batch),
-            [self.names[k] for k in at] * batch,
+            names,
             goals=None if self.goals is None else np.tile(self.goals[at], (batch, 1)),
         )
         shape = (batch, len(at))
@@ -208,6 +242,12 @@ class Chain:
         sound = result.valid[:, 0] & (result.valid[:, 1] | ~np.tile(goes_on, batch))
         predicted = np.where(self.late, seen[:, 1], seen[:, 0]).reshape(*shape, -1)
         return predicted, result.states[:, 1].reshape(*shape, -1), sound.reshape(shape)
+
+    def _spend(self, cost: float) -> None:
+        cost += self._part
+        if self.rollouts + math.ceil(cost) > self.budget:
+            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost:.0f}")
+        self.rollouts, self._part = self.rollouts + int(cost), cost % 1.0
 
     def _compared(self, theta_states: FloatArray, predicted: FloatArray, ends: FloatArray) -> dict[str, Any]:
         """Residual, jump and offset of states (K, S), and the masks."""

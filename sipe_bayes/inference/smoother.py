@@ -12,11 +12,13 @@ state is sharper than its measurement, so after each of the first few estimates 
 (B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 1979) runs through the logs and linearises each step where it stands;
 Gauss-Newton goes on from its states where that ends lower.
 
-It begins with states as measured and, where every coordinate is, theta by reweighted least squares of the jumps, weights of
-a Student t with four degrees of freedom: contacts amplify the noise of a measurement manyfold.
+It begins with states as measured, and theta by reweighted least squares of the jumps, weights of a Student t with four degrees of
+freedom: contacts amplify the noise of a measurement manyfold. Where some coordinate is not measured, it begins with the filter's states
+about those that the commands lead to.
 
-Deviations: the noise is held at its optimum, the posterior of theta does not widen for it; in the filter, channels that are
-read late are left out; it only proposes.
+Deviations: the noise is held at its optimum, the posterior of theta does not widen for it; a coordinate's process noise has an
+exponential prior whose mean is the coordinate's movement in a control step, as the likelihood leaves that of an unmeasured one open; in the
+filter, channels that are read late are left out; it only proposes.
 """
 
 from __future__ import annotations
@@ -28,7 +30,6 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from sipe_bayes.inference.least_squares import FLAT_PRECISION, QuadraticPrior, box_step
-from sipe_bayes.likelihood import START_SD
 from sipe_bayes.state_space import Chain
 from sipe_bayes.tridiagonal import (
     Border,
@@ -47,7 +48,9 @@ _SPAN, _SEARCH = np.log(10.0), 12  # how far a noise sd may move at a time, step
 _FREEDOM = 4.0  # of the Student t
 _WIDER = 4.0  # of the first state's covariance, where the filter begins
 _FILTER_STEP = 1e-5
-_FREE = 0.1  # of the first state's prior sd: process noise of coordinates that nothing measures, a second for positions
+_FREE = 0.1  # of a coordinate's movement in a control step: process noise where not every coordinate is measured
+_STIFFEST = 1e-5  # of a coordinate's movement: process noise at least, for the sake of rounding
+_NEVER = 1e300  # nats
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,11 @@ def descend(
     value, damping = energy(found, noise) + penalty(prior, here.theta), here.damping
     hold = border(prior, here.theta, np.zeros_like(here.theta))
     while damping <= _DAMPING_MAX:
-        solved = eliminate(found, noise, damping)
+        try:
+            solved = eliminate(found, noise, damping)
+        except np.linalg.LinAlgError:
+            damping = max(damping, 1e-4) * _DAMPING_UP
+            continue
         hessian, gradient = solved.precision + hold.precision, solved.gradient + hold.pull
         move = box_step(hessian, gradient, here.theta, damping)
         expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * solved.explained
@@ -99,13 +106,19 @@ def descend(
 
 
 def infer_noise(
-    chain: Chain, found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray
+    chain: Chain,
+    found: ChainLinearisation,
+    noise: ChainNoise,
+    prior: QuadraticPrior,
+    theta: FloatArray,
+    movement: FloatArray,
 ) -> tuple[ChainNoise, float]:
     """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten, and the nats
-    that it gains."""
+    that it gains. movement (D,): means of the process noises' exponential priors."""
     channels, fixed = len(noise.sd), chain.fixed_sd
     hold = border(prior, theta, eliminate(found, noise).gradient)
-    least = np.log(np.concatenate(chain.least))
+    least_sd, least_process = chain.least
+    least = np.log(np.concatenate([least_sd, np.maximum(least_process, _STIFFEST * movement)]))
     start = np.maximum(np.log(np.concatenate([noise.sd, noise.process])), least)
     free = np.concatenate([np.isnan(fixed), np.full(len(noise.process), True)])
 
@@ -116,8 +129,13 @@ def infer_noise(
         return ChainNoise(sd, np.exp(everything[channels:]))
 
     def objective(logs: FloatArray) -> tuple[float, FloatArray]:
-        value, by_sd, by_process = restricted(found, split(logs), hold)
-        return -value, -np.concatenate([by_sd, by_process])[free]
+        tried = split(logs)
+        try:
+            value, by_sd, by_process = restricted(found, tried, hold)
+        except np.linalg.LinAlgError:  # so far apart that rounding rules
+            return _NEVER, np.zeros(len(logs))
+        unlikely = tried.process / movement
+        return float(unlikely.sum()) - value, np.concatenate([-by_sd, unlikely - by_process])[free]
 
     bounds = [(max(low, s - _SPAN), s + _SPAN) for low, s in zip(least[free], start[free], strict=True)]
     before = objective(start[free])[0]
@@ -141,18 +159,16 @@ def scale(found: ChainLinearisation) -> FloatArray:
     return np.asarray(np.maximum(size, 1e-9 * max(float(size.max()), 1e-300)))
 
 
-def first_noise(chain: Chain, found: ChainLinearisation) -> ChainNoise:
+def first_noise(chain: Chain, found: ChainLinearisation, movement: FloatArray) -> ChainNoise:
     """A guess from the first guess of the states. Measurement noise: what third differences of a channel leave, at most a
-    third of the jumps of the coordinate that it measures. Process noise: as large as the jumps, or for coordinates that no
-    channel measures so large that they can follow."""
+    third of the jumps of the coordinate that it measures. Process noise: as large as the jumps, or where some coordinate is
+    not measured a share of its movement."""
     jumps, fixed = scale(found), chain.fixed_sd
     least_sd, least_process = chain.least
-    direct = np.array([np.inf if c is None else jumps[c] / 3 for c in chain.coordinates])
+    whole = chain.placed.all()
+    direct = np.array([np.inf if c is None or not whole else jumps[c] / 3 for c in chain.coordinates])
     sd = np.where(np.isnan(fixed), np.maximum(np.minimum(_roughness(chain), direct), least_sd), fixed)
-    free = (
-        _FREE * np.repeat(START_SD, chain.sizes) * np.where(np.arange(len(jumps)) < chain.sizes[0], chain.dt.max(), 1.0)
-    )
-    return ChainNoise(sd, np.where(chain.placed, np.maximum(jumps, least_process), free))
+    return ChainNoise(sd, np.maximum(jumps if whole else _FREE * movement, least_process))
 
 
 def _roughness(chain: Chain) -> FloatArray:

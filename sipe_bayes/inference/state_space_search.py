@@ -62,6 +62,7 @@ def _begin(chain: Chain, theta: FloatArray) -> State:
         "states": chain.reference,
         "sd": np.ones(len(chain.channels)),
         "process": np.ones(chain.num_start),
+        "movement": np.ones(chain.num_start),
         "damping": 1e-4,
         "iteration": 0,
         "round": 0,
@@ -113,7 +114,7 @@ def step(search: Search, chain: Chain, state: State) -> State:
         here, still = descend(chain, found, noise, prior, here, _TOLERANCE)
         if not still:
             return {**state, **_at(here), "due": state["inner"] >= _INNER[min(state["round"], 1)]}
-    better, gain = infer_noise(chain, found, noise, prior, here.theta)
+    better, gain = infer_noise(chain, found, noise, prior, here.theta, state["movement"])
     last = state["round"] >= _ROUNDS
     if state["round"] and ((gain < _SETTLED and still) or last):
         if last:
@@ -142,8 +143,7 @@ def _at(point: Point) -> State:
 
 def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisation) -> State:
     if not chain.placed.all():
-        noise = first_noise(chain, found)
-        return {**state, "held": False, "sd": noise.sd, "process": noise.process}
+        return _followed(chain, state)
     theta = regress(found, search.quadratic_prior, state["theta"])
     still = np.abs(theta - state["theta"]).max() < _STILL or state["iteration"] + 1 >= _REGRESSIONS
     state = {**state, "theta": theta, "iteration": state["iteration"] + 1, "held": not still}
@@ -151,9 +151,24 @@ def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisa
         return state
     if any(np.abs(theta - earlier).max() < _SAME for earlier in state["regressed"]):
         return _next(chain, state)
-    noise = first_noise(chain, found)
+    movement = chain.movement(state["states"])
+    noise = first_noise(chain, found, movement)
     regressed = np.concatenate([state["regressed"], theta[None]])
-    return {**state, "sd": noise.sd, "process": noise.process, "regressed": regressed}
+    return {**state, "sd": noise.sd, "process": noise.process, "movement": movement, "regressed": regressed}
+
+
+def _followed(chain: Chain, state: State) -> State:
+    """Where some coordinate is not measured: the filter's states, about those that the commands lead to."""
+    theta, states = state["theta"], chain.predicted(state["theta"])
+    states = state["states"] if states is None else states
+    found = chain.linearise(theta, states)
+    if found is None:
+        return _next(chain, state)
+    movement = chain.movement(states)
+    noise = first_noise(chain, found, movement)
+    better = filtered(chain, found, noise, theta, states)
+    known = {"sd": noise.sd, "process": noise.process, "movement": movement}
+    return {**state, **known, "held": False, "states": states if better is None else better}
 
 
 def _refiltered(
