@@ -1,0 +1,84 @@
+"""The tables and SiPE plots of the committed benchmark, from its records.
+
+    sipe benchmark run --suite direct --out results            # the records, some hours on two cores; the same command goes on
+    sipe benchmark run --suite learned_reward --out results
+    sipe benchmark run --suite gradient_steps --out results
+    python examples/studies/benchmark.py                       # results/README.md and its pictures
+
+`sipe benchmark report results` says the same and more, as a page and as a PDF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from sipe_bayes.atomic import write_text
+from sipe_bayes.benchmark.report_contents import Contents, Picture, Section, contents
+from sipe_bayes.benchmark.status import headline, summary
+from sipe_bayes.benchmark.tables import Entry, Table
+
+RESULTS = Path(__file__).parents[2] / "results"
+SHOWN = (
+    "direct-in_distribution",
+    "direct-default",
+    "direct-out_of_distribution",
+    "direct-against-learned_reward",
+    "gradient-steps",
+)
+PICTURES = ("direct-in_distribution-compared0", "direct-in_distribution-compared1", "gradient-steps")
+
+
+def cell(entry: Entry | None) -> str:
+    if entry is None:
+        return ""
+    mean, error = entry.texts()
+    text = f"{mean} ± {error}" if error else mean
+    return f"**{text}**" if entry.best else text
+
+
+def rows(table: Table) -> Iterator[str]:
+    yield f"\n**{table.measure.name}**: {table.measure.meaning}\n"
+    yield "| | " + " | ".join(table.columns) + " |"
+    yield "|---" * (len(table.columns) + 1) + "|"
+    for name, entries in table.rows:
+        yield f"| `{name}` | " + " | ".join(map(cell, entries)) + " |"
+
+
+def drawn(picture: Picture) -> Iterator[str]:
+    picture.figure.savefig(RESULTS / f"{picture.name}.png", dpi=110)
+    yield f"\n![{picture.caption}]({picture.name}.png)\n\n{picture.caption}\n"
+
+
+def section(found: Section) -> Iterator[str]:
+    yield f"\n## {found.title}\n"
+    yield from (f"- {sentence}" for sentence in found.sentences)
+    for picture in found.pictures:
+        if picture.name in PICTURES:
+            yield from drawn(picture)
+    for table in found.tables:
+        yield from rows(table)
+
+
+def page(found: Contents) -> Iterator[str]:
+    state = summary(RESULTS)
+    yield "# The benchmark\n"
+    yield f"{headline(state).split(': ', 1)[1]}. Means and standard errors over seeds; bold is the best outside noise.\n"
+    yield from (f"- {label}: {text}" for label, text in found.facts if label != "command")
+    seconds, cpu = (sum(run[name] for run in state["runs"]) / 3600 for name in ("seconds", "cpu_seconds"))
+    simulating = [run["simulating"] for run in state["runs"]]
+    share = sum(s["cpu_seconds"] for s in simulating) / (2 * sum(s["seconds"] for s in simulating))
+    yield f"- wall time: {seconds:.1f} h on two cores, {cpu:.1f} h of CPU; CPU use while simulating {share:.0%}"
+    yield "- made by `sipe benchmark run --out results` with the suites direct, learned_reward and gradient_steps"
+    for part in found.sections:
+        if part.anchor in SHOWN:
+            yield from section(part)
+
+
+def main() -> None:
+    write_text(RESULTS / "README.md", "\n".join(page(contents(RESULTS))) + "\n")
+    print(RESULTS / "README.md")
+
+
+if __name__ == "__main__":
+    main()
