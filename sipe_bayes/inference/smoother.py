@@ -49,6 +49,7 @@ _FREEDOM = 4.0  # of the Student t
 _WIDER = 4.0  # of the first state's covariance, where the filter begins
 _FILTER_STEP = 1e-5
 _FREE = 0.1  # of a coordinate's movement in a control step: process noise where not every coordinate is measured
+_SHARES = (1.0, 0.1, 0.01, 1e-3)  # of that, to begin with
 _STIFFEST = 1e-5  # of a coordinate's movement: process noise at least, for the sake of rounding
 _NEVER = 1e300  # nats
 
@@ -169,6 +170,21 @@ def first_noise(chain: Chain, found: ChainLinearisation, movement: FloatArray) -
     direct = np.array([np.inf if c is None or not whole else jumps[c] / 3 for c in chain.coordinates])
     sd = np.where(np.isnan(fixed), np.maximum(np.minimum(_roughness(chain), direct), least_sd), fixed)
     return ChainNoise(sd, np.maximum(jumps if whole else _FREE * movement, least_process))
+
+
+def quietest(
+    chain: Chain, found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray
+) -> ChainNoise:
+    """The noise with its process noise as small as the likelihood of one linearisation likes best, of a few shares."""
+    tried = [ChainNoise(noise.sd, np.maximum(share * noise.process, chain.least[1])) for share in _SHARES]
+
+    def value(one: ChainNoise) -> float:
+        try:
+            return restricted(found, one, border(prior, theta, eliminate(found, one).gradient))[0]
+        except np.linalg.LinAlgError:
+            return -np.inf
+
+    return max(tried, key=value)
 
 
 def _roughness(chain: Chain) -> FloatArray:

@@ -1,6 +1,7 @@
 """What ``laplace`` does step by step with a ``StateSpace``: from starting point to recorded optimum, in a flat state.
 
-A search regresses theta on the measured states, then smooths and infers the noise in turn (``inference.smoother``). The
+A search regresses theta on the measured states, then smooths and infers the noise in turn (``inference.smoother``). Where the logs'
+first states are known, it begins at the optima of whole logs without process noise (``window_search``). The
 optimum's normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of. A later
 starting point is dropped once its regression ends where an earlier one did.
 """
@@ -11,8 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.inference import window_search
 from sipe_bayes.inference.least_squares import QuadraticPrior
-from sipe_bayes.inference.optima import Search
+from sipe_bayes.inference.optima import Search, distinct_modes
 from sipe_bayes.inference.smoother import (
     Point,
     border,
@@ -21,10 +23,12 @@ from sipe_bayes.inference.smoother import (
     first_noise,
     infer_noise,
     penalty,
+    quietest,
     regress,
     scale,
 )
 from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetExhausted, Segments
 from sipe_bayes.state_space import Chain
 from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
 
@@ -42,7 +46,9 @@ _SAME = 0.02  # distance of regressed thetas that is none
 
 def start(search: Search, chain: Chain) -> State:
     """The first state of a fit."""
-    points = _screened(search, chain) if search.initial is None else search.initial
+    points = search.initial
+    if points is None:
+        points = _shot(search, chain) if chain.settings.starts == "recorded" else _screened(search, chain)
     n, (k, d), c = chain.num_theta, chain.prior_precision.shape, len(chain.channels)
     shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
     shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "evidence": ()}
@@ -91,6 +97,23 @@ def _screened(search: Search, chain: Chain) -> FloatArray:
     order = np.argsort(np.log(sizes).sum(1), kind="stable")
     chosen = [good[k] for k in order if good[k] != 0]
     return points[([0] if good[0] == 0 else []) + chosen][: search.restarts]
+
+
+def _shot(search: Search, chain: Chain) -> FloatArray:
+    """Starting points (R, N) where the logs' first states are known: the optima of whole logs without process noise."""
+    likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
+    windows = likelihood.bind(chain.simulator, chain.trajectories)
+    windows.rollouts, windows.budget = chain.rollouts, chain.budget
+    state = window_search.start(search, windows)
+    try:
+        while not state["done"]:
+            state = window_search.step(search, windows, state)
+    except BudgetExhausted:
+        if not len(state["mode_theta"]):
+            raise
+    chain.rollouts = windows.rollouts
+    best = distinct_modes(state)[: search.restarts]
+    return np.asarray(state["mode_theta"][best])
 
 
 def step(search: Search, chain: Chain, state: State) -> State:
@@ -143,7 +166,7 @@ def _at(point: Point) -> State:
 
 def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisation) -> State:
     if not chain.placed.all():
-        return _followed(chain, state)
+        return _followed(search, chain, state)
     theta = regress(found, search.quadratic_prior, state["theta"])
     still = np.abs(theta - state["theta"]).max() < _STILL or state["iteration"] + 1 >= _REGRESSIONS
     state = {**state, "theta": theta, "iteration": state["iteration"] + 1, "held": not still}
@@ -157,7 +180,7 @@ def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisa
     return {**state, "sd": noise.sd, "process": noise.process, "movement": movement, "regressed": regressed}
 
 
-def _followed(chain: Chain, state: State) -> State:
+def _followed(search: Search, chain: Chain, state: State) -> State:
     """Where some coordinate is not measured: the filter's states, about those that the commands lead to."""
     theta, states = state["theta"], chain.predicted(state["theta"])
     states = state["states"] if states is None else states
@@ -165,7 +188,7 @@ def _followed(chain: Chain, state: State) -> State:
     if found is None:
         return _next(chain, state)
     movement = chain.movement(states)
-    noise = first_noise(chain, found, movement)
+    noise = quietest(chain, found, first_noise(chain, found, movement), search.quadratic_prior, theta)
     better = filtered(chain, found, noise, theta, states)
     known = {"sd": noise.sd, "process": noise.process, "movement": movement}
     return {**state, **known, "held": False, "states": states if better is None else better}
