@@ -230,7 +230,8 @@ class Windows:
                 pieces.append((k, start, min(steps, len(trajectory) - start)))
         self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
         self.dt = trajectories.dt[self.log]
-        self.names = [trajectories.names[k] for k in self.log]
+        names = trajectories.names or (None,) * len(trajectories)
+        self.names = [names[k] for k in self.log]
 
     def _read_samples(self, trajectories: Trajectories) -> None:
         simulator, environment = self.simulator, self.simulator.environment

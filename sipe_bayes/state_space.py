@@ -12,7 +12,7 @@ https://doi.org/10.1137/0804035).
 
 The state's coordinates are tangents (dq (nv), dv (nv), dact (na)), so quaternions stay of length one; a difference of two
 states is MuJoCo's mj_differentiatePos. The first state of a log has a normal prior about the measured one whose sd is far
-wider than any measurement; command histories of delayed actuators are taken as commanded.
+wider than any measurement, or, where it is known, about the recorded one with an sd far narrower; command histories of delayed actuators are taken as commanded.
 
 Deviations from the textbooks: measurement channels that the environment reads one physics step late (``derived_late``)
 are predicted by the step that led to the sample, so that process noise does not reach them.
@@ -78,18 +78,19 @@ class Chain:
     """Recorded trajectories as K unknown states in a row, T + 1 of each log; states of different logs are not linked.
 
     log, sample (K,): where a state belongs. measured, observed (K, C): what the simulation that starts there predicts.
-    rollouts, budget: as ``likelihood.Windows`` counts them."""
+    rollouts, budget: as ``likelihood.Windows`` counts them; part: of a rollout, not counted yet."""
 
     def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
-        self.rollouts, self._part, self.budget = 0, 0.0, math.inf
+        self.rollouts, self.part, self.budget = 0, 0.0, math.inf
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
         steps = trajectories.length
         self.log = np.repeat(np.arange(len(trajectories)), steps + 1)
         self.sample = np.concatenate([np.arange(n + 1) for n in steps])
         self.first, self.linked = self.sample == 0, self.log[1:] == self.log[:-1]
         self.dt = trajectories.dt[self.log]
-        self.names = [trajectories.names[k] for k in self.log]
+        names = trajectories.names or (None,) * len(trajectories)
+        self.names = [names[k] for k in self.log]
         last = np.minimum(self.sample, steps[self.log] - 1)
         self.actions = trajectories.actions[self.log, last][:, None]
         self._read(trajectories)
@@ -158,7 +159,8 @@ class Chain:
 
     @property
     def placed(self) -> BoolArray:
-        """Which coordinates (D,) belong to a degree of freedom or an activation that a channel or a recorded state tells."""
+        """Which coordinates (D,) belong to a degree of freedom or an activation that a channel tells, or with estimated starts a recorded
+        state."""
         nv = self.sizes[0]
         if self.trajectories.states is not None and self.settings.starts == "estimated":
             return np.full(self.num_start, True)
@@ -182,7 +184,7 @@ class Chain:
     def predicted(self, theta: FloatArray) -> FloatArray | None:
         """States (K, S) that the commands lead to at theta (N,) from where each log begins; None where that diverges."""
         logs, first = self.trajectories, self.reference[self.first]
-        theta, names = np.tile(theta, (len(logs), 1)), list(logs.names)
+        theta, names = np.tile(theta, (len(logs), 1)), list(logs.names) or None
         goals = None if self.goals is None else self.goals[self.first]
         self._spend(len(logs))
         result = self.simulator.rollout(theta, logs.actions, first, logs.dt, names, goals=goals)
@@ -244,10 +246,10 @@ class Chain:
         return predicted, result.states[:, 1].reshape(*shape, -1), sound.reshape(shape)
 
     def _spend(self, cost: float) -> None:
-        cost += self._part
+        cost += self.part
         if self.rollouts + math.ceil(cost) > self.budget:
             raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost:.0f}")
-        self.rollouts, self._part = self.rollouts + int(cost), cost % 1.0
+        self.rollouts, self.part = self.rollouts + int(cost), cost % 1.0
 
     def _compared(self, theta_states: FloatArray, predicted: FloatArray, ends: FloatArray) -> dict[str, Any]:
         """Residual, jump and offset of states (K, S), and the masks."""

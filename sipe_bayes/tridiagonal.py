@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_JITTER = (0.0, 1e-12, 1e-10, 1e-8)  # of the diagonal, as far as rounding asks for it
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 
 
@@ -116,7 +115,7 @@ def eliminate(found: ChainLinearisation, noise: ChainNoise, damping: float = 0.0
     driven = links[..., None] * found.transition_theta
     cross[:-1] += back @ driven
     cross[1:] -= driven
-    factor = _factorised(_banded(diagonal, -onward))
+    factor = scipy.linalg.cholesky_banded(_banded(diagonal, -onward), lower=True, check_finite=False)
     force = pull(found, noise)
     right = np.concatenate([cross, force[..., None]], axis=-1).reshape(length * size, -1)
     solved = scipy.linalg.cho_solve_banded((factor, True), right, check_finite=False).reshape(*pull_shape, -1)
@@ -128,19 +127,6 @@ def eliminate(found: ChainLinearisation, noise: ChainNoise, damping: float = 0.0
     gradient += np.einsum("kdn,kd->n", driven, found.jump) - np.einsum("kdn,kd->n", cross, shift)
     determinant = 2 * float(np.log(factor[0]).sum())
     return Eliminated(factor, slope, shift, precision, gradient, float((force * shift).sum()), determinant)
-
-
-def _factorised(bands: FloatArray) -> FloatArray:
-    """Cholesky factor of a banded matrix (2D, K D), positive definite but for rounding; raises LinAlgError where that rules."""
-    whole = bands[0].copy()
-    for share in _JITTER[:-1]:
-        bands[0] = whole * (1 + share)
-        try:
-            return np.asarray(scipy.linalg.cholesky_banded(bands, lower=True, check_finite=False))
-        except np.linalg.LinAlgError:
-            continue
-    bands[0] = whole * (1 + _JITTER[-1])
-    return np.asarray(scipy.linalg.cholesky_banded(bands, lower=True, check_finite=False))
 
 
 def _banded(diagonal: FloatArray, below: FloatArray) -> FloatArray:

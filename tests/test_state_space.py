@@ -13,7 +13,7 @@ import torch
 import sipe_bayes as sipe
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.mcmc import MCMC
-from sipe_bayes.inference.smoother import Point, border, descend, first_noise, infer_noise
+from sipe_bayes.inference.smoother import Point, border, descend, first_noise, infer_noise, sound
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.likelihood import START_SD
 from sipe_bayes.parameters import Parameter
@@ -128,6 +128,8 @@ def test_a_recorded_start_is_believed_and_the_other_states_are_not() -> None:
         assert log.states is not None
         log.states[0] = 0.0, 0.3, 0.0
     chain = StateSpace(noise_sd=(SD,), starts="recorded").bind(spring(), Trajectories.stack(logs))
+    measured = StateSpace(noise_sd=(SD,)).bind(spring(), Trajectories.stack(spring_logs())).reference
+    np.testing.assert_array_equal(chain.reference[~chain.first], measured[~chain.first])
     found = chain.linearise(np.array([0.35]), chain.reference)
     assert found is not None
     value = log_likelihood(found, MADE_WITH, eliminate(found, MADE_WITH))
@@ -136,9 +138,8 @@ def test_a_recorded_start_is_believed_and_the_other_states_are_not() -> None:
     )
 
 
-def test_what_nothing_measures_is_followed() -> None:
-    """A mass hung on another one by a spring of unknown stiffness, the upper one's position measured: 12 logs from a known start,
-    of the 12 intervals of 90 % at least 8 hold the truth (right ones fail with probability 0.4 %)."""
+def hung(num_threads: int = 1) -> Simulator:
+    """A mass hung on another one by a spring of unknown stiffness, the upper one's position measured."""
     body = (
         '<body><joint name="{0}" type="slide" axis="1 0 0" damping="0.5" stiffness="{1}"/><geom size="0.1" mass="1"/>'
     )
@@ -148,20 +149,47 @@ def test_what_nothing_measures_is_followed() -> None:
         '<actuator><motor name="m" joint="upper"/></actuator></mujoco>'
     )
     parameters = [Parameter("stiffness", LOW, HIGH, targets=("joint:lower.stiffness",))]
-    simulator = Simulator(sipe.MjcfEnvironment.build(xml, parameters, ["m"], ["joint:upper.position"]), num_threads=1)
+    environment = sipe.MjcfEnvironment.build(xml, parameters, ["m"], ["joint:upper.position"])
+    return Simulator(environment, num_threads=num_threads)
+
+
+def hung_log(theta: np.ndarray, seed: int, steps: int = 80) -> Trajectory:
+    """From rest, with 1 cm of noise and the states."""
+    simulator, actions = hung(), 4 * np.sin(np.arange(steps) * 0.12 + seed)[:, None]
+    (motion,) = simulator.rollout(theta, actions, simulator.default_state(), dt=0.02)
+    noise = 0.01 * np.random.default_rng(seed).standard_normal(motion.observations.shape)
+    return replace(motion, observations=motion.observations + noise, name=f"log{seed}")
+
+
+def test_what_nothing_measures_is_followed() -> None:
+    """Of 12 intervals of 90 % at least 8 hold the truth (right ones fail with probability 0.4 %)."""
     rng, covered = np.random.default_rng(3), 0
     for seed in range(12):
-        theta, actions = rng.uniform(0.1, 0.9, 1), 4 * np.sin(np.arange(80) * 0.12 + seed)[:, None]
-        (motion,) = simulator.rollout(theta, actions, simulator.default_state(), dt=0.02)
-        noisy = motion.observations + 0.01 * rng.standard_normal(motion.observations.shape)
-        log = replace(motion, observations=noisy)
-        estimator = Laplace(simulator, likelihood=StateSpace(starts="recorded"), restarts=1, candidates=0)
-        posterior = estimator.fit(log)
+        theta = rng.uniform(0.1, 0.9, 1)
+        estimator = Laplace(hung(), likelihood=StateSpace(starts="recorded"), restarts=1, candidates=0)
+        posterior = estimator.fit(hung_log(theta, seed))
         low, high = posterior.quantile([0.05, 0.95]).numpy()
         covered += int(low[0] <= theta[0] <= high[0])
         print(theta, posterior.mean.numpy(), posterior.stddev.numpy(), estimator.warnings)
         assert float(posterior.stddev[0]) < 0.1
     assert covered >= 8
+
+
+def test_noise_that_rounding_cannot_bear_is_raised() -> None:
+    """The process noise that ``sound`` returns is the least of a few that the equations can be solved with, and no other is touched."""
+    chain = StateSpace().bind(hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))
+    found = chain.linearise(np.array([0.4]), chain.reference)
+    assert found is not None
+    fair = ChainNoise(np.array([0.01]), np.full(4, 1e-4))
+    assert sound(found, fair) is fair
+    never = ChainNoise(np.array([0.01]), np.full(4, 1e-14))
+    with pytest.raises(np.linalg.LinAlgError):
+        eliminate(found, never)
+    raised = sound(found, never)
+    assert raised.sd is never.sd
+    assert (raised.process > never.process).all()
+    with pytest.raises(np.linalg.LinAlgError):
+        eliminate(found, ChainNoise(raised.sd, raised.process / 3))
 
 
 def random_chain(rng: np.random.Generator) -> tuple[ChainLinearisation, ChainNoise]:
@@ -388,19 +416,23 @@ def test_quaternions_stay_of_length_one() -> None:
     assert simulator.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_BALL
 
 
-def test_threads_and_an_interruption_change_no_bit(tmp_path: Path) -> None:
-    logs = spring_logs()
-    plain = Laplace(spring(), likelihood=StateSpace()).fit(logs)
-    threads = Laplace(spring(2), likelihood=StateSpace()).fit(logs)
-    interrupted = Laplace(spring(), likelihood=StateSpace(), checkpoint=tmp_path / "fit.safetensors")
+@pytest.mark.parametrize("starts", ["estimated", "recorded"])
+def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str) -> None:
+    logs = spring_logs() if starts == "estimated" else [hung_log(np.array([0.4]), 0), hung_log(np.array([0.4]), 1, 61)]
+    simulator, likelihood = spring if starts == "estimated" else hung, StateSpace(starts=starts)
+    undisturbed = Laplace(simulator(), likelihood=likelihood)
+    plain = undisturbed.fit(logs)
+    threads = Laplace(simulator(2), likelihood=likelihood).fit(logs)
+    interrupted = Laplace(simulator(), likelihood=likelihood, checkpoint=tmp_path / "fit.safetensors")
     interrupted.checkpoint_seconds = 0.0
-    interrupted.progress = _stop_after(4)
+    interrupted.progress = _stop_after(2)
     with pytest.raises(KeyboardInterrupt):
         interrupted.fit(logs)
     interrupted.progress = None
     for other in (threads, interrupted.fit(logs)):
         assert torch.equal(plain.means, other.means)  # type: ignore[attr-defined]
         assert torch.equal(plain.covariances, other.covariances)  # type: ignore[attr-defined]
+    assert interrupted.rollouts == undisturbed.rollouts
 
 
 def _stop_after(steps: int):  # type: ignore[no-untyped-def]

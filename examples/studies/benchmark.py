@@ -65,11 +65,9 @@ def page(found: Contents) -> Iterator[str]:
     yield "# The benchmark\n"
     yield f"{headline(state).split(': ', 1)[1]}. Means and standard errors over seeds; bold is the best outside noise.\n"
     yield from (f"- {label}: {text}" for label, text in found.facts if label != "command")
-    seconds, cpu = (sum(run[name] for run in state["runs"]) / 3600 for name in ("seconds", "cpu_seconds"))
-    simulating = [run["simulating"] for run in state["runs"]]
-    share = sum(s["cpu_seconds"] for s in simulating) / (2 * sum(s["seconds"] for s in simulating))
-    yield f"- wall time: {seconds:.1f} h on two cores, {cpu:.1f} h of CPU; CPU use while simulating {share:.0%}"
-    yield "- made by `sipe benchmark run --out results` with the suites direct, learned_reward and gradient_steps"
+    runs = state["runs"]
+    seconds, cpu = (sum(run[name] for run in runs) / 3600 for name in ("seconds", "cpu_seconds"))
+    yield f"- wall time: {seconds:.1f} h on {runs[0]['workers']} cores, {cpu:.1f} h of CPU; `sipe benchmark status results` has each run's"
     for part in found.sections:
         if part.anchor in SHOWN:
             yield from section(part)

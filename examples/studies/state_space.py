@@ -77,14 +77,14 @@ def one_fit(simulator: sipe.Simulator, task: str, level: float, seed: int, steps
         "rollouts": estimator.rollouts,
         "wall_seconds": round(seconds, 2),
         "processor_seconds": round(processor, 2),
-        "process_over_measurement": round(_process_share(estimator.diagnostics), 4),
+        "process_over_measurement": round(_process_share(estimator.diagnostics, task in CHEETAHS), 4),
         "warnings": estimator.warnings,
     }
 
 
-def _process_share(diagnostics: dict[str, Any]) -> float:
-    """Median process noise over the coordinates by median measurement noise, root's place left out: it is not observed."""
-    return float(np.median(diagnostics["process_noise"][1:]) / np.median(diagnostics["noise_sd"]))
+def _process_share(diagnostics: dict[str, Any], runs: bool) -> float:
+    """Median process noise over the coordinates by median measurement noise; how far a cheetah has run is not observed and left out."""
+    return float(np.median(diagnostics["process_noise"][runs:]) / np.median(diagnostics["noise_sd"]))
 
 
 def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any]:

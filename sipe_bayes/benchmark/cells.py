@@ -17,7 +17,8 @@ Deviations. The paper sweeps and runs its ablation on unnamed variants; here the
 lies at the centre of the range, where knowing nothing is a perfect guess. Its five environments with a policy are not all named;
 here they are one of each kind. Its search is taken as a full grid, without the combinations in which a value has no effect. The settings with a
 policy train the agents of ``benchmark.transfer``. The humanoid's and the hand's trajectories take 100 control steps, not 250 and 200:
-each costs about a millisecond of CPU, ten times a half-cheetah's, and the first 100 determine the same parameters (``benchmark.log``).
+each costs about a millisecond of CPU, ten times a half-cheetah's, and the first 100 determine what all do (``benchmark.log``), but
+for Door's frame in one of the logs.
 """
 
 from __future__ import annotations

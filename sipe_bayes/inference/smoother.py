@@ -51,6 +51,7 @@ _FILTER_STEP = 1e-5
 _FREE = 0.1  # of a coordinate's movement in a control step: process noise where not every coordinate is measured
 _SHARES = (1.0, 0.1, 0.01, 1e-3)  # of that, to begin with
 _STIFFEST = 1e-5  # of a coordinate's movement: process noise at least, for the sake of rounding
+_LOUDER = 3.0
 _NEVER = 1e300  # nats
 
 
@@ -104,6 +105,17 @@ def descend(
             return Point(theta, states, after, max(_DAMPING_MIN, damping * _DAMPING_DOWN)), False
         damping = max(damping, 1e-4) * _DAMPING_UP
     return replace(here, energy=value), True
+
+
+def sound(found: ChainLinearisation, noise: ChainNoise) -> ChainNoise:
+    """The noise, its process noise raised as far as the normal equations need it to be solved in spite of rounding."""
+    while True:
+        try:
+            eliminate(found, noise)
+        except np.linalg.LinAlgError:
+            noise = ChainNoise(noise.sd, _LOUDER * noise.process)
+        else:
+            return noise
 
 
 def infer_noise(

@@ -1,12 +1,14 @@
 """What ``laplace`` does step by step with a ``StateSpace``: from starting point to recorded optimum, in a flat state.
 
-A search regresses theta on the measured states, then smooths and infers the noise in turn (``inference.smoother``). Where the logs'
-first states are known, it begins at the optima of whole logs without process noise (``window_search``). The
-optimum's normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of. A later
+A search regresses theta on the measured states, or follows the commands where some coordinate is not measured, then smooths and infers
+the noise in turn (``inference.smoother``). Where the logs' first states are known, it begins at the optima of whole logs without process
+noise (``window_search``). The optimum's normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of. A later
 starting point is dropped once its regression ends where an earlier one did.
 """
 
 from __future__ import annotations
+
+import copy
 
 import numpy as np
 import torch
@@ -26,6 +28,7 @@ from sipe_bayes.inference.smoother import (
     quietest,
     regress,
     scale,
+    sound,
 )
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Segments
@@ -41,6 +44,7 @@ _ROUNDS, _FILTERS = 10, 3  # estimates of the noise at most, and after how many 
 _DROPPED = 0.5  # where the process noise dropped by more than this, in logs
 _INNER = (3, 2)  # steps between them: before the first, later
 _AFTER_FILTER = 4
+_SHOT = 1 / 3  # of the budget, for starting points of logs whose first states are known
 _SAME = 0.02  # distance of regressed thetas that is none
 
 
@@ -54,6 +58,7 @@ def start(search: Search, chain: Chain) -> State:
     shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "evidence": ()}
     return {
         "done": False,
+        "part": chain.part,
         "points": points,
         "point": 0,
         "regressed": np.empty((0, n)),
@@ -100,33 +105,41 @@ def _screened(search: Search, chain: Chain) -> FloatArray:
 
 
 def _shot(search: Search, chain: Chain) -> FloatArray:
-    """Starting points (R, N) where the logs' first states are known: the optima of whole logs without process noise."""
+    """Starting points (R, N) where the logs' first states are known: the optima of whole logs without process noise, as far as a
+    third of the budget finds them; what is said on the way is not of the fit."""
     likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
-    windows = likelihood.bind(chain.simulator, chain.trajectories)
-    windows.rollouts, windows.budget = chain.rollouts, chain.budget
-    state = window_search.start(search, windows)
+    windows, quiet = likelihood.bind(chain.simulator, chain.trajectories), copy.copy(search)
+    quiet.warn = lambda sentence: None  # type: ignore[method-assign]
+    windows.rollouts, windows.budget = chain.rollouts, chain.rollouts + _SHOT * (chain.budget - chain.rollouts)
+    points = search.space.default_theta[None]
     try:
+        state = window_search.start(quiet, windows)
         while not state["done"]:
-            state = window_search.step(search, windows, state)
+            points = state["theta"][None]
+            state = window_search.step(quiet, windows, state)
     except BudgetExhausted:
-        if not len(state["mode_theta"]):
-            raise
+        pass
+    except ValueError:  # whole logs diverge
+        return _screened(search, chain)
     chain.rollouts = windows.rollouts
-    best = distinct_modes(state)[: search.restarts]
-    return np.asarray(state["mode_theta"][best])
+    if not len(state["mode_theta"]):
+        return np.asarray(points)
+    return np.asarray(state["mode_theta"][distinct_modes(state)[: search.restarts]])
 
 
 def step(search: Search, chain: Chain, state: State) -> State:
     """One linearisation and what follows from it: a step of the regression or the smoother, or a new noise."""
+    chain.part = float(state["part"])
+    return {**_stepped(search, chain, state), "part": chain.part}
+
+
+def _stepped(search: Search, chain: Chain, state: State) -> State:
     held = bool(state["held"])
+    if held and not chain.placed.all():
+        return _followed(search, chain, state)
     found = chain.linearise(state["theta"], state["states"], with_states=not held)
     if found is None:
-        if state["point"] + 1 == len(state["points"]) and not len(state["mode_theta"]):
-            raise ValueError(
-                "trajectories: the simulation diverges from the measured states at every starting point; look at the log's "
-                "channels and units, or shorten the model's timestep"
-            )
-        return _next(chain, state)
+        return _diverged(chain, state)
     if held:
         return _regressed(search, chain, state, found)
     prior, noise = search.quadratic_prior, ChainNoise(state["sd"], state["process"])
@@ -137,6 +150,7 @@ def step(search: Search, chain: Chain, state: State) -> State:
         here, still = descend(chain, found, noise, prior, here, _TOLERANCE)
         if not still:
             return {**state, **_at(here), "due": state["inner"] >= _INNER[min(state["round"], 1)]}
+    noise = sound(found, noise)
     better, gain = infer_noise(chain, found, noise, prior, here.theta, state["movement"])
     last = state["round"] >= _ROUNDS
     if state["round"] and ((gain < _SETTLED and still) or last):
@@ -165,8 +179,6 @@ def _at(point: Point) -> State:
 
 
 def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisation) -> State:
-    if not chain.placed.all():
-        return _followed(search, chain, state)
     theta = regress(found, search.quadratic_prior, state["theta"])
     still = np.abs(theta - state["theta"]).max() < _STILL or state["iteration"] + 1 >= _REGRESSIONS
     state = {**state, "theta": theta, "iteration": state["iteration"] + 1, "held": not still}
@@ -186,9 +198,10 @@ def _followed(search: Search, chain: Chain, state: State) -> State:
     states = state["states"] if states is None else states
     found = chain.linearise(theta, states)
     if found is None:
-        return _next(chain, state)
+        return _diverged(chain, state)
     movement = chain.movement(states)
     noise = quietest(chain, found, first_noise(chain, found, movement), search.quadratic_prior, theta)
+    noise = sound(found, noise)
     better = filtered(chain, found, noise, theta, states)
     known = {"sd": noise.sd, "process": noise.process, "movement": movement}
     return {**state, **known, "held": False, "states": states if better is None else better}
@@ -221,6 +234,15 @@ def _finish(search: Search, chain: Chain, state: State, found: ChainLinearisatio
     here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "evidence": np.array(evidence)}
     modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in here.items()}
     return _next(chain, {**state, **modes})
+
+
+def _diverged(chain: Chain, state: State) -> State:
+    if state["point"] + 1 == len(state["points"]) and not len(state["mode_theta"]):
+        raise ValueError(
+            "trajectories: the simulation diverges from the measured states at every starting point; look at the log's "
+            "channels and units, or shorten the model's timestep"
+        )
+    return _next(chain, state)
 
 
 def _next(chain: Chain, state: State) -> State:
