@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -224,6 +225,15 @@ def test_readme_explains_every_key() -> None:
 def test_readme_lists_every_unit() -> None:
     section = README.split("Unit words", 1)[1].split("\n\n", 1)[0]
     assert set(re.findall(r"`([^`]+)`", section)) == set(UNITS)
+
+
+def test_readme_least_configuration_is_one() -> None:
+    (block,) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
+    found = Config.model_validate(tomllib.loads(block))
+    assert [log.use for log in found.logs] == ["train", "holdout"]
+    for left_out in ("model", "window", "measurements", "logs", "parameters"):
+        with pytest.raises(ValueError, match="(?i)missing|required|at least"):
+            Config.model_validate({k: v for k, v in tomllib.loads(block).items() if k != left_out})
 
 
 def test_readme_python_runs(tmp_path: Path) -> None:
