@@ -232,7 +232,7 @@ def test_readme_least_configuration_is_one() -> None:
     found = Config.model_validate(tomllib.loads(block))
     assert [log.use for log in found.logs] == ["train", "holdout"]
     for left_out in ("model", "window", "measurements", "logs", "parameters"):
-        with pytest.raises(ValueError, match="(?i)missing|required|at least"):
+        with pytest.raises(ValueError, match=r"(?i)missing|required|at least"):
             Config.model_validate({k: v for k, v in tomllib.loads(block).items() if k != left_out})
 
 

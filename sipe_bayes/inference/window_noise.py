@@ -36,6 +36,14 @@ def present_noise(windows: Windows, residual: FloatArray) -> Noise:
     return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
 
 
+def louder(windows: Windows, noise: Noise, residuals: FloatArray) -> Noise:
+    """The noise with sds no less than the root-mean-squares of residuals (B, W, L, C) of as good points, the given ones kept."""
+    if not len(residuals):
+        return noise
+    size = np.max([present_noise(windows, r).sd ** 2 for r in residuals], axis=0) ** 0.5
+    return Noise(np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, size), noise.sd), noise.tau)
+
+
 def updated_noise(
     windows: Windows,
     moments: Moments,

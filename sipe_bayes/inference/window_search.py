@@ -11,7 +11,8 @@ place to place, and the place would otherwise be an accident of the start.
 Where the starts are recorded and theta alone is searched, points around each optimum are tried as well (``poll``), and the search
 goes on from a better one, with finite differences no longer than the way there. The normal that is left is no narrower than the
 shortest of these ways, and holds the points that fit as well as the optimum, whatever the curvature says; one that fits as
-well but lies beyond worse ones becomes a further starting point.
+well but lies beyond worse ones becomes a further starting point. Where already the shortest way leads to a far worse fit, the optimum is a stroke
+of luck: then its neighbours say how large the noise is and what fits as well, and a warning says so.
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ from numpy.typing import NDArray
 from sipe_bayes.inference.least_squares import Fit, QuadraticPrior, energy_of
 from sipe_bayes.inference.least_squares import step as descend
 from sipe_bayes.inference.optima import Search, known
-from sipe_bayes.inference.poll import SHORTEST, Around, cost, poll
+from sipe_bayes.inference.poll import SHORTEST, Around, cost, nearest, poll
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.window_noise import (
     beyond_rounding,
     free_noise,
+    louder,
     present_noise,
     pulls,
     same_noise,
@@ -40,6 +42,7 @@ from sipe_bayes.noise import Arrow, Moments, Noise, eliminate, restricted
 from sipe_bayes.noise_spread import noise_cloud, sandwich
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _MANY, _ELITE, _LEAST_SPREAD = 40, 6, 1e-3  # candidates; how many of the best lead on; sd, in the cube
 _TOLERANCE = 0.02  # nats
@@ -308,6 +311,11 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     around = _around(search, windows, theta, searched, found["covariance"])
     if around is not None:
         found["covariance"] = around.covariance
+        if around.rough:
+            search.warn(
+                "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse than its nearest "
+                "neighbours, and the search may have missed a better place; compare with npe or bayessim"
+            )
     elif state["polls"]:  # the budget ends: at least as wide as the optimum before, which this one betters
         found["covariance"] = found["covariance"] + state["mode_covariance"][-1]
     further = None if state["centred"] else _middle(search, windows, found)
@@ -336,12 +344,20 @@ def _around(search: Search, windows: Windows, theta: FloatArray, noise: Noise, c
         return None
     starts, prior = windows.no_starts(), search.quadratic_prior
 
+    def simulated(thetas: FloatArray) -> tuple[FloatArray, BoolArray]:
+        return windows.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
+
+    near = nearest(theta)
+    residual, valid = simulated(near)
+    noise = louder(windows, noise, residual[valid])
+
     def energies(thetas: FloatArray) -> FloatArray:
-        residual, valid = windows.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
+        residual, valid = simulated(thetas)
         values = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(thetas, residual, strict=True)]
         return np.where(valid, values, np.inf)
 
-    return poll(energies, theta, covariance)
+    levels = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(near[valid], residual[valid], strict=True)]
+    return poll(energies, theta, covariance, max(levels) if levels else -np.inf)
 
 
 def _middle(search: Search, windows: Windows, found: State) -> FloatArray | None:
