@@ -133,7 +133,10 @@ def _grouped(missing: Sequence[str]) -> list[tuple[str, str, int, str]]:
 
 def _facts(records: Sequence[Record]) -> list[tuple[str, str]]:
     method = sum(r.cpu_seconds or 0.0 for r in records)
-    shared = sum(r.simulation_cpu_seconds for r in records)
+    banks: dict[tuple[str, str, int, int], float] = {}  # each shared by several records
+    for r in records:
+        bank = (r.task, r.variant, r.seed, r.steps)
+        banks[bank] = max(banks.get(bank, 0.0), r.simulation_cpu_seconds)
     estimators = order_estimators({r.estimator for r in records})
     facts = [
         ("environments", ", ".join(order_tasks({r.task for r in records}))),
@@ -144,7 +147,7 @@ def _facts(records: Sequence[Record]) -> list[tuple[str, str]]:
         ("seeds", _numbers(r.seed for r in records)),
         ("budget", f"{_numbers(r.budget for r in records)} rollouts"),
         ("trajectories", f"{_horizons(records)} control steps; by {_listed(r.log for r in records)}"),
-        ("time", f"{_duration(method)} of CPU for the methods, {_duration(shared)} for shared simulations"),
+        ("time", f"{_duration(method)} of CPU for the methods, {_duration(sum(banks.values()))} for shared simulations"),
         ("versions", "; ".join(f"{p} {_listed(r.versions.get(p, '') for r in records)}" for p in _packages(records))),
     ]
     commands = _listed(r.command for r in records)
