@@ -147,7 +147,10 @@ def _facts(records: Sequence[Record]) -> list[tuple[str, str]]:
         ("seeds", _numbers(r.seed for r in records)),
         ("budget", f"{_numbers(r.budget for r in records)} rollouts"),
         ("trajectories", f"{_horizons(records)} control steps; by {_listed(r.log for r in records)}"),
-        ("time", f"{_duration(method)} of CPU for the methods, {_duration(sum(banks.values()))} for shared simulations"),
+        (
+            "time",
+            f"{_duration(method)} of CPU for the methods, {_duration(sum(banks.values()))} for shared simulations",
+        ),
         ("versions", "; ".join(f"{p} {_listed(r.versions.get(p, '') for r in records)}" for p in _packages(records))),
     ]
     commands = _listed(r.command for r in records)
