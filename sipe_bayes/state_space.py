@@ -12,7 +12,8 @@ https://doi.org/10.1137/0804035).
 
 The state's coordinates are tangents (dq (nv), dv (nv), dact (na)), so quaternions stay of length one; a difference of two
 states is MuJoCo's mj_differentiatePos. The first state of a log has a normal prior about the measured one whose sd is far
-wider than any measurement, or, where it is known, about the recorded one with an sd far narrower; command histories of delayed actuators are taken as commanded.
+wider than any measurement, or, where it is known, about the recorded one with an sd far narrower; command histories of
+delayed actuators are taken as commanded.
 
 Deviations from the textbooks: measurement channels that the environment reads one physics step late (``derived_late``)
 are predicted by the step that led to the sample, so that process noise does not reach them.
@@ -40,7 +41,7 @@ BoolArray = NDArray[np.bool_]
 _THETA_STEP = 1e-4  # finite differences, of the unit cube
 _STATE_STEP = 1e-5  # rad or m, rad/s or m/s
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known: position, velocity, activation
-_LEAST_MOVEMENT = 1e-2
+_LEAST_MOVEMENT = 1e-2  # of the largest among the positions, the velocities or the activations
 _LEAST_SD = 1e-6  # of a channel's or coordinate's size: noise below it is not told from rounding
 
 

@@ -338,3 +338,14 @@ def test_command(folder: Path, tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, [str(folder), "--out", str(tmp_path / "file")])
     assert refused.exit_code == 2
     assert "choose another name" in refused.stderr
+
+
+def test_shared_simulations_are_counted_once() -> None:
+    """Two estimators of one bank, and one of another seed's: 60 s + 90 s."""
+    one = Record("a", "Pendulum", "npe", "direct", "default", 0, 100, 20, "done", simulation_cpu_seconds=60.0)
+    records = [
+        one,
+        dataclasses.replace(one, id="b", estimator="bayessim"),
+        dataclasses.replace(one, seed=1, simulation_cpu_seconds=90.0),
+    ]
+    assert dict(report_contents._facts(records))["time"].endswith("2.5 min for shared simulations")

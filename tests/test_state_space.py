@@ -175,6 +175,20 @@ def test_what_nothing_measures_is_followed() -> None:
     assert covered >= 8
 
 
+def test_a_known_start_costs_a_third_of_the_budget_at_most() -> None:
+    """Budgets that end within the search for starting points leave it an estimate, and one that is too small for anything says so."""
+    logs, likelihood = [hung_log(np.array([0.4]), 0)], StateSpace(starts="recorded")
+    for budget in (20, 100):
+        estimator = Laplace(hung(), likelihood=likelihood, budget=budget)
+        chain = estimator.windows(Trajectories.stack(logs))
+        points = estimator.start(Trajectories.stack(logs))["points"]
+        print(budget, points)
+        assert points.shape[1] == 1
+        assert chain.rollouts <= budget / 3 + 1
+    with pytest.raises(ValueError, match="budget"):
+        Laplace(hung(), likelihood=likelihood, budget=2).fit(logs)
+
+
 def test_noise_that_rounding_cannot_bear_is_raised() -> None:
     """The process noise that ``sound`` returns is the least of a few that the equations can be solved with, and no other is touched."""
     chain = StateSpace().bind(hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))

@@ -111,7 +111,7 @@ def _shot(search: Search, chain: Chain) -> FloatArray:
     windows, quiet = likelihood.bind(chain.simulator, chain.trajectories), copy.copy(search)
     quiet.warn = lambda sentence: None  # type: ignore[method-assign]
     windows.rollouts, windows.budget = chain.rollouts, chain.rollouts + _SHOT * (chain.budget - chain.rollouts)
-    points = search.space.default_theta[None]
+    points, state, diverged = search.space.default_theta[None], None, False
     try:
         state = window_search.start(quiet, windows)
         while not state["done"]:
@@ -119,10 +119,12 @@ def _shot(search: Search, chain: Chain) -> FloatArray:
             state = window_search.step(quiet, windows, state)
     except BudgetExhausted:
         pass
-    except ValueError:  # whole logs diverge
-        return _screened(search, chain)
+    except ValueError:  # whole logs
+        diverged = True
     chain.rollouts = windows.rollouts
-    if not len(state["mode_theta"]):
+    if diverged:
+        return _screened(search, chain)
+    if state is None or not len(state["mode_theta"]):
         return np.asarray(points)
     return np.asarray(state["mode_theta"][distinct_modes(state)[: search.restarts]])
 
