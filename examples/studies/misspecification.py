@@ -136,9 +136,7 @@ def main() -> None:
     }
     whole = given.seeds is None and given.cells == list(SIZES)
     name = "misspecification.json" if whole else "misspecification_part.json"
-    write_text(
-        (HERE / "results" if whole else RUNS) / name, json.dumps({**settings, "rows": rows}, indent=1) + "\n"
-    )
+    write_text((HERE / "results" if whole else RUNS) / name, json.dumps({**settings, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
