@@ -68,3 +68,8 @@ def path(name: str, value: Any) -> Path | None:
 def _shown(value: Any) -> str:
     """Short: a number or text as it is, of anything else the type."""
     return repr(value) if isinstance(value, Real | str | None) else f"a {type(value).__name__}"
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

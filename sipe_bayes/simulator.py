@@ -13,7 +13,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.checks import whole
+from sipe_bayes.checks import cores, whole
 from sipe_bayes.engine import HUGE, Engine, quiet
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task
@@ -52,7 +51,7 @@ class Simulator:
             hint = f"sipe.make_task({environment!r})" if isinstance(environment, str) else "one of sipe.make_task(name)"
             raise ValueError(f"environment: expected an Environment, got {environment!r}; give {hint}")
         self.environment = environment
-        self.num_threads = (os.cpu_count() or 1) if num_threads is None else whole("num_threads", num_threads)
+        self.num_threads = cores() if num_threads is None else whole("num_threads", num_threads)
         self.model = environment.compile()
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show

@@ -8,9 +8,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,18 +19,17 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from sipe_bayes import atomic
-from sipe_bayes.benchmark import bank, cells, frame, measure, records, run
+from sipe_bayes.benchmark import bank, cells, frame, measure, records, run, spent
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import NINE, SUITES, Cell, matches, select, suite
 from sipe_bayes.benchmark.log import recorded
 from sipe_bayes.benchmark.pool import Inline
 from sipe_bayes.benchmark.records import Record, load_all, posterior_path, record_path
+from sipe_bayes.benchmark.report_contents import contents
 from sipe_bayes.benchmark.status import lines, summary
 from sipe_bayes.cli import app
-from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.prior_sampling import PriorSampling
 from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
-from sipe_bayes.posterior import Dirac
 
 SMALL = ["--suite", "all", "--budget", "60", "--steps", "20"]
 PENDULUM = [  # six cells, two of which share simulations
@@ -79,7 +79,15 @@ def test_every_estimator_and_the_baselines_are_cells() -> None:
     assert direct == {"prior", "prior_mean", *ESTIMATORS}
     assert {c.estimator for c in suite("all") if c.setting == "gradient_steps"} == {"maml"}
     assert {c.estimator for c in suite("all") if c.setting == "learned_reward"} == {"simopt", "adr"}
-    assert {c.values[0][1] for c in suite("gradient_steps")} == set(range(11))
+    assert {dict(c.values).get("gradient_steps") for c in suite("gradient_steps")} == {None, *range(11)}
+
+
+@pytest.mark.parametrize("name", ["paper", *(n for n in SUITES if n not in ("quick", "all"))])
+def test_every_suite_has_what_its_cells_are_held_against(name: str) -> None:
+    """The prior, its mean and laplace, of the direct setting, for each environment, variant and seed."""
+    found = {(c.task, c.variant, c.seed, c.estimator) for c in suite(name) if c.setting == "direct"}
+    wanted = {(c.task, c.variant, c.seed, e) for c in suite(name) for e in ("prior", "prior_mean", "laplace")}
+    assert wanted <= found
 
 
 def test_suites_are_those_of_the_paper() -> None:
@@ -92,8 +100,9 @@ def test_suites_are_those_of_the_paper() -> None:
     assert {c.setting for c in suite("paper")} == {
         *("direct", "learned_reward", "gradient_steps", "policy", "policy_learned_reward")
     }
-    assert {c.split for c in suite("sweep")} == {"validation"}
-    grid = [c for c in suite("sweep") if (c.task, c.seed) == ("FetchPush", 0)]
+    searched = [c for c in suite("sweep") if c.setting == "sweep"]
+    assert {c.split for c in searched} == {"validation"}
+    grid = [c for c in searched if (c.task, c.seed) == ("FetchPush", 0)]
     assert [sum(c.estimator == e for c in grid) for e in ("regression", "bayesopt", "maml", "simopt", "adr")] == [
         *(16, 8, 9, 54, 12)
     ]
@@ -151,7 +160,7 @@ def test_records_round_trip_and_name_what_is_wrong(undisturbed: Path, tmp_path: 
         assert len(record.mean) == len(record.names) == len(record.determined or ())
         assert record.history[-1]["mean_accuracy"] == record.scores["mean_accuracy"]
         assert record.versions["mujoco"]
-        assert set(record.checksums) == {"model", "log"}
+        assert set(record.checksums) == {"model", "log", "source"}
     (tmp_path / "records" / "bad.json").write_text('{"id": "x", "budgets": 3}')
     with pytest.raises(records.RecordError, match=r"bad\.json: cannot be read as a record \(unknown entry 'budgets'\)"):
         load_all(tmp_path)
@@ -196,18 +205,20 @@ def test_finished_cells_never_run_again(undisturbed: Path) -> None:
 def test_status(undisturbed: Path) -> None:
     found = summary(undisturbed)
     assert (found["cells"], found["done"], found["failed"], found["missing"]) == (6, 6, {}, [])
-    (spent,) = found["runs"]
-    assert spent["cpu_use"] == spent["cpu_seconds"] / spent["seconds"] > 0
-    assert spent["units"] == 7
+    (took,) = found["runs"]
+    assert took["cpu_use"] == took["cpu_seconds"] / took["seconds"] > 0
+    assert took["units"] == 7
     assert "6 cells, 6 done, 0 failed, 0 missing" in lines(found)[0]
     twice = {
         **found,
         "runs": [
-            {**spent, "seconds": 1800.0, "cpu_seconds": 3600.0},
-            {**spent, "seconds": 5400.0, "cpu_seconds": 900.0},
+            {**took, "seconds": 1800.0, "cpu_seconds": 3600.0},
+            {**took, "seconds": 5400.0, "cpu_seconds": 900.0},
         ],
     }
-    assert lines(twice)[-1] == "all runs: 2.00 h, 1.25 h of CPU"
+    assert lines({**twice, "suites": {}, "all": spent.together(twice["runs"])})[-1].startswith(
+        "all runs: 2.0 h, 1.2 h of CPU"
+    )
     assert json.loads(sipe("benchmark", "status", str(undisturbed), "--json").output)["done"] == 6
 
 
@@ -223,14 +234,18 @@ def test_status_finds_cells_that_do_not_compare(undisturbed: Path, tmp_path: Pat
 
 
 def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
-    """SIGKILL while it starts, and at random moments after the first and the third record."""
+    """SIGKILL at random moments: after its plan is there, when it simulates, and after the first and the third record."""
     out, rng = tmp_path / "out", random.Random(6)
     command = [sys.executable, "-m", "sipe_bayes.cli", "benchmark", "run", *SMALL, *PENDULUM, "--out", str(out)]
     seen: dict[Path, int] = {}
     for least in (0, 1, 3):
         process = subprocess.Popen([*command, "--jobs", "1"], stdout=subprocess.DEVNULL)
         until = time.monotonic() + 300
-        while len(list(out.glob("records/P*.json"))) < least and time.monotonic() < until and process.poll() is None:
+
+        def begun(least: int = least) -> bool:
+            return (out / records.PLAN).exists() and len(list(out.glob("records/P*.json"))) >= least
+
+        while not begun() and time.monotonic() < until and process.poll() is None:
             time.sleep(0.01)
         time.sleep(rng.uniform(0, 0.3))
         process.send_signal(signal.SIGKILL)
@@ -244,37 +259,45 @@ def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) 
     assert found.exit_code == 0, found.output
     assert what_counts(out) == what_counts(undisturbed)
     assert all(path.stat().st_mtime_ns == written for path, written in seen.items())
+    assert records.planned(out) == records.planned(undisturbed)
+    assert bank.verify(PENDULUM_BANK, 60, out) == []
+    assert 2 <= len(spent.runs(out)) <= 4  # of those that wrote something
 
+
+MIDDLE = '''"""A toy: the answer is the middle, whatever was recorded."""
+import numpy as np
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.posterior import Dirac
 
 class Middle(Estimator):
-    """A toy: the answer is the middle, whatever was recorded."""
-
+    """The middle; seed 1 fails."""
     name = "middle"
 
-    def start(self, trajectories: Any) -> dict[str, Any]:
+    def start(self, trajectories):
         return {"done": False}
 
-    def step(self, state: dict[str, Any], trajectories: Any) -> dict[str, Any]:
+    def step(self, state, trajectories):
         if self.seed == 1:
             raise ArithmeticError("no middle")
         return {"done": True}
 
-    def posterior(self, state: dict[str, Any], trajectories: Any) -> Dirac:
+    def posterior(self, state, trajectories):
         return Dirac(np.full(len(self.space), 0.5), self.space)
+'''
 
 
 @pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> None:
+def toy(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """One file and one registry line."""
-    module = ModuleType("middle")
-    module.Middle = Middle  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "middle", module)
+    folder = tmp_path_factory.mktemp("toy")
+    (folder / "middle.py").write_text(MIDDLE)
+    monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setitem(ESTIMATORS, "middle", ("middle", "Middle"))
 
 
 @pytest.mark.usefixtures("toy")
 def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) -> None:
-    """Seed 1 fails; the others go on; it runs again when it is asked for, and then only it."""
+    """Found in the CLI, the tables and the plots. Seed 1 fails; the others go on; it runs again when it is asked for, and then only it."""
     assert "Pendulum/middle/direct/default/seed2" in sipe("benchmark", "cells", "all").output.splitlines()
     chosen = ["--select", "pendulum/middle/direct/in_distribution"]
     found = measured(tmp_path, *chosen)
@@ -292,6 +315,17 @@ def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) 
     assert measured(tmp_path, *chosen).exit_code == 0
     again = measured(tmp_path, *chosen, "--retry-failed")
     assert (again.exit_code, again.stdout.splitlines()[0]) == (1, "3 cells, 2 of them there already")
+    assert "--retry-failed" in again.stderr
+    assert measured(tmp_path, "--select", "pendulum/prior_mean/direct/in_distribution").exit_code == 0
+    section = next(part for part in contents(tmp_path).sections if part.anchor == "direct-in_distribution")
+    assert section.tables
+    for table in section.tables:
+        found_there, known = table.entry("middle", "Pendulum"), table.entry("prior_mean", "Pendulum")
+        assert found_there is not None
+        assert known is not None
+        assert table.measure.name == "CPU seconds" or found_there.mean == known.mean
+    legend = section.pictures[0].figure.legends[0].get_texts()
+    assert [text.get_text() for text in legend] == ["middle", "prior mean"]
 
 
 def test_policy_cell(tmp_path: Path) -> None:
@@ -301,7 +335,10 @@ def test_policy_cell(tmp_path: Path) -> None:
     (record,) = load_all(tmp_path)
     assert record.converged in (True, False)
     assert record.log == "policy"
-    assert len(record.history) == 10 or record.history[-1]["rollouts"] == record.rollouts
+    assert record.history[-1] == {
+        "rollouts": record.rollouts, "mean_accuracy": record.scores["mean_accuracy"], "mean_crps": record.scores["mean_crps"]
+    }  # fmt: skip
+    assert 0 < record.rollouts <= 60
     (folder,) = (tmp_path / measure.POLICIES).iterdir()
     assert (folder / "policy.safetensors").exists()
     assert not (folder / "checkpoint").exists()
@@ -370,27 +407,56 @@ def test_results_of_another_kind_are_left_alone(
 
 
 def test_read_only_folder(tmp_path: Path) -> None:
+    """To root every folder can be written but those that are none."""
     tmp_path.chmod(0o500)
-    if os.access(tmp_path, os.W_OK):
-        pytest.skip("this user may write anywhere")
-    refused(measured(tmp_path, *PENDULUM), "Permission denied")
+    folder = Path("/proc/self/task") if os.access(tmp_path, os.W_OK) else tmp_path
+    before = sorted(p.name for p in tmp_path.iterdir())
+    found = measured(folder, *PENDULUM)
+    refused(found, str(folder))
+    assert "denied" in found.stderr or "not permitted" in found.stderr or "No such file" in found.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
 
 
-def test_full_disk_loses_nothing(monkeypatch: pytest.MonkeyPatch, undisturbed: Path, tmp_path: Path) -> None:
-    """After the seventh file there is no room: what is there is whole, and the same command goes on."""
-    room = [7]
+def test_versions_of_cells_not_asked_for_count_too(undisturbed: Path, tmp_path: Path) -> None:
+    """Tables would mix them."""
+    other = replace(load_all(undisturbed)[0], versions={**frame.versions(), "mujoco": "3.9"})
+    other.write(tmp_path)
+    elsewhere = ["--select", "cartpole/prior/direct/default/seed0"]
+    refused(measured(tmp_path, *elsewhere), "with versions mujoco 3.9", other.id, "choose another folder")
 
-    def write(path: Path, data: bytes) -> None:
-        room[0] -= 1
-        if room[0] < 0:
-            raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        atomic.write_bytes(path, data)
 
-    monkeypatch.setattr(run, "write_bytes", write)
+def test_a_folder_that_is_elsewhere(undisturbed: Path) -> None:
+    """On a machine that does not see the folder of results a cell makes its simulations itself: the same result, their cost apart,
+    and nothing left behind."""
+    nowhere, cell = Path("/proc/nowhere"), replace(Cell("Pendulum", "regression"), budget=60, steps=20)
+    done = measure.run(cell, nowhere, "")
+    assert not done.failed, done.line
+    record = json.loads(done.files[1][1])
+    assert record["simulation_cpu_seconds"] > 0
+    same = {k: v for k, v in record.items() if k not in TIMES}
+    assert (same, done.files[0][1]) == what_counts(undisturbed)[cell.id]
+
+
+@pytest.mark.parametrize(("room_for", "kept"), [(0, 0), (3, 0), (12, 2), (13, 3)])
+def test_full_disk_loses_nothing(
+    room_for: int, kept: int, monkeypatch: pytest.MonkeyPatch, undisturbed: Path, tmp_path: Path
+) -> None:
+    """After some files, plan and times among them, there is no room: what is there is whole, and the same command goes on."""
+    room, replacing = [room_for], atomic.replacing
+
+    @contextmanager
+    def full(path: Path) -> Iterator[Path]:
+        with replacing(path) as temporary:
+            yield temporary
+            room[0] -= 1
+            if room[0] < 0:
+                raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(atomic, "replacing", full)
     refused(measured(tmp_path, *PENDULUM), "No space left")
-    kept = load_all(tmp_path)
-    assert 0 < len(kept) < 6
-    monkeypatch.setattr(run, "write_bytes", atomic.write_bytes)
+    assert len(list(tmp_path.glob("records/P*.json"))) == kept
+    assert not list(tmp_path.rglob(".*.[a-z]*"))  # no half-written file
+    monkeypatch.setattr(atomic, "replacing", replacing)
     assert measured(tmp_path, *PENDULUM).exit_code == 0
     assert what_counts(tmp_path) == what_counts(undisturbed)
 

@@ -16,7 +16,7 @@ import typer
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.benchmark import figures, report_contents, report_html, report_latex, tables
+from sipe_bayes.benchmark import figures, findings, report_contents, report_html, report_latex, spent, tables
 from sipe_bayes.benchmark.commands import report
 from sipe_bayes.benchmark.records import Record, RecordError, plan
 from sipe_bayes.diagnostics.scores import score
@@ -25,7 +25,7 @@ from sipe_bayes.posterior import Dirac, Posterior, prior
 NAMES = ("mass_1", "friction_2")
 SPACE = sipe.ParameterSpace([sipe.Parameter(name, 0.0, 1.0) for name in NAMES])
 BOTH = ("in_distribution", "out_of_distribution")
-TRUTHS = {"in_distribution": (0.25, 0.8), "out_of_distribution": (-0.1, 1.1)}
+TRUTHS = {"in_distribution": (0.25, 0.8), "default": (0.5, 0.5), "out_of_distribution": (-0.1, 1.1)}
 EVIL = r"</table><script>alert(1)</script> 100 % & $x$ #1 \input{a} _b^c~ ½ é 中"
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 PDFLATEX = shutil.which("pdflatex")
@@ -44,7 +44,7 @@ def make(
         "names": list(NAMES), "truth": truth.tolist(), "mean": posterior.mean.tolist(), "sd": posterior.stddev.tolist(),
         "scores": score(posterior, truth).to_dict(), "determined": [True, False] if variant == "in_distribution" else None,
         "history": [{"rollouts": n, "mean_accuracy": 0.6 + n / 1e4, "mean_crps": 0.1} for n in (100, 1000)],
-        "log": "excitation", "versions": {"mujoco": "4.0.0"}, "command": "sipe benchmark run --suite quick",
+        "log": "excitation", "versions": {"mujoco": "4.0.0"}, "checksums": {"log": f"{task}{variant}{seed}", "source": "a"}, "command": "sipe benchmark run --suite quick",
     }  # fmt: skip
     cell = f"{task}/{estimator}/{label or setting}/{variant}/seed{seed}"
     return Record(cell, task, estimator, setting, variant, seed, **{**made, **other})
@@ -151,8 +151,34 @@ def test_the_best_is_set_apart_only_outside_noise() -> None:
     assert column({**clear, "c": [0.89, 0.92, 0.9]}) is None  # a close second
     assert column({"a": [0.9], "b": [0.1]}) is None  # one seed
     assert column({**clear, "prior_mean": [0.95]}) is None  # knowing nothing is better
+    assert column({**clear, "prior_mean": [0.909]}) is None  # and it must be worse outside noise
+    assert column({**clear, "prior_mean": [0.85]}) == "a"
     assert column({"a": [0.9, 0.9], "b": [0.8, 0.8]}) == "a"  # deterministic
     assert column({"a": [0.9, 0.9], "b": [0.9, 0.9]}) is None
+
+
+def test_nothing_is_best_where_the_truth_is_the_centre() -> None:
+    records = [make(estimator=e, seed=s, variant="default", at=near(error, s)) for e, error in (("adr", 0.0), ("simopt", 0.2)) for s in range(3)]  # fmt: skip
+    apart = tables.score_table(records, "accuracy", tables.Context.of(records))
+    inside = [dataclasses.replace(r, variant="in_distribution") for r in records]
+    same = tables.score_table(inside, "accuracy", tables.Context.of(inside))
+    assert apart is not None
+    assert same is not None
+    assert [sum(e.best for _, row in t.rows for e in row if e) for t in (apart, same)] == [0, 1]
+    section = report_contents._group("direct-default", "", records, tables.Context.of(records))
+    assert len(section.sentences) == 1
+    assert "nothing is set in bold" in section.sentences[0]
+
+
+def test_against_a_constant() -> None:
+    assert tables.against([0.6, 0.61, 0.62], 0.5) == 1
+    assert tables.against([0.6, 0.61, 0.62], 0.7) == -1
+    assert tables.against([0.3, 0.5, 0.9], 0.5) == 0
+    assert tables.against([0.9], 0.5) == 0  # one seed tells nothing
+    assert tables.against([0.6, 0.6], 0.5) == 1  # deterministic
+    rng = np.random.default_rng(2)
+    alarms = sum(tables.against(list(rng.normal(size=3)), 0.0) != 0 for _ in range(300))
+    assert alarms <= 30, alarms  # expected 15; more than 30 in one of 5,000 such tests
 
 
 def test_equal_estimators_seldom_have_a_best_one() -> None:
@@ -180,7 +206,98 @@ def test_warnings_are_counted_without_names_and_numbers() -> None:
     assert tables.warning_counts(runs) == [("adr", "at a bound: sd #", 2)]
 
 
+def test_baselines_are_better_worse_or_not_told_apart() -> None:
+    errors = {
+        "good": (0.04, 0.05, 0.06),
+        "bad": (0.44, 0.45, 0.45),
+        "noisy": (0.1, 0.28, 0.45),
+    }  # the prior mean's: 0.275
+    away = np.array([1, -1])
+    records = [make(estimator=n, seed=s, at=TRUTHS["in_distribution"] + e[s] * away) for n, e in errors.items() for s in range(3)]  # fmt: skip
+    records += [make(estimator="prior_mean"), make(estimator="prior")]
+    context = tables.Context.of(records)
+    (table,) = [t for t in [tables.score_table(records, "accuracy", context)] if t]
+    said = findings.table_findings([table])[1]
+    assert said.startswith("Better in accuracy than the prior mean: good; worse: bad; not told apart: noisy"), said
+
+
+def test_gain_of_a_setting_is_paired_by_environment_and_seed() -> None:
+    """Two environments that differ far more than the two settings do."""
+    base = {"Door": 0.4, "FetchPush": 0.05}
+    left = [make(t, "adr", s, at=near(b, s)) for t, b in base.items() for s in range(3)]
+    right = [make(t, "adr", s, "learned_reward", at=near(b - 0.02, s)) for t, b in base.items() for s in range(3)]
+    labels = ("state differences", "learned rewards")
+    (said,) = findings.pair_findings(left, right, labels)
+    assert (
+        "adr: mean accuracy with learned rewards less that with state differences is 0.022 ± 0.001, a gain outside noise"
+        in said
+    )
+    assert "positive on 2 of 2" in said
+    (same,) = findings.pair_findings(left, left, labels)
+    assert "0.000 ± 0.000, not told from none" in same
+
+
+def test_rows_that_do_not_compare_are_named() -> None:
+    assert findings.unequal([make(seed=0), make(seed=1)]) == ""
+    said = findings.unequal([make(seed=0), make(seed=1, budget=100), make("FetchPush", steps=20), make("FetchPush")])
+    assert (
+        said
+        == "The rows do not compare: budgets differ (100, 1,000 rollouts) and trajectories differ in length on FetchPush."
+    )
+
+
+def test_search_is_held_against_the_defaults() -> None:
+    """Two combinations tie for the best, and both are far ahead of the defaults."""
+    errors = {4: 0.05, 6: 0.05, 10: 0.3}
+    mine = [make("FetchPush", "adr", s, "sweep", at=near(e, s), label=f"sweep,particles={n}", values={"particles": n}) for n, e in errors.items() for s in range(3)]  # fmt: skip
+    mine.append(make("FetchPush", "prior_mean"))
+    rows = tables.sweep_rows(mine)
+    assert [(row[0], row[3]) for row in rows] == [
+        ("adr", False),
+        ("adr", False),
+        ("adr", True),
+        ("prior_mean, direct", False),
+    ]
+    (said,) = findings.sweep_findings([row for row in rows if row[1]])
+    assert "the best of 3, and not the defaults, particles = 10" in said
+    assert "they differ outside noise" in said
+
+
+def test_wall_time_is_summed_by_suite() -> None:
+    row = {
+        "workers": 2,
+        "units": 3,
+        "seconds": 1800.0,
+        "cpu_seconds": 3000.0,
+        "simulating": {"seconds": 100.0, "cpu_seconds": 190.0},
+    }
+    runs = [{**row, "command": f"sipe benchmark run --suite {name} --out x"} for name in ("direct", "direct", "policy")]
+    assert spent.by_suite(runs)["direct"] == {
+        "seconds": 3600.0, "cpu_seconds": 6000.0, "workers": 2, "simulating_seconds": 200.0,
+        "cpu_use": pytest.approx(6000 / 7200), "cpu_use_simulating": pytest.approx(0.95),
+    }  # fmt: skip
+    assert spent.by_suite([{**row, "command": "sipe benchmark run --out x"}]).keys() == {"paper"}
+    assert spent.by_suite([{**row, "command": "sipe simulate Door"}]).keys() == {"sipe simulate"}
+    said = dict(findings.facts([make()], runs))["wall time"]
+    assert (
+        said
+        == "1.5 h on 2 cores, cells that were measured again included (direct 1.0 h, policy 30.0 min); CPU use 95% while simulating"
+    )
+
+
 # Figures
+
+
+def test_the_reference_is_dotted_on_every_figure(found: report_contents.Contents) -> None:
+    """laplace, wherever it has no curve of its own; the prior mean is dashed everywhere."""
+    pictures = [p for s in found.sections for p in s.pictures]
+    assert len(pictures) > 8
+    for picture in pictures:
+        (legend,) = picture.figure.legends
+        names = [text.get_text() for text in legend.get_texts()]
+        assert "prior mean" in names, picture.name
+        own = "laplace" in picture.caption.split(":")[0].split(". The radius")[0]
+        assert own or {"laplace", "laplace, direct"} & set(names), (picture.name, names)
 
 
 def test_every_seed_and_the_truth_are_drawn() -> None:
@@ -222,11 +339,11 @@ def test_contents_say_what_was_run_and_what_is_missing(found: report_contents.Co
     facts = dict(found.facts)
     assert facts["versions"] == "mujoco 4.0.0"
     assert "toy" in facts["estimators"]
-    assert facts["time"].startswith(f"{3 * len(every()) / 60:.1f} min of CPU")
+    assert facts["CPU time"].startswith(f"{3 * len(every()) / 60:.1f} min for the methods")
     assert facts["trajectories"] == "50 control steps; by excitation"
     longer = [dataclasses.replace(r, steps=200) if r.task == "Door" else r for r in every()]
     assert (
-        dict(report_contents._facts(longer))["trajectories"]
+        dict(findings.facts(longer, []))["trajectories"]
         == "50 (FetchPush, Relocate); 200 (Door) control steps; by excitation"
     )
     titles = [section.title for section in found.sections]
@@ -264,19 +381,27 @@ const values = () => [...table.tBodies[0].rows].map(r => Number(r.cells[1].datas
 const button = table.tHead.rows[0].cells[1].querySelector("button");
 said.given = values(); button.click(); said.descending = values(); button.click(); said.ascending = values();
 said.drawn = [...document.images].filter(i => i.complete && i.naturalWidth > 0).length; said.images = document.images.length;
-said.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-document.body.innerHTML = "<pre>" + JSON.stringify(said) + "</pre>"; });</script>"""
+said.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth; said.width = innerWidth;
+parent.postMessage(JSON.stringify(said), "*"); });</script>"""
+_WINDOW = """<iframe src="page.html" style="width: {width}px; height: 900px; border: 0"></iframe><pre></pre>
+<script>addEventListener("message", e => document.querySelector("pre").textContent = e.data);</script>"""
+
+
+def browser(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
+               f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=5000", *arguments]  # fmt: skip
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
-@pytest.mark.parametrize("width", [500, 1200])
+@pytest.mark.parametrize("width", [360, 1200])
 def test_page_in_a_browser(written: Path, tmp_path: Path, width: int) -> None:
-    """Figures are drawn, tables sort, nothing is wider than the window, and the console stays empty."""
+    """On a phone and on a desk: figures are drawn, tables sort, nothing is wider than the window, and the console stays empty. The page
+    is in a frame, since Chromium's own window has at least 500 pixels."""
     page = (written / "report.html").read_text(encoding="utf-8")
     (tmp_path / "page.html").write_text(page.replace("</body>", _PROBE + "</body>"), encoding="utf-8")
-    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", "--enable-logging=stderr",
-               f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--dump-dom", (tmp_path / "page.html").as_uri()]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    (tmp_path / "window.html").write_text(_WINDOW.format(width=width), encoding="utf-8")
+    done = browser(tmp_path, "--dump-dom", (tmp_path / "window.html").as_uri())
     assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     found = re.search(r"<pre>(\{.*\})</pre>", done.stdout)
     assert found is not None, done.stdout[-500:]
@@ -284,7 +409,24 @@ def test_page_in_a_browser(written: Path, tmp_path: Path, width: int) -> None:
     assert said["ascending"] == sorted(said["given"]) != said["given"]
     assert said["descending"] == sorted(said["given"], reverse=True)
     assert said["images"] == said["drawn"] > 5
+    assert said["width"] == width
     assert said["wide"] <= 0
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_page_prints(written: Path, tmp_path: Path) -> None:
+    """With every figure, also those that a reader opens when wanted: fewer of them are printed where they stay shut."""
+    page, images = written / "report.html", {}
+    shut = tmp_path / "shut.html"
+    shut.write_text(
+        page.read_text(encoding="utf-8").replace("details::details-content", "details::none"), encoding="utf-8"
+    )
+    for path in (page, shut):
+        browser(tmp_path, f"--print-to-pdf={tmp_path / 'page.pdf'}", path.as_uri())
+        printed = (tmp_path / "page.pdf").read_bytes()
+        assert printed.startswith(b"%PDF")
+        images[path] = printed.count(b"/Subtype /Image")
+    assert images[page] > images[shut] > 5, images
 
 
 @pytest.mark.skipif(PDFLATEX is None, reason="needs pdflatex")
@@ -342,10 +484,22 @@ def test_command(folder: Path, tmp_path: Path) -> None:
 
 def test_shared_simulations_are_counted_once() -> None:
     """Two estimators of one bank, and one of another seed's: 60 s + 90 s."""
-    one = Record("a", "Pendulum", "npe", "direct", "default", 0, 100, 20, "done", simulation_cpu_seconds=60.0)
+    one = Record(
+        "a",
+        "Pendulum",
+        "npe",
+        "direct",
+        "default",
+        0,
+        100,
+        20,
+        "done",
+        simulation_cpu_seconds=60.0,
+        checksums={"log": "x"},
+    )
     records = [
         one,
         dataclasses.replace(one, id="b", estimator="bayessim"),
         dataclasses.replace(one, seed=1, simulation_cpu_seconds=90.0),
     ]
-    assert dict(report_contents._facts(records))["time"].endswith("2.5 min for shared simulations")
+    assert dict(findings.facts(records, []))["CPU time"].endswith("2.5 min for shared simulations")

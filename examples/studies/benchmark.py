@@ -15,7 +15,6 @@ from pathlib import Path
 
 from sipe_bayes.atomic import write_text
 from sipe_bayes.benchmark.report_contents import Contents, Picture, Section, contents
-from sipe_bayes.benchmark.status import headline, summary
 from sipe_bayes.benchmark.tables import Entry, Table
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -26,7 +25,12 @@ SHOWN = (
     "direct-against-learned_reward",
     "gradient-steps",
 )
-PICTURES = ("direct-in_distribution-compared0", "direct-in_distribution-compared1", "gradient-steps")
+PICTURES = (
+    *(f"direct-in_distribution-compared{k}" for k in range(2)),
+    *(f"direct-in_distribution-spread{k}" for k in range(3)),
+    "direct-against-learned_reward0",
+    "gradient-steps",
+)
 
 
 def cell(entry: Entry | None) -> str:
@@ -61,13 +65,9 @@ def section(found: Section) -> Iterator[str]:
 
 
 def page(found: Contents) -> Iterator[str]:
-    state = summary(RESULTS)
     yield "# The benchmark\n"
-    yield f"{headline(state).split(': ', 1)[1]}. Means and standard errors over seeds; bold is the best outside noise.\n"
+    yield f"{found.headline}. Means and standard errors over seeds; bold is the best outside noise.\n"
     yield from (f"- {label}: {text}" for label, text in found.facts if label != "command")
-    runs = state["runs"]
-    seconds, cpu = (sum(run[name] for run in runs) / 3600 for name in ("seconds", "cpu_seconds"))
-    yield f"- wall time: {seconds:.1f} h on {runs[0]['workers']} cores, {cpu:.1f} h of CPU; `sipe benchmark status results` has each run's"
     for part in found.sections:
         if part.anchor in SHOWN:
             yield from section(part)

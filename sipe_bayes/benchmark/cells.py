@@ -11,7 +11,8 @@ The benchmark of B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to C
 - rollouts: direct with other budgets, for accuracy against rollouts.
 
 Tasks and estimators come from their registries, and which settings an estimator has follows from its arguments: a new method is
-its file and one line. The prior and its mean are cells as well: no table stands without them.
+its file and one line. The prior, its mean and ``laplace`` on full states are cells of every suite: no table and no plot stands without
+them.
 
 Deviations. The paper sweeps and runs its ablation on unnamed variants; here they are the in-distribution one, as the default model
 lies at the centre of the range, where knowing nothing is a perfect guess. Its five environments with a policy are not all named;
@@ -41,7 +42,8 @@ from sipe_bayes.trajectory_sets import TASKS as NINE
 
 BASELINES = ("prior", "prior_mean")
 PAPER = ("regression", "bayesopt", "maml", "simopt", "adr", "bayessim")
-_BESIDE = ("laplace", "npe")  # measured beside the paper's
+REFERENCE = "laplace"
+_BESIDE = (REFERENCE, "npe")  # measured beside the paper's
 _WITH_POLICY = ("FetchPush", "Relocate", "Door", "HalfCheetahLinks", "HumanoidLinks")
 _TUNED_ON = ("FetchPush", "Relocate")
 _SEEDS = range(3)
@@ -145,6 +147,14 @@ def direct(
         yield Cell(task, estimator, "direct", variant, seed)
 
 
+def referenced(cells: Iterable[Cell]) -> Iterator[Cell]:
+    """Cells of other settings after those of the direct one that they are held against."""
+    own = list(cells)
+    for task, variant, seed in dict.fromkeys((cell.task, cell.variant, cell.seed) for cell in own):
+        yield from direct((task,), (*BASELINES, REFERENCE), (variant,), (seed,))
+    yield from own
+
+
 def learned(tasks: Iterable[str], estimators: Iterable[str], setting: str = "learned_reward") -> Iterator[Cell]:
     chosen = [name for name in estimators if has(name, "reward")]
     for task, seed, estimator in itertools.product(tasks, _SEEDS, chosen):
@@ -212,11 +222,20 @@ SUITES = {
     "quick": Suite("three environments, six estimators, one seed, 200 rollouts of 50 control steps", _quick),
     "paper": Suite("direct, learned_reward, gradient_steps and policy", _paper),
     "direct": Suite("nine environments, the paper's estimators, laplace and npe, three variants", _direct_suite),
-    "learned_reward": Suite("simopt and adr on nine environments", lambda: learned(NINE, ("simopt", "adr"))),
-    "gradient_steps": Suite("MAML with 0 to 10 steps at test time on nine environments", lambda: gradient_steps(NINE)),
-    "policy": Suite("five estimators on five environments, simopt and adr also with learned rewards", _policy_suite),
-    "rollouts": Suite("every estimator with 100 to 3,000 rollouts on two environments", rollouts),
-    "sweep": Suite("the hyper-parameters of the paper's appendix, on validation trajectories", sweep),
+    "learned_reward": Suite(
+        "simopt and adr on nine environments", lambda: referenced(learned(NINE, ("simopt", "adr")))
+    ),
+    "gradient_steps": Suite(
+        "MAML with 0 to 10 steps at test time on nine environments", lambda: referenced(gradient_steps(NINE))
+    ),
+    "policy": Suite(
+        "five estimators on five environments, simopt and adr also with learned rewards",
+        lambda: referenced(_policy_suite()),
+    ),
+    "rollouts": Suite("every estimator with 100 to 3,000 rollouts on two environments", lambda: referenced(rollouts())),
+    "sweep": Suite(
+        "the hyper-parameters of the paper's appendix, on validation trajectories", lambda: referenced(sweep())
+    ),
     "all": Suite("every task and estimator there is, in every setting; to select from", _all),
 }
 

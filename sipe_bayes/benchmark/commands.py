@@ -157,7 +157,7 @@ def simulate(
 
 def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[], Executor]:
     """What makes the executor; raises ValueError for options that do not go together."""
-    import os
+    from sipe_bayes.checks import cores
 
     if address is not None and name != "ray":
         raise ValueError(f"--address {address}: goes with --executor ray alone; add it, or leave the address out")
@@ -171,7 +171,7 @@ def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[]
 
     if name not in ("pool", "inline"):
         raise ValueError(f"--executor {name}: expected pool, ray or inline")
-    return Inline if name == "inline" else lambda: Pool(jobs or os.cpu_count() or 1)
+    return Inline if name == "inline" else lambda: Pool(jobs or cores())
 
 
 def at_least_one(**options: float | None) -> None:
@@ -195,7 +195,10 @@ def print_status(found: dict[str, Any], lines: Callable[[dict[str, Any]], list[s
 def exit_if_failed(what: str, failed: int, status: str) -> None:
     """Exit code 1 where something failed, with the command that shows why."""
     if failed:
-        print(f"sipe: {what} failed; `sipe {status}` shows why", file=sys.stderr)
+        print(
+            f"sipe: {what} failed; `sipe {status}` shows why, the same command with --retry-failed tries again",
+            file=sys.stderr,
+        )
         raise typer.Exit(1)
 
 

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from sipe_bayes.benchmark.cells import BASELINES
+from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
 from sipe_bayes.benchmark.records import Record
 from sipe_bayes.benchmark.tables import order_estimators, order_tasks
 from sipe_bayes.diagnostics.drawing import CHAINS, MEASURED, POSTERIOR, PRIOR, _figure, _line, _short, _styled, _ticks
@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 Points = Mapping[float, Sequence[float]]  # x -> a score of each seed
 
 _BASELINE: dict[str, Any] = {"color": "#444444", "ls": (0, (3, 2)), "lw": 1.2}
+_REFERENCE: dict[str, Any] = {**_BASELINE, "ls": (0, (1, 1.4))}
 _PRIOR_SD = 12**-0.5
 _ROW = 0.82  # inches
 
@@ -141,7 +142,7 @@ def _undetermined(rows: Mapping[str, Sequence[Record]]) -> list[int]:
 @_styled
 def accuracy_against_rollouts(records: Sequence[Record]) -> Figure:
     """One panel per task: mean accuracy against rollouts, the mean over seeds with their range. Where cells with other budgets were
-    run, a point is a whole run with that budget, else what the estimator knew on the way. The prior mean is dashed."""
+    run, a point is a whole run with that budget, else what the estimator knew on the way, or at its end alone. The prior mean is dashed."""
     curves: dict[str, dict[str, Points]] = {}
     for task in order_tasks({r.task for r in records}):
         mine = [r for r in records if r.done and r.task == task and r.estimator not in BASELINES]
@@ -149,20 +150,20 @@ def accuracy_against_rollouts(records: Sequence[Record]) -> Figure:
             points = _budgets([r for r in mine if r.estimator == name])
             if points:
                 curves.setdefault(task, {})[name] = points
-    return _panels(curves, _prior_mean(records), "rollouts", logarithmic=True)
+    return _panels(curves, _levels(records, curves), "rollouts", logarithmic=True)
 
 
 @_styled
 def gradient_step_ablation(records: Sequence[Record]) -> Figure:
     """One panel per task: mean accuracy against the gradient steps at test time, the mean over seeds with their range. records: those of
-    the setting gradient_steps, and the prior mean's, which is dashed."""
+    the setting gradient_steps, the prior mean's, which is dashed, and ``laplace``'s of the direct setting, which is dotted."""
     curves: dict[str, dict[str, Points]] = {}
     for record in records:
         if record.done and "gradient_steps" in record.values:
             points: Any = curves.setdefault(record.task, {}).setdefault(record.estimator, {})
             points.setdefault(float(record.values["gradient_steps"]), []).append(record.scores["mean_accuracy"])
     ordered = {task: curves[task] for task in order_tasks(set(curves))}
-    return _panels(ordered, _prior_mean(records), "gradient steps at test time", logarithmic=False)
+    return _panels(ordered, _levels(records, ordered), "gradient steps at test time", logarithmic=False)
 
 
 def _budgets(records: Sequence[Record]) -> Points:
@@ -190,14 +191,26 @@ def _trace(record: Record) -> tuple[FloatArray, FloatArray]:
     return rollouts, score
 
 
-def _prior_mean(records: Sequence[Record]) -> dict[str, float]:
-    mine = [r for r in records if r.done and r.estimator == "prior_mean"]
-    return {t: float(np.mean([r.scores["mean_accuracy"] for r in mine if r.task == t])) for t in {r.task for r in mine}}
+Levels = Mapping[str, tuple[dict[str, Any], Mapping[str, float]]]  # label -> style, task -> mean accuracy
 
 
-def _panels(
-    curves: Mapping[str, Mapping[str, Points]], baseline: Mapping[str, float], xlabel: str, logarithmic: bool
-) -> Figure:
+def _levels(records: Sequence[Record], curves: Mapping[str, Mapping[str, Points]]) -> Levels:
+    """What is drawn across: the prior mean, and the reference where it has no curve."""
+    styles = {"prior_mean": _BASELINE}
+    if not any(REFERENCE in of_task for of_task in curves.values()):
+        styles[REFERENCE] = _REFERENCE
+    found = {}
+    for name, style in styles.items():
+        mine = [r for r in records if r.done and (r.estimator, r.setting) == (name, "direct") and r.task in curves]
+        levels = {
+            t: float(np.mean([r.scores["mean_accuracy"] for r in mine if r.task == t])) for t in {r.task for r in mine}
+        }
+        if levels:
+            found[name.replace("_", " ")] = (style, levels)
+    return found
+
+
+def _panels(curves: Mapping[str, Mapping[str, Points]], levels: Levels, xlabel: str, logarithmic: bool) -> Figure:
     if not curves:
         raise ValueError("records: no finished run to draw; run some cells")
     names = order_estimators({name for of_task in curves.values() for name in of_task})
@@ -209,8 +222,9 @@ def _panels(
         ax = figure.add_subplot(grid[k // columns, k % columns])
         for name, points in of_task.items():
             _curve(ax, points, names.index(name))
-        if task in baseline:
-            ax.axhline(baseline[task], **_BASELINE)
+        for style, level in levels.values():
+            if task in level:
+                ax.axhline(level[task], **style)
         if logarithmic:
             ax.set_xscale("log")
             _ticks(ax.xaxis, 5)
@@ -223,8 +237,8 @@ def _panels(
         if k + columns >= len(curves):
             ax.set_xlabel(xlabel)
     handles = [_line(label=n, ms=4, lw=1.4, **_style(k)) for k, n in enumerate(names)]
-    baselines = [_line(_BASELINE["color"], "prior mean", ls=_BASELINE["ls"])] if baseline else []
-    figure.legend(handles=[*handles, *baselines], loc="outside upper center", ncols=6)
+    across = [_line(style["color"], name, ls=style["ls"]) for name, (style, _) in levels.items()]
+    figure.legend(handles=[*handles, *across], loc="outside upper center", ncols=6)
     return figure
 
 

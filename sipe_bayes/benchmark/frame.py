@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any, TypeVar
 
+import sipe_bayes
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.records import Record
 from sipe_bayes.benchmark.work import Done
@@ -28,6 +32,15 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = ""
     return found
+
+
+@cache
+def source() -> str:
+    """A digest of this package's code: two records of one version may stem from different states of it."""
+    root, found = Path(sipe_bayes.__file__).parent, hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        found.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return found.hexdigest()[:12]
 
 
 def blank(kind: type[R], cell: Cell, command: str, **more: Any) -> R:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
-from sipe_bayes.benchmark.frame import Files, blank, failed, measured
+from sipe_bayes.benchmark.frame import Files, blank, failed, measured, source
 from sipe_bayes.benchmark.log import Log, one_step, recorded
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path
 from sipe_bayes.benchmark.work import Done
@@ -45,8 +46,20 @@ class _Found:
 
 
 def run(cell: Cell, folder: Path, command: str) -> Done:
-    """Measure a cell. folder: of the results; read for simulations, and a training's checkpoints are kept in it."""
-    return measured(blank_record(cell, command), lambda record: _measured(cell, record, folder))
+    """Measure a cell. folder: of the results; read for simulations, and a training's checkpoints are kept in it. Where it is not there,
+    as this is another machine, the cell makes what it needs for itself."""
+    with at_hand(folder) as here:
+        return measured(blank_record(cell, command), lambda record: _measured(cell, record, here))
+
+
+@contextmanager
+def at_hand(folder: Path) -> Iterator[Path]:
+    """The folder, or where it is not there an empty one for the time being."""
+    if folder.is_dir():
+        yield folder
+    else:
+        with tempfile.TemporaryDirectory() as instead:
+            yield Path(instead)
 
 
 def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
@@ -91,7 +104,7 @@ def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, 
         determined=None if log.determined is None or cell.with_policy else log.determined.tolist(),
         history=[*rows, last],
         log="policy" if cell.with_policy else log.source,
-        checksums={"model": simulator.checksum(), "log": digest(log.trajectories)},
+        checksums={"model": simulator.checksum(), "log": digest(log.trajectories), "source": source()},
         **found.more,
     )
     line = f"accuracy {scores.mean_accuracy:.3f}, CRPS {scores.mean_crps:.3f}"
@@ -117,6 +130,9 @@ def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Fou
     simulations = folder / bank.FOLDER
     estimator = _estimator(cell, simulator, **({"cache": simulations} if shares else {}))
     clock, history = _Clock(), []
+    more: dict[str, Any] = {}
+    if isinstance(estimator, PriorSampling):
+        more["simulation_cpu_seconds"] = _simulated(estimator, cell, log, simulations)
     looks = [] if shares else [share * cell.budget for share in _ALONG]
     while not _over(estimator):
         clock.time(lambda: estimator.update_parameter_estimate(log.trajectories))
@@ -124,12 +140,15 @@ def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Fou
             looks = [share for share in looks if share > estimator.rollouts]
             history += _look(estimator, log)
     posterior = clock.time(lambda: estimator.get_parameter_estimate(log.trajectories))
-    more: dict[str, Any] = {}
-    if isinstance(estimator, PriorSampling):
-        key = estimator._simulations(log.trajectories).key
-        more["simulation_cpu_seconds"] = bank.cost(simulations, key)
     said = list(estimator.warnings)
     return _Found(posterior, clock.seconds, clock.cpu_seconds, estimator.rollouts, said, history, more)
+
+
+def _simulated(estimator: PriorSampling, cell: Cell, log: Log, folder: Path) -> float:
+    """See that the simulations which the method shares with others are there; the CPU seconds that they took, here or before."""
+    simulations, clock = estimator._simulations(log.trajectories), _Clock()
+    clock.time(lambda: simulations.first(cell.budget))
+    return bank.cost(folder, simulations.key) or clock.cpu_seconds
 
 
 def _over(estimator: Estimator) -> bool:

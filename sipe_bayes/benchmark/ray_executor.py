@@ -1,8 +1,9 @@
 """The executor of many machines: Ray's, from `pip install sipe-bayes[ray]`.
 
 A unit is a task of one CPU that returns its files; the process that started the run writes them. When a node dies, Ray runs its units
-again on another. The folder of results may be on a file system that the nodes share: then they read its simulations; where it is not,
-each makes the rows it needs itself, and they are the same.
+again on another. The folder of results may be on a file system that the nodes share: then they read its simulations, and a training
+goes on from its checkpoints; where it is not, each cell makes the rows it needs itself, and they are the same. Agents of the transfer
+read the estimates that they train under, and so need a shared one.
 """
 
 from __future__ import annotations

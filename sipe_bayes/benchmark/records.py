@@ -7,6 +7,7 @@ posterior (ArviZ, physical units); and ``plan.json``, every cell that was ever a
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -117,7 +118,7 @@ class Record:
     @classmethod
     def all_in(cls, folder: Path) -> list[Self]:
         """All of this kind in a folder of results, by id; raises RecordError where there is none, or one cannot be read."""
-        found = cls._every(folder)
+        found = cls.every(folder)
         if not found:
             raise RecordError(f"{folder}: holds {cls.NONE} --out {folder}`")
         return found
@@ -129,7 +130,7 @@ class Record:
         asked = planned(folder / cls.FOLDER)
         if not asked:
             raise RecordError(f"{folder}: {cls.NEVER} --out {folder}`")
-        records = cls._every(folder)
+        records = cls.every(folder)
         known = {record.id for record in records}
         return records, {
             "folder": str(folder),
@@ -140,7 +141,8 @@ class Record:
         }
 
     @classmethod
-    def _every(cls, folder: Path) -> list[Self]:
+    def every(cls, folder: Path) -> list[Self]:
+        """All of this kind in a folder of results, perhaps none; raises RecordError where one cannot be read."""
         return [cls.read(path) for path in sorted((folder / cls.FOLDER / RECORDS).glob("[!.]*.json"))]
 
 
@@ -160,6 +162,19 @@ def posterior_path(folder: Path, cell_id: str) -> Path:
 def load_all(folder: Path) -> list[Record]:
     """All records of a folder of results, by id; raises RecordError where there is none, or one cannot be read."""
     return Record.all_in(folder)
+
+
+def mixed(records: Sequence[Record]) -> list[str]:
+    """Tasks, variants and seeds whose cells were given different logs, as an agent was installed or trained anew meanwhile: they do
+    not compare."""
+    logs: dict[str, set[str]] = {}
+    for record in records:
+        if record.done and record.log != "policy":
+            group = f"{record.task}/{record.variant}/seed{record.seed}" + (
+                "/sweep" if record.setting == "sweep" else ""
+            )
+            logs.setdefault(group, set()).add(record.checksums["log"])
+    return [group for group, found in logs.items() if len(found) > 1]
 
 
 def planned(folder: Path) -> list[str]:

@@ -12,18 +12,18 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from sipe_bayes.benchmark import figures
-from sipe_bayes.benchmark.cells import BASELINES
+from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
+from sipe_bayes.benchmark.findings import facts, pair_findings, sweep_findings, table_findings, unequal
 from sipe_bayes.benchmark.records import Record, load_all, planned
+from sipe_bayes.benchmark.spent import runs
 from sipe_bayes.benchmark.tables import (
-    ALL,
-    MEASURES,
     OUTSIDE,
+    VARIANT_NAMES,
     Context,
     Entry,
     Table,
     counted,
     measures,
-    order_estimators,
     order_tasks,
     renamed,
     results,
@@ -45,14 +45,13 @@ _PAIRS = (
     ("direct", "learned_reward", ("state differences", "learned rewards"), "Learned rewards against state differences"),
     ("policy", "policy_learned_reward", ("state differences", "learned rewards"), "The same, with a policy in the loop"),
 )  # fmt: skip
-_VARIANTS = {"in_distribution": "in distribution", "default": "default", OUTSIDE: "out of distribution"}
 _NOTES = {
-    "default": "The truth is the centre of every range here, so the prior mean is exact: judge by CRPS skill and by the variants beside it.",
-    "in_distribution": "",
+    "default": "The truth is the centre of every range here, where knowing nothing is a perfect guess: neither accuracy nor CRPS skill tells learning from not learning, so nothing is set in bold. Judge by the other variants.",
+    "in_distribution": "Each environment has one truth, .1 to .4 of the range from its centre in every parameter; logs and estimators differ with the seed. Standard errors are over seeds, so they do not tell how another truth would come out.",
     OUTSIDE: "The truth lies outside every range here, so only CRPS, the energy score and whether a method noticed mean anything.",
 }
 _PER_FIGURE = 3  # estimators
-_RADARS = "The radius is the value, on one spoke per environment; dashed is the prior mean. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
+_RADARS = "The radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def contents(folder: Path) -> Contents:
     )
     return Contents(
         headline=", ".join(state),
-        facts=_facts(records),
+        facts=facts(records, runs(folder)),
         sections=[s for s in _sections(done) if s.tables or s.pictures or s.sweep],
         missing=_grouped(missing),
         failed=failed,
@@ -124,69 +123,8 @@ def _grouped(missing: Sequence[str]) -> list[tuple[str, str, int, str]]:
     for cell in missing:
         task, estimator, setting, variant, _ = cell.split("/")
         label = setting.split("=")[0].split(",")[0]
-        groups.setdefault((f"{label}, {_VARIANTS.get(variant, variant)}", estimator), []).append(task)
+        groups.setdefault((f"{label}, {VARIANT_NAMES.get(variant, variant)}", estimator), []).append(task)
     return [(*key, len(tasks), ", ".join(order_tasks(set(tasks)))) for key, tasks in groups.items()]
-
-
-# What was run
-
-
-def _facts(records: Sequence[Record]) -> list[tuple[str, str]]:
-    method = sum(r.cpu_seconds or 0.0 for r in records)
-    banks: dict[tuple[str, str, int, int], float] = {}  # each shared by several records
-    for r in records:
-        bank = (r.task, r.variant, r.seed, r.steps)
-        banks[bank] = max(banks.get(bank, 0.0), r.simulation_cpu_seconds)
-    estimators = order_estimators({r.estimator for r in records})
-    facts = [
-        ("environments", ", ".join(order_tasks({r.task for r in records}))),
-        ("estimators", ", ".join(e for e in estimators if e not in BASELINES)),
-        ("baselines", ", ".join(e for e in estimators if e in BASELINES) or "none was run: no figure shows the prior"),
-        ("settings", ", ".join(sorted({r.setting for r in records}))),
-        ("variants", ", ".join(text for name, text in _VARIANTS.items() if any(r.variant == name for r in records))),
-        ("seeds", _numbers(r.seed for r in records)),
-        ("budget", f"{_numbers(r.budget for r in records)} rollouts"),
-        ("trajectories", f"{_horizons(records)} control steps; by {_listed(r.log for r in records)}"),
-        (
-            "time",
-            f"{_duration(method)} of CPU for the methods, {_duration(sum(banks.values()))} for shared simulations",
-        ),
-        ("versions", "; ".join(f"{p} {_listed(r.versions.get(p, '') for r in records)}" for p in _packages(records))),
-    ]
-    commands = _listed(r.command for r in records)
-    return [*facts, *([("command", commands)] if commands else [])]
-
-
-def _packages(records: Sequence[Record]) -> list[str]:
-    return list(dict.fromkeys(package for r in records for package in r.versions if r.versions[package]))
-
-
-def _horizons(records: Sequence[Record]) -> str:
-    """How long the trajectories are, by task where that differs."""
-    tasks: dict[int, set[str]] = {}
-    for record in records:
-        tasks.setdefault(record.steps, set()).add(record.task)
-    if len(tasks) == 1:
-        return f"{next(iter(tasks)):,}"
-    return "; ".join(f"{steps:,} ({', '.join(order_tasks(tasks[steps]))})" for steps in sorted(tasks))
-
-
-def _numbers(values: Iterator[int]) -> str:
-    return ", ".join(f"{v:,}" for v in sorted(set(values)))
-
-
-def _listed(values: Iterator[str]) -> str:
-    return ", ".join(sorted({v for v in values if v}))
-
-
-def _duration(seconds: float) -> str:
-    return (
-        f"{seconds / 3600:.1f} h"
-        if seconds >= 3600
-        else f"{seconds / 60:.1f} min"
-        if seconds >= 60
-        else f"{seconds:.1f} s"
-    )
 
 
 # Sections
@@ -195,7 +133,7 @@ def _duration(seconds: float) -> str:
 def _sections(done: Sequence[Record]) -> Iterator[Section]:
     context = Context.of(done)
     for setting, title in SETTINGS.items():
-        for variant, words in _VARIANTS.items():
+        for variant, words in VARIANT_NAMES.items():
             group = [r for r in done if (r.setting, r.variant) == (setting, variant)]
             if any(r.estimator not in BASELINES for r in group):
                 yield _group(f"{setting}-{variant}", f"{title}, {words}", _with_baselines(group, done), context)
@@ -207,12 +145,12 @@ def _sections(done: Sequence[Record]) -> Iterator[Section]:
 
 
 def _with_baselines(group: Sequence[Record], done: Sequence[Record]) -> list[Record]:
-    """The group and, where it has none of its own, the baselines of the direct setting on its tasks."""
-    if any(r.estimator in BASELINES for r in group):
-        return list(group)
-    tasks, variants = {r.task for r in group}, {r.variant for r in group}
-    own = [r for r in done if r.estimator in BASELINES and r.task in tasks and r.variant in variants]
-    return [*group, *own]
+    """The group and, where it has none of its own, the baselines and ``laplace`` of the direct setting on its tasks."""
+    tasks, variants, own = ({getattr(r, name) for r in group} for name in ("task", "variant", "estimator"))
+    direct = [r for r in done if r.setting == "direct" and r.task in tasks and r.variant in variants]
+    baselines = [r for r in direct if r.estimator in BASELINES and r.estimator not in own]
+    held_against = [] if REFERENCE in own else renamed([r for r in direct if r.estimator == REFERENCE], "direct")
+    return [*group, *baselines, *held_against]
 
 
 def _group(anchor: str, title: str, records: Sequence[Record], context: Context) -> Section:
@@ -220,8 +158,9 @@ def _group(anchor: str, title: str, records: Sequence[Record], context: Context)
     shown, sentence = counted(records)
     variant = next(r.variant for r in shown if r.estimator not in BASELINES)
     tables = [t for name in measures(variant) if (t := score_table(shown, name, context)) is not None]
-    notes = [_NOTES[variant], sentence]
-    section = Section(anchor, title, [*(n for n in notes if n), *_findings(tables)], tables)
+    notes = [_NOTES[variant], sentence, unequal(shown)]
+    found = [] if variant == "default" else table_findings(tables)
+    section = Section(anchor, title, [*(n for n in notes if n), *found], tables)
     if variant != OUTSIDE:
         section.pictures.extend(_radars(anchor, shown))
     if anchor == "direct-in_distribution":
@@ -231,17 +170,24 @@ def _group(anchor: str, title: str, records: Sequence[Record], context: Context)
 
 def _radars(anchor: str, records: Sequence[Record]) -> Iterator[Picture]:
     found = results(records)
-    base = {name: found.pop(name) for name in BASELINES if name in found}
-    for k, part in enumerate(_parts(list(found), COMPARED)):
-        figure = sipe_plot({**{n: found[n] for n in part}, **base}, "mean")
+    beside = {name: found[name] for name in found if name in BASELINES or _is_reference(name)}
+    reference = next((name for name in beside if _is_reference(name)), None)
+    mine = [name for name in found if name not in BASELINES and name != f"{REFERENCE}, direct"]
+    for k, part in enumerate(_parts(mine, COMPARED)):
+        drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, "mean", None if reference in part else reference)
         yield Picture(
-            f"{anchor}-compared{k}", f"Means over parameters and seeds of {', '.join(part)}. {_RADARS}", figure
+            f"{anchor}-compared{k}", f"Means over parameters and seeds of {', '.join(part)}. {_RADARS}", drawn
         )
-    for k, part in enumerate(_parts(list(found), _PER_FIGURE)):
+    for k, part in enumerate(_parts(mine, _PER_FIGURE)):
         caption = (
             f"{', '.join(part)}: mean (green), worst (blue) and best (orange) parameter of each environment. {_RADARS}"
         )
-        yield Picture(f"{anchor}-spread{k}", caption, sipe_plot({**{n: found[n] for n in part}, **base}))
+        drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, None, None if reference in part else reference)
+        yield Picture(f"{anchor}-spread{k}", caption, drawn)
+
+
+def _is_reference(name: str) -> bool:
+    return name.split(",")[0] == REFERENCE
 
 
 def _parts(names: list[str], size: int) -> list[list[str]]:
@@ -269,23 +215,24 @@ def _pair(
 ) -> Section:
     """Two settings on the tasks and estimators that both have, in distribution."""
     section = Section(f"{first}-against-{second}", title)
-    (one, _), (two, sentence) = (
+    (one, of_one), (two, of_two) = (
         counted([r for r in done if r.setting == s and r.variant == "in_distribution"]) for s in (first, second)
     )
-    one = _with_baselines(one, done)
     both = {(r.task, r.estimator) for r in one} & {(r.task, r.estimator) for r in two}
     left, right = ([r for r in group if (r.task, r.estimator) in both] for group in (one, two))
     if not left or not right:
         return section
-    trivial = [r for r in one if r.estimator in BASELINES and r.task in {task for task, _ in both}]
-    rows = [*renamed(left, labels[0]), *renamed(right, labels[1]), *trivial]
+    beside = _with_baselines(left, done)[len(left) :]
+    rows = [*renamed(left, labels[0]), *renamed(right, labels[1]), *beside]
     section.tables.extend(t for n in ("accuracy", "spread", "CRPS skill") if (t := score_table(rows, n, context)))
-    section.sentences.extend([sentence] if sentence else [])
-    everything = results([*left, *trivial])
-    names = [n for n in everything if n not in BASELINES]
-    base = {n: everything[n] for n in BASELINES if n in everything}
+    said = [f"With {label}: {s}" for label, s in zip(labels, (of_one, of_two), strict=True) if s]
+    section.sentences.extend([*said, unequal(rows)] if unequal(rows) else said)
+    section.sentences.extend(pair_findings(left, right, labels))
+    everything, reference = results([*left, *beside]), f"{REFERENCE}, direct"
+    names = [n for n in everything if n not in (*BASELINES, reference)]
     for k, part in enumerate(_parts(names, _PER_FIGURE)):
-        figure = settings_plot({**{n: everything[n] for n in part}, **base}, results(right), labels)
+        shown = {n: everything[n] for n in everything if n in part or n not in names}
+        figure = settings_plot(shown, results(right), labels, reference if reference in everything else None)
         caption = f"{', '.join(part)}: means over parameters and seeds with {labels[0]} (green) and {labels[1]} (orange). {_RADARS}"
         section.pictures.append(Picture(f"{section.anchor}{k}", caption, figure))
     return section
@@ -295,67 +242,31 @@ def _along(done: Sequence[Record], setting: str, title: str, what: str) -> Secti
     """Accuracy against gradient steps or rollouts; for rollouts, what was known on the way where no other budget was run."""
     section = Section(setting.replace("_", "-"), title)
     mine = [r for r in done if r.setting == setting]
-    if not mine and setting == "rollouts":
-        mine = [r for r in done if (r.setting, r.variant) == ("direct", "in_distribution") and len(r.history) > 1]
+    whole = bool(mine)
+    if not whole and setting == "rollouts":
+        mine = [r for r in done if (r.setting, r.variant) == ("direct", "in_distribution")]
+        mine = mine if any(len(r.history) > 1 for r in mine) else []
     if not mine:
         return section
-    variants = {r.variant for r in mine}
-    tasks = {r.task for r in mine}
-    base = [r for r in done if r.estimator in BASELINES and r.variant in variants and r.task in tasks]
+    tasks, variants = {r.task for r in mine}, {r.variant for r in mine}
+    across = (*BASELINES, REFERENCE)
+    beside = [r for r in done if r.setting == "direct" and r.estimator in across and r not in mine]
+    beside = [r for r in beside if r.task in tasks and r.variant in variants]
     draw = figures.gradient_step_ablation if setting == "gradient_steps" else figures.accuracy_against_rollouts
-    caption = f"Mean accuracy against {what}: mean over seeds, shaded their range; dashed the prior mean."
-    section.pictures.append(Picture(section.anchor, caption, draw([*mine, *base])))
+    caption = f"Mean accuracy against {what}: mean over seeds, shaded their range; dashed the prior mean"
+    caption += (
+        ", dotted laplace."
+        if setting == "gradient_steps"
+        else "."
+        if whole
+        else ". Searches are looked at on the way, from when each seed has an estimate; methods that train once are known at the end alone."
+    )
+    section.pictures.append(Picture(section.anchor, caption, draw([*mine, *beside])))
     return section
 
 
 def _sweep(done: Sequence[Record]) -> Section:
     rows = sweep_rows(done)
-    section = Section("sweep", "Search over hyper-parameters", sweep=rows)
-    for estimator in dict.fromkeys(row[0] for row in rows):
-        mine = [row for row in rows if row[0] == estimator]
-        defaults = next((row for row in mine if row[3]), None)
-        first = mine[0]
-        where = "outside noise" if first[2].best else "not outside noise"
-        if first[3]:
-            section.sentences.append(f"{estimator}: the search chooses the defaults, {first[1]}.")
-        elif defaults is not None:
-            section.sentences.append(
-                f"{estimator}: the search would choose {first[1]} ({_text(first[2])}) and not the defaults, {defaults[1]} "
-                f"({_text(defaults[2])}); its lead is {where}."
-            )
-    return section
-
-
-# Sentences
-
-
-def _findings(tables: Sequence[Table]) -> list[str]:
-    """What the tables say, over all environments where they are complete."""
-    found = []
-    for table in tables:
-        if table.measure.name not in ("accuracy", "CRPS skill", "CRPS"):
-            continue
-        column = ALL if ALL in table.columns else table.columns[0]
-        rows = {name: entry for name, _ in table.rows if (entry := table.entry(name, column)) is not None}
-        mine = {name: entry for name, entry in rows.items() if name not in BASELINES}
-        if not mine:
-            continue
-        sign = MEASURES[table.measure.name].better
-        first = max(mine, key=lambda name: sign * mine[name].mean)
-        where = "over all environments" if column == ALL else f"on {column}"
-        noise = "ahead of every other outside noise" if mine[first].best else "its lead is not outside noise"
-        found.append(f"Best {table.measure.name} {where}: {first}, {_text(mine[first])}; {noise}.")
-        reference = "prior_mean" if table.measure.name == "accuracy" else "prior"
-        if reference in rows:
-            ahead = [n for n, e in mine.items() if sign * (e.mean - rows[reference].mean) > 0]
-            behind = [n for n in mine if n not in ahead]
-            text = (
-                f"Better in {table.measure.name} than the {reference.replace('_', ' ')}: {', '.join(ahead) or 'none'}"
-            )
-            found.append(f"{text}; not better: {', '.join(behind) or 'none'}.")
-    return found
-
-
-def _text(entry: Entry) -> str:
-    mean, error = entry.texts()
-    return f"{mean} ± {error}" if error else mean
+    searched = [row for row in rows if row[1]]
+    title = "Search over hyper-parameters"
+    return Section("sweep", title, sweep_findings(searched), sweep=rows if searched else [])

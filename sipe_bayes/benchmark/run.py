@@ -7,7 +7,6 @@ writes them, each under a temporary name and renamed, a record after its posteri
 from __future__ import annotations
 
 import fcntl
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,15 +16,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from sipe_bayes.atomic import write_bytes, write_text
-from sipe_bayes.benchmark import bank, measure
+from sipe_bayes.atomic import write_bytes
+from sipe_bayes.benchmark import bank, measure, spent
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
-from sipe_bayes.benchmark.records import Record, file_name, plan, record_path
+from sipe_bayes.benchmark.records import Record, file_name, plan
 from sipe_bayes.benchmark.work import Done, Executor, Unit
-from sipe_bayes.output import OutputError, to_json
+from sipe_bayes.output import OutputError
 
-LOG = "runs.json"
 _LOCK = ".lock"
 Report = Callable[[str], None]
 
@@ -86,23 +84,28 @@ def lacking(
     cells: Iterable[Cell], folder: Path, retry_failed: bool, blank: Callable[[Cell, str], Record] = measure.blank_record
 ) -> list[Cell]:
     """The cells that have no record in a folder of results, or with retry_failed a failed one. blank: makes their records. Raises
-    OutputError for a record with other entries than its cell's."""
-    return [cell for cell in cells if not _finished(blank(cell, ""), folder, retry_failed)]
+    OutputError for a record with other entries than its cell's, and for one of any cell that other versions made."""
+    asked = [(cell, blank(cell, "")) for cell in cells]
+    if not asked:
+        return []
+    kind = asked[0][1]
+    there = {record.id: record for record in kind.every(folder)}
+    for record in there.values():
+        _alike(record, kind, ("versions",), folder)
+    for _, mine in asked:
+        if mine.id in there:
+            _alike(there[mine.id], mine, mine.FIXED, folder)
+    return [cell for cell, mine in asked if mine.id not in there or (retry_failed and not there[mine.id].done)]
 
 
-def _finished(mine: Record, folder: Path, retry_failed: bool) -> bool:
-    path = record_path(folder / mine.FOLDER, mine.id)
-    if not path.is_file():
-        return False
-    found = mine.read(path)
-    for name in mine.FIXED:
+def _alike(found: Record, mine: Record, names: Iterable[str], folder: Path) -> None:
+    for name in names:
         there, here = getattr(found, name), getattr(mine, name)
         if there != here:
             raise OutputError(
-                f"--out {folder}: holds {mine.id} with {name} {_differing(there, here)} and not {_differing(here, there)}; "
+                f"--out {folder}: holds {found.id} with {name} {_differing(there, here)} and not {_differing(here, there)}; "
                 "choose another folder"
             )
-    return found.done or not retry_failed
 
 
 def _differing(one: Any, other: Any) -> Any:
@@ -178,8 +181,8 @@ class _Log:
     """``runs.json``: what each run took, kept up to date: seconds and CPU seconds, also of its simulations alone."""
 
     def __init__(self, folder: Path, command: str, workers: int, shards: int) -> None:
-        self._path, self._began, self._shards = folder / LOG, time.perf_counter(), shards
-        self._before = runs(folder)
+        self._folder, self._began, self._shards = folder, time.perf_counter(), shards
+        self._before = spent.runs(folder)
         self._row: dict[str, Any] = {
             "command": command,
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -196,19 +199,9 @@ class _Log:
         self._row["cpu_seconds"] += done.cpu_seconds
         if self._shards and unit.name.startswith("simulations/"):
             self._shards -= 1
-            spent = self._row["simulating"]["cpu_seconds"] + done.cpu_seconds
-            self._row["simulating"] = {"seconds": now, "cpu_seconds": spent}
-        write_text(self._path, to_json({"runs": [*self._before, self._row]}, indent=0) + "\n")
-
-
-def runs(folder: Path) -> list[dict[str, Any]]:
-    """What each run in a folder of results took."""
-    path = folder / LOG
-    try:
-        found: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["runs"] if path.is_file() else []
-    except (ValueError, KeyError) as error:
-        raise OutputError(f"{path}: cannot be read ({error}); delete it") from None
-    return found
+            cpu = self._row["simulating"]["cpu_seconds"] + done.cpu_seconds
+            self._row["simulating"] = {"seconds": now, "cpu_seconds": cpu}
+        spent.keep(self._folder, [*self._before, self._row])
 
 
 def changed(cells: Sequence[Cell], **changes: Any) -> list[Cell]:

@@ -6,8 +6,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.benchmark.records import Record
-from sipe_bayes.benchmark.run import runs
+from sipe_bayes.benchmark.records import Record, mixed
+from sipe_bayes.benchmark.spent import by_suite, duration, percent, runs, together
 
 _SHOWN = 20  # missing cells that are named
 
@@ -15,25 +15,15 @@ _SHOWN = 20  # missing cells that are named
 def summary(folder: Path) -> dict[str, Any]:
     """Of a folder of results, as plain data; raises RecordError for another one."""
     records, found = Record.progress(folder)
+    rows = runs(folder)
     return {
         **found,
-        "mixed": _mixed(records),
+        "mixed": mixed(records),
         "converged": _converged(records),
-        "runs": [_used(row) for row in runs(folder)],
+        "runs": [{**row, **together([row])} for row in rows],
+        "suites": by_suite(rows),
+        "all": together(rows),
     }
-
-
-def _mixed(records: list[Record]) -> list[str]:
-    """Tasks, variants and seeds whose cells were given different logs, as an agent was installed or trained anew meanwhile: they do
-    not compare."""
-    logs: dict[str, set[str]] = {}
-    for record in records:
-        if record.done and record.log != "policy":
-            group = f"{record.task}/{record.variant}/seed{record.seed}" + (
-                "/sweep" if record.setting == "sweep" else ""
-            )
-            logs.setdefault(group, set()).add(record.checksums["log"])
-    return [group for group, found in logs.items() if len(found) > 1]
 
 
 def _converged(records: list[Record]) -> dict[str, str]:
@@ -45,20 +35,6 @@ def _converged(records: list[Record]) -> dict[str, str]:
             asked[name] += 1
             solved[name] += record.converged
     return {name: f"{solved[name]} of {count}" for name, count in asked.items()}
-
-
-def _used(row: dict[str, Any]) -> dict[str, Any]:
-    """A run with the share of its workers' time in which they computed; None where nothing was simulated."""
-    spent = row["simulating"]
-    return {
-        **row,
-        "cpu_use": _share(row["cpu_seconds"], row["seconds"] * row["workers"]),
-        "cpu_use_simulating": _share(spent["cpu_seconds"], spent["seconds"] * row["workers"]),
-    }
-
-
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
 
 
 def lines(found: dict[str, Any]) -> list[str]:
@@ -73,22 +49,31 @@ def lines(found: dict[str, Any]) -> list[str]:
         for group in found["mixed"]
     ]
     said += [f"converged: {name}: {count} seeds" for name, count in found["converged"].items()]
+    if found["failed"]:
+        said.append("the same command with --retry-failed measures those that failed again")
     for row in found["runs"]:
-        use = f"{row['units']} units in {row['seconds']:.0f} s, CPU use {_percent(row['cpu_use'])} of {row['workers']} workers"
-        if row["cpu_use_simulating"] is not None:
-            use += f", {_percent(row['cpu_use_simulating'])} while simulating ({row['simulating']['seconds']:.0f} s)"
-        said.append(f"{row['started']}: {use}: {row['command']}")
+        use = f"{row['units']} units in {row['seconds']:.0f} s, CPU use {percent(row['cpu_use'])} of {row['workers']} workers"
+        said.append(f"{row['started']}: {use}{_simulating(row)}: {row['command']}")
     if len(found["runs"]) > 1:
-        seconds, cpu = (sum(row[name] for row in found["runs"]) for name in ("seconds", "cpu_seconds"))
-        said.append(f"all runs: {seconds / 3600:.2f} h, {cpu / 3600:.2f} h of CPU")
+        said += [f"{name}: {_time(row)}" for name, row in (*found["suites"].items(), ("all runs", found["all"]))]
     return said
+
+
+def _time(row: dict[str, Any]) -> str:
+    """Of runs together."""
+    return f"{duration(row['seconds'])}, {duration(row['cpu_seconds'])} of CPU{_simulating(row)}"
+
+
+def _simulating(row: dict[str, Any]) -> str:
+    share = row["cpu_use_simulating"]
+    return (
+        f", CPU use {percent(share)} while simulating ({duration(row['simulating_seconds'])})"
+        if share is not None
+        else ""
+    )
 
 
 def headline(found: dict[str, Any]) -> str:
     """The counts of a summary."""
     counts = f"{found['done']} done, {len(found['failed'])} failed, {len(found['missing'])} missing"
     return f"{found['folder']}: {found['cells']} cells, {counts}"
-
-
-def _percent(share: float | None) -> str:
-    return "?" if share is None else f"{share:.0%}"

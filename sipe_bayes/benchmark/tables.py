@@ -4,7 +4,8 @@ An entry is set apart as the best of its column only when that is outside noise:
 other estimator's by Welch's t-test at 5 % (B. Welch 1947, "The generalization of 'Student's' problem when several different
 population variances are involved", Biometrika 34, https://doi.org/10.1093/biomet/34.1-2.28). It follows that a column of
 equally good estimators has a best one in less than 5 % of cases, and that one seed never has one. Baselines do not compete, but the
-best must beat the prior mean and the prior too, except on the default variant, whose truth the prior mean is.
+best must beat the prior mean and the prior too, by a one-sample t-test, as they are the same with every seed. On the default variant
+nothing is the best: its truth is the prior mean, so that no measure tells learning from knowing nothing.
 
 A run with a policy counts only if the policy solved simulators drawn from the estimate, as in the paper (Mehta, Handa, Fox, Ramos
 2020, https://arxiv.org/abs/2011.08985, Section 3.2); where no run of a setting did, all count, and the report says so.
@@ -23,12 +24,13 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sipe_bayes.benchmark.cells import BASELINES
+from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
 from sipe_bayes.benchmark.records import Record
 
 LEVEL = 0.05
 OUTSIDE = "out_of_distribution"
 ALL = "mean of all"
+VARIANT_NAMES = {"in_distribution": "in distribution", "default": "default", OUTSIDE: "out of distribution"}
 
 Value = Callable[[Record, "Context"], float | None]
 Key = tuple[str, str, int]
@@ -101,7 +103,7 @@ MEASURES = {
         Measure("CRPS skill, determined", "the same over the parameters that the log determines", 1, 3, _determined_skill),
         Measure("CRPS", "continuous ranked probability score in theta, mean over parameters", -1, 4, _of_scores("mean_crps")),
         Measure("energy score", "of all parameters together, in theta", -1, 3, _of_scores("energy")),
-        Measure("coverage", "share of parameters whose 90 % interval holds the truth; 0.9 is right", 0, 2, lambda r, _: r.scores["coverage"]["0.9"]),
+        Measure("coverage", "share of parameters whose 90 % interval holds the truth; the prior's hold all, as the truths lie well inside", 0, 2, lambda r, _: r.scores["coverage"]["0.9"]),
         Measure("contraction", "1 - sd / sd of the prior, mean over parameters", 0, 2, _of_scores("mean_contraction")),
         Measure("noticed", "share of parameters outside the bounds whose median sits on that bound", 1, 2, _noticed),
         Measure("CPU seconds", "of the method, simulations included unless they were shared", 0, 0, lambda r, _: r.cpu_seconds),
@@ -185,9 +187,8 @@ def score_table(records: Sequence[Record], name: str, context: Context) -> Table
         e: [*(_seeds(row.get(c, {})) for c in columns), *(_over_tasks(row, columns) for _ in whole)]
         for e, row in rows.items()
     }
-    best = [
-        _best({e: v[k] for e, v in entries.items()}, measure.better, default) for k in range(len(columns) + len(whole))
-    ]
+    better = 0 if default else measure.better
+    best = [_best({e: v[k] for e, v in entries.items()}, better) for k in range(len(columns) + len(whole))]
     return Table(
         measure,
         (*columns, *whole),
@@ -210,15 +211,15 @@ def _over_tasks(row: dict[str, dict[int, float]], columns: Sequence[str]) -> tup
     return tuple(float(np.mean([row[c][seed] for c in columns])) for seed in sorted(seeds))
 
 
-def _best(column: dict[str, tuple[float, ...]], better: int, default: bool = False) -> str | None:
+def _best(column: dict[str, tuple[float, ...]], better: int) -> str | None:
     """The estimator that is the best outside noise, if there is one."""
     mine = {e: v for e, v in column.items() if e not in BASELINES and v}
     if better == 0 or len(mine) < 2:
         return None
     first = max(mine, key=lambda e: better * float(np.mean(mine[e])))
     rest = [v for e, v in mine.items() if e != first]
-    trivial = [] if default else [float(np.mean(v)) for e, v in column.items() if e in BASELINES and v]
-    ahead = all(better * (float(np.mean(mine[first])) - t) > 0 for t in trivial)
+    trivial = [float(np.mean(v)) for e, v in column.items() if e in BASELINES and v]
+    ahead = all(better * against(mine[first], t) > 0 for t in trivial)
     return first if ahead and all(differ(mine[first], other) for other in rest) else None
 
 
@@ -230,6 +231,16 @@ def differ(a: Sequence[float], b: Sequence[float]) -> bool:
         return bool(abs(a[0] - b[0]) > 1e-9)
     moments = [m for v in (a, b) for m in (np.mean(v), np.std(v, ddof=1), len(v))]
     return bool(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue < LEVEL)
+
+
+def against(values: Sequence[float], constant: float) -> int:
+    """1 or -1 where the mean is above or below a constant outside noise, by a one-sample t-test, else 0; 0 with one seed."""
+    above = float(np.mean(values)) - constant
+    if len(values) < 2 or abs(above) <= 1e-9:
+        return 0
+    if np.ptp(values) > 0 and stats.ttest_1samp(values, constant).pvalue >= LEVEL:
+        return 0
+    return 1 if above > 0 else -1
 
 
 def counted(records: Sequence[Record]) -> tuple[list[Record], str]:
@@ -290,23 +301,32 @@ def warning_counts(records: Sequence[Record]) -> list[tuple[str, str, int]]:
 
 def sweep_rows(records: Sequence[Record]) -> list[tuple[str, str, Entry, bool]]:
     """Of the search over hyper-parameters: estimator, values, mean accuracy over the tasks it was tuned on, whether these are the
-    library's defaults; the best first. Only combinations that were run on every task and seed of the search are comparable."""
+    library's defaults; the best first. Only combinations that were run on every task and seed of the search are comparable. Last, without
+    values, the baselines and ``laplace`` in the direct setting."""
     tried: dict[tuple[str, str], dict[str, dict[int, float]]] = {}
     ours: dict[tuple[str, str], bool] = {}
+    tuned = {record.task for record in records if record.setting == "sweep"}
     for record in records:
-        if record.setting == "sweep" and record.done:
-            key = (record.estimator, ", ".join(f"{k} = {v}" for k, v in record.values.items()))
-            tried.setdefault(key, {}).setdefault(record.task, {})[record.seed] = record.scores["mean_accuracy"]
-            ours[key] = all(_default(record.estimator, k) == v for k, v in record.values.items())
+        searched = record.setting == "sweep"
+        beside = record.estimator in (*BASELINES, REFERENCE) and record.task in tuned
+        if not record.done or not (searched or (beside and _where(record) == ("direct", "in_distribution"))):
+            continue
+        values = ", ".join(f"{k} = {v}" for k, v in record.values.items())
+        key = (record.estimator if searched else f"{record.estimator}, direct", values)
+        tried.setdefault(key, {}).setdefault(record.task, {})[record.seed] = record.scores["mean_accuracy"]
+        ours[key] = searched and all(_default(record.estimator, k) == v for k, v in record.values.items())
     found = []
     for estimator in order_estimators({e for e, _ in tried}):
         mine = {key: row for key, row in tried.items() if key[0] == estimator}
-        tasks = sorted({t for row in mine.values() for t in row})
-        values = {key[1]: over for key, row in mine.items() if (over := _over_tasks(row, tasks))}
-        best = _best(values, 1)
-        ranked = sorted(values, key=lambda v: -float(np.mean(values[v])))
-        found += [(estimator, v, Entry(values[v], 3, v == best), ours[estimator, v]) for v in ranked]
+        values_of = {key[1]: over for key, row in mine.items() if (over := _over_tasks(row, sorted(tuned)))}
+        best = _best(values_of, 1)
+        ranked = sorted(values_of, key=lambda v: -float(np.mean(values_of[v])))
+        found += [(estimator, v, Entry(values_of[v], 3, v == best), ours[estimator, v]) for v in ranked]
     return found
+
+
+def _where(record: Record) -> tuple[str, str]:
+    return record.setting, record.variant
 
 
 def _default(estimator: str, argument: str) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.frame import Files, blank, failed, measured
+from sipe_bayes.benchmark.frame import Files, blank, failed, measured, source
 from sipe_bayes.benchmark.measure import POLICIES
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
 from sipe_bayes.benchmark.transfer import (
@@ -133,7 +133,7 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
         truth=truth.tolist(),
         mean=drawn.posterior.mean.tolist(),
         sd=drawn.posterior.stddev.tolist(),
-        checksums={"model": simulator.checksum(), "randomization": drawn.fingerprint},
+        checksums={"model": simulator.checksum(), "randomization": drawn.fingerprint, "source": source()},
         evaluation=found,
         random=earned(evaluation.random(task, cell.seed), EPISODES, 0.0),
         curve=curve,

@@ -13,7 +13,8 @@ nothing. CRPS skill is added. Curves differ in line and marker as well as in col
 and Ito's palette, so that every version is safe for colour-blind readers. Accuracies below 0 and skills below -1 sit at the centre.
 
 Results in, one Matplotlib figure out, no pyplot, no state. ``Results`` are estimator -> environment -> scores of each seed, a score
-being ``Scores`` or what its ``to_dict`` returns; "prior_mean", where present, is the baseline and no estimator.
+being ``Scores`` or what its ``to_dict`` returns; "prior_mean", where present, is the baseline and no estimator. One of the estimators
+may be the ``reference`` that the others are held against: it is dotted on every radar.
 """
 
 from __future__ import annotations
@@ -99,17 +100,17 @@ def environments(results: Results) -> list[str]:
     return sorted(found, key=lambda name: (order.index(name) if name in order else len(order), name))
 
 
-def estimators(results: Results) -> list[str]:
-    """What is drawn as a curve of its own: everything but the baselines."""
-    return [name for name in results if name not in BASELINES]
+def estimators(results: Results, reference: str | None = None) -> list[str]:
+    """What is drawn as a curve of its own: everything but the baselines and the reference."""
+    return [name for name in results if name not in (*BASELINES, reference)]
 
 
 @_styled
-def sipe_plot(results: Results, mode: Mode | None = None) -> Figure:
+def sipe_plot(results: Results, mode: Mode | None = None, reference: str | None = None) -> Figure:
     """Left accuracy, right CRPS skill. Without a mode one row per estimator, with its mean (green), minimum (blue) and maximum
     (orange) over parameters; with one, all estimators in that mode on one pair of radars, at most six. The prior mean is
-    dashed. Raises ValueError for results without an estimator, another mode or more estimators."""
-    spokes, names = _checked(results), estimators(results)
+    dashed, the mean of the reference dotted. Raises ValueError for results without an estimator, another mode or more estimators."""
+    spokes, names = _checked(results), estimators(results, reference)
     if mode is None:
         rows = [(name, {m: _spread(results[name], spokes, m) for m in _MEASURES}) for name in names]
     elif mode not in MODES:
@@ -120,13 +121,13 @@ def sipe_plot(results: Results, mode: Mode | None = None) -> Figure:
         )
     else:
         rows = [(f"{mode} over parameters", {m: _several(results, names, spokes, m, mode) for m in _MEASURES})]
-    return _rows(rows, spokes, _baselines(results, spokes, mode or "mean"))
+    return _rows(rows, spokes, _baselines(results, spokes, mode or "mean", reference))
 
 
 @_styled
-def settings_plot(first: Results, second: Results, labels: tuple[str, str]) -> Figure:
+def settings_plot(first: Results, second: Results, labels: tuple[str, str], reference: str | None = None) -> Figure:
     """One row per estimator that has both: its mean accuracy and skill in one setting (green) and in another (orange), such as
-    demonstrations and the data of a policy, on the environments that both have. Raises ValueError where nothing is in both."""
+    demonstrations and the data of a policy, on the environments that both have; the reference is one of the first. Raises ValueError where nothing is in both."""
     both = [name for name in estimators(first) if any(first[name].values()) and any(second.get(name, {}).values())]
     spokes = [e for e in environments({n: first[n] for n in both}) if e in environments({n: second[n] for n in both})]
     if not spokes:
@@ -138,7 +139,7 @@ def settings_plot(first: Results, second: Results, labels: tuple[str, str]) -> F
         rows.append(
             (name, {m: [Curve(label, over_seeds(r, spokes, m, "mean"), *s) for label, r, s in pair] for m in _MEASURES})
         )
-    return _rows(rows, spokes, _baselines(first, spokes, "mean"))
+    return _rows(rows, spokes, _baselines(first, spokes, "mean", reference))
 
 
 def _checked(results: Results) -> list[str]:
@@ -161,16 +162,22 @@ def _several(results: Results, names: Sequence[str], spokes: Sequence[str], meas
     ]
 
 
-def _baselines(results: Results, spokes: Sequence[str], mode: Mode) -> dict[str, Curve]:
-    """The prior mean's curve in each measure."""
-    if BASELINE not in results:
-        return {}
-    values = {m: over_seeds(results[BASELINE], spokes, m, mode) for m in _MEASURES}
-    return {m: Curve("prior mean", v, "#444444", (0, (3, 2))) for m, v in values.items()}
+def _baselines(results: Results, spokes: Sequence[str], mode: Mode, reference: str | None) -> dict[str, list[Curve]]:
+    """The curves of the prior mean and of the reference in each measure."""
+    styles: list[tuple[str, Mode, Any]] = [(BASELINE, mode, (0, (3, 2)))]
+    styles += [(reference, "mean", (0, (1, 1.4)))] if reference is not None else []
+    return {
+        m: [
+            Curve(name.replace("_", " "), over_seeds(results[name], spokes, m, which), "#444444", line)
+            for name, which, line in styles
+            if name in results
+        ]
+        for m in _MEASURES
+    }
 
 
 def _rows(
-    rows: Sequence[tuple[str, Mapping[str, list[Curve]]]], spokes: Sequence[str], baselines: Mapping[str, Curve]
+    rows: Sequence[tuple[str, Mapping[str, list[Curve]]]], spokes: Sequence[str], baselines: Mapping[str, list[Curve]]
 ) -> Figure:
     """A row per title, a column per measure, one legend."""
     figure = _figure(_SIDE * len(rows) + 0.45)
@@ -179,15 +186,16 @@ def _rows(
     axes: Any = figure.subplots(len(rows), len(_MEASURES), squeeze=False, subplot_kw={"projection": "polar"})
     for line, (title, curves) in zip(axes, rows, strict=True):
         for ax, measure in zip(line, _MEASURES, strict=True):
-            drawn = [*curves[measure], *([baselines[measure]] if baselines else [])]
-            _radar(ax, drawn, spokes, _RANGES[measure])
+            _radar(ax, [*curves[measure], *baselines[measure]], spokes, _RANGES[measure])
             ax.set_title(f"{title}: {measure}", fontweight="bold", pad=26)
     figure.legend(handles=_legend(rows, baselines), loc="outside upper center", ncols=4 if len(rows) > 1 else 7)
     return figure
 
 
-def _legend(rows: Sequence[tuple[str, Mapping[str, list[Curve]]]], baselines: Mapping[str, Curve]) -> list[Line2D]:
-    shown = [*rows[0][1][_MEASURES[0]], *list(baselines.values())[:1]]
+def _legend(
+    rows: Sequence[tuple[str, Mapping[str, list[Curve]]]], baselines: Mapping[str, list[Curve]]
+) -> list[Line2D]:
+    shown = [*rows[0][1][_MEASURES[0]], *baselines[_MEASURES[0]]]
     return [Line2D([], [], color=c.colour, ls=c.line, marker=c.marker, ms=4.5, label=c.label) for c in shown]
 
 
