@@ -166,8 +166,9 @@ def test_nothing_is_best_where_the_truth_is_the_centre() -> None:
     assert same is not None
     assert [sum(e.best for _, row in t.rows for e in row if e) for t in (apart, same)] == [0, 1]
     section = report_contents._group("direct-default", "", records, tables.Context.of(records))
-    assert len(section.sentences) == 1
+    assert len(section.sentences) == 2
     assert "nothing is set in bold" in section.sentences[0]
+    assert section.sentences[1] == report_contents._RADARS
 
 
 def test_against_a_constant() -> None:
@@ -296,7 +297,7 @@ def test_the_reference_is_dotted_on_every_figure(found: report_contents.Contents
         (legend,) = picture.figure.legends
         names = [text.get_text() for text in legend.get_texts()]
         assert "prior mean" in names, picture.name
-        own = "laplace" in picture.caption.split(":")[0].split(". The radius")[0]
+        own = "laplace" in picture.caption.split(": ")[1]
         assert own or {"laplace", "laplace, direct"} & set(names), (picture.name, names)
 
 
@@ -353,6 +354,8 @@ def test_contents_say_what_was_run_and_what_is_missing(found: report_contents.Co
         "Learned rewards against state differences",
         "Gradient steps of MAML",
     } <= set(titles)
+    ablation = next(s for s in found.sections if s.anchor == "gradient-steps")
+    assert "with 2 gradient steps less that with 0 gradient steps is 0.210" in ablation.sentences[0]
     sweep = next(s for s in found.sections if s.anchor == "sweep")
     assert "would choose particles = 4" in sweep.sentences[0]
     outside = next(s for s in found.sections if s.anchor.endswith("out_of_distribution"))

@@ -51,7 +51,7 @@ def rows(table: Table) -> Iterator[str]:
 
 def drawn(picture: Picture) -> Iterator[str]:
     picture.figure.savefig(RESULTS / f"{picture.name}.png", dpi=110)
-    yield f"\n![{picture.caption}]({picture.name}.png)\n\n{picture.caption}\n"
+    yield f"\n![{picture.caption}]({picture.name}.png)\n\n*{picture.caption}*\n"
 
 
 def section(found: Section) -> Iterator[str]:

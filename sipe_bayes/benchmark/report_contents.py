@@ -51,7 +51,7 @@ _NOTES = {
     OUTSIDE: "The truth lies outside every range here, so only CRPS, the energy score and whether a method noticed mean anything.",
 }
 _PER_FIGURE = 3  # estimators
-_RADARS = "The radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
+_RADARS = "Radars: the radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
 
 
 @dataclass(frozen=True)
@@ -162,6 +162,7 @@ def _group(anchor: str, title: str, records: Sequence[Record], context: Context)
     found = [] if variant == "default" else table_findings(tables)
     section = Section(anchor, title, [*(n for n in notes if n), *found], tables)
     if variant != OUTSIDE:
+        section.sentences.append(_RADARS)
         section.pictures.extend(_radars(anchor, shown))
     if anchor == "direct-in_distribution":
         section.in_depth.extend(_parameters(shown))
@@ -175,13 +176,9 @@ def _radars(anchor: str, records: Sequence[Record]) -> Iterator[Picture]:
     mine = [name for name in found if name not in BASELINES and name != f"{REFERENCE}, direct"]
     for k, part in enumerate(_parts(mine, COMPARED)):
         drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, "mean", None if reference in part else reference)
-        yield Picture(
-            f"{anchor}-compared{k}", f"Means over parameters and seeds of {', '.join(part)}. {_RADARS}", drawn
-        )
+        yield Picture(f"{anchor}-compared{k}", f"Means over parameters and seeds: {', '.join(part)}.", drawn)
     for k, part in enumerate(_parts(mine, _PER_FIGURE)):
-        caption = (
-            f"{', '.join(part)}: mean (green), worst (blue) and best (orange) parameter of each environment. {_RADARS}"
-        )
+        caption = f"Mean (green), worst (blue) and best (orange) parameter of each environment: {', '.join(part)}."
         drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, None, None if reference in part else reference)
         yield Picture(f"{anchor}-spread{k}", caption, drawn)
 
@@ -227,13 +224,15 @@ def _pair(
     section.tables.extend(t for n in ("accuracy", "spread", "CRPS skill") if (t := score_table(rows, n, context)))
     said = [f"With {label}: {s}" for label, s in zip(labels, (of_one, of_two), strict=True) if s]
     section.sentences.extend([*said, unequal(rows)] if unequal(rows) else said)
-    section.sentences.extend(pair_findings(left, right, labels))
+    section.sentences.extend([*pair_findings(left, right, labels), _RADARS])
     everything, reference = results([*left, *beside]), f"{REFERENCE}, direct"
     names = [n for n in everything if n not in (*BASELINES, reference)]
     for k, part in enumerate(_parts(names, _PER_FIGURE)):
         shown = {n: everything[n] for n in everything if n in part or n not in names}
         figure = settings_plot(shown, results(right), labels, reference if reference in everything else None)
-        caption = f"{', '.join(part)}: means over parameters and seeds with {labels[0]} (green) and {labels[1]} (orange). {_RADARS}"
+        caption = (
+            f"Means over parameters and seeds with {labels[0]} (green) and {labels[1]} (orange): {', '.join(part)}."
+        )
         section.pictures.append(Picture(f"{section.anchor}{k}", caption, figure))
     return section
 
@@ -262,6 +261,11 @@ def _along(done: Sequence[Record], setting: str, title: str, what: str) -> Secti
         else ". Searches are looked at on the way, from when each seed has an estimate; methods that train once are known at the end alone."
     )
     section.pictures.append(Picture(section.anchor, caption, draw([*mine, *beside])))
+    if setting == "gradient_steps":
+        few, many = (f([r.values["gradient_steps"] for r in mine]) for f in (min, max))
+        with_few, with_many = ([r for r in mine if r.values["gradient_steps"] == n] for n in (few, many))
+        labels = (f"{few} gradient steps", f"{many} gradient steps")
+        section.sentences.extend(pair_findings(with_few, with_many, labels))
     return section
 
 
