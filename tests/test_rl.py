@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -253,7 +254,10 @@ def contents(path: Path) -> dict[str, Any]:
     ids=["published", "every option", "goals and hindsight"],
 )
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, settings: Settings) -> None:
-    drawn = Randomization(prior(sipe.make_task(task).space), observation_noise=0.01, action_delay=2)
+    wider = [
+        replace(p, high=p.low + 1.5 * (p.high - p.low)) for p in sipe.make_task(task).space
+    ]  # some theta are drawn anew
+    drawn = Randomization(prior(sipe.ParameterSpace(wider)), observation_noise=0.01, action_delay=2)
     run = {"evaluate_every": 90, "evaluation_episodes": 2, "checkpoint_every": 75, "randomization": drawn}
     whole = train(task, 270, 3, tmp_path / "whole", settings, **run)  # type: ignore[arg-type]
     short = tmp_path / "short"
@@ -281,6 +285,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, setti
         if name not in ("seconds", "curve"):  # the time it took
             np.testing.assert_array_equal(value, states[1][name], err_msg=name)
     assert states[0]["updates"] > 100
+    assert states[0]["redrawn"] > 0
     assert len(list((short / "checkpoint").glob("replay-*.npz"))) == 1
 
 

@@ -1,6 +1,8 @@
 """Sim2sim transfer: its cells, killed and resumed runs, what is refused, and what the report makes of returns."""
 
+import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +15,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from sipe_bayes.benchmark import transfer, transfer_measure
+import sipe_bayes as sipe_package
+from sipe_bayes.benchmark import transfer, transfer_measure, transfer_report
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.measure import POLICIES, _netcdf
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
@@ -25,13 +28,14 @@ from sipe_bayes.benchmark.transfer import (
     estimate_of,
     select,
     settings,
+    trained_as,
     varied,
 )
-from sipe_bayes.benchmark.transfer_report import bars, curves, label, relative, rows, table
+from sipe_bayes.benchmark.transfer_report import bars, contrasts, curves, label, relative, rows, table
 from sipe_bayes.benchmark.transfer_run import load, summary
 from sipe_bayes.cli import app
 from sipe_bayes.envs.registry import TASKS, make_task
-from sipe_bayes.posterior import Dirac, Posterior, prior
+from sipe_bayes.posterior import Dirac, Particles, Posterior, prior
 from sipe_bayes.simulator import Simulator
 
 SMALL = ["--suite", "quick", "--training", "600", "--budget", "60", "--steps", "20"]
@@ -79,6 +83,9 @@ def test_cells() -> None:
     assert {c.seed for c in study} == {0, 1, 2}
     assert min(c.training for c in study) >= 150_000
     assert not [c for c in study if (c.estimator, c.variant) == ("default", "default")]
+    assert {(c.estimator, c.values) for c in study if c.values} == {
+        *(("bayessim", (("point", "mean"),)), ("bayessim", (("particles", 10),)))
+    }
     assert set(SUITES) == {"quick", "study", "nine", "all"}
     assert {c.task for c in select("all")} == set(TASKS)
 
@@ -127,7 +134,32 @@ def test_variations_are_in_the_id_and_not_of_the_truth() -> None:
     assert estimate_of(second) == estimate_of(CELL)
 
 
+def test_cells_that_ask_for_the_same_training() -> None:
+    """The prior has no variant, and the default model is the truth of its own."""
+    study = select("study")
+    twins = {cell.id: trained_as(cell).id for cell in study if trained_as(cell) != cell}
+    assert len(twins) == 2 * 3 * 3
+    assert twins["FetchPush/prior/transfer/in_distribution/seed1"] == "FetchPush/prior/transfer/default/seed1"
+    assert twins["FetchPush/default/transfer/in_distribution/seed1"] == "FetchPush/truth/transfer/default/seed1"
+
+
 # Runs
+
+
+def test_the_same_training_is_made_once(tmp_path: Path) -> None:
+    """Two targets, one agent of the prior: it is trained for the first and read for the second."""
+    chosen = ["--suite", "all", "--select", "pendulum/prior/transfer/*/seed0"]
+    arguments = [*chosen, *SMALL[2:], "--executor", "inline", "--out", str(tmp_path)]
+    found = sipe("run", *arguments)
+    assert found.exit_code == 0, found.output
+    default, inside = sorted(load(tmp_path), key=lambda r: r.variant)
+    assert [row["own_return"] for row in default.curve] == [row["own_return"] for row in inside.curve]
+    assert default.checksums["randomization"] == inside.checksums["randomization"]
+    assert default.evaluation["mean"] != inside.evaluation["mean"]
+    assert inside.cpu_seconds is None
+    (folder,) = (tmp_path / POLICIES).iterdir()
+    assert folder.name == file_name(default.id)
+    assert not (folder / "checkpoint").exists()
 
 
 def test_records(undisturbed: Path) -> None:
@@ -148,6 +180,17 @@ def test_records(undisturbed: Path) -> None:
     np.testing.assert_allclose(found["laplace"].mean, direct.mean, atol=4 * max(direct.sd) / np.sqrt(2000) + 1e-12)
     again = measured(undisturbed, *TWO)
     assert again.output == "2 cells, 2 of them there already; 0 estimates to make first\n"
+
+
+def test_agents_of_an_estimate_that_was_measured_anew_are_named(undisturbed: Path, tmp_path: Path) -> None:
+    for path in (undisturbed / "transfer" / "records", undisturbed / "records"):
+        shutil.copytree(path, tmp_path / path.relative_to(undisturbed))
+    shutil.copy(undisturbed / "transfer" / "plan.json", tmp_path / "transfer" / "plan.json")
+    assert summary(tmp_path)["stale"] == []
+    space = make_task("Pendulum").space
+    posterior_path(tmp_path, "Pendulum/laplace/direct/in_distribution/seed0").write_bytes(_netcdf(prior(space), 0))
+    assert summary(tmp_path)["stale"] == ["Pendulum/laplace/transfer/in_distribution/seed0"]
+    assert "its estimate was measured anew" in sipe("status", str(tmp_path)).output
 
 
 def test_status_and_report(undisturbed: Path, tmp_path: Path) -> None:
@@ -231,11 +274,30 @@ def test_variations_reach_the_training(tmp_path: Path) -> None:
     drawn = transfer_measure.randomization(cell, tmp_path)
     assert (drawn.observation_noise, drawn.action_delay) == (0.1, 2)
     np.testing.assert_allclose(drawn.posterior.mean, [0.2, 0.3, 0.4], atol=1e-12)  # a point has nothing to widen
-    estimated(tmp_path, prior(space))
-    assert not np.allclose(
-        transfer_measure.randomization(cell, tmp_path).posterior.sample((5,)),
-        transfer_measure.randomization(CELL, tmp_path).posterior.sample((5,)),
+    narrow = Particles(0.4 + 0.05 * np.random.default_rng(0).random((500, 3)), space)
+    estimated(tmp_path, narrow)
+    whole = transfer_measure.randomization(CELL, tmp_path).posterior
+    np.testing.assert_allclose(whole.stddev, narrow.stddev, rtol=0.1)
+    wide = transfer_measure.randomization(cell, tmp_path).posterior
+    np.testing.assert_allclose(wide.stddev, 2 * whole.stddev, rtol=0.02)
+    point, few = (
+        transfer_measure.randomization(varied([CELL], **{name: value})[0], tmp_path).posterior
+        for name, value in (("point", "mean"), ("particles", 10))
     )
+    np.testing.assert_allclose(point.sample((3,)), np.tile(whole.mean, (3, 1)))
+    drawn = few.sample((200,))
+    assert len(np.unique(drawn, axis=0)) == 10
+    assert np.all((drawn.numpy() >= 0.4) & (drawn.numpy() <= 0.45))
+
+
+def test_draws_outside_the_bounds_are_refused_by_name(tmp_path: Path) -> None:
+    """They come from an estimate within other bounds; at the bound they would pile up."""
+    space = make_task("Pendulum").space
+    wider = sipe_package.ParameterSpace([replace(p, high=2 * p.high) if p.name == "length" else p for p in space])
+    estimated(tmp_path, Dirac([0.5, 0.9, 0.5], wider))
+    done = transfer_measure.run(CELL, tmp_path, "")
+    assert done.failed
+    assert "draws of length outside the bounds that Pendulum has now" in done.line
 
 
 @pytest.mark.parametrize(
@@ -287,6 +349,7 @@ def record(name: str, seed: int, earned: float, task: str = "HalfCheetahLinks", 
         "random": {"mean": 100.0},
         "curve": curve,
         "seconds": 1.0,
+        "sd": [0.1, 0.1],
         **changes,
     }
     return TransferRecord(*plain, budget=60, steps=20, status="done", **more)
@@ -294,12 +357,23 @@ def record(name: str, seed: int, earned: float, task: str = "HalfCheetahLinks", 
 
 def test_percentages_and_their_bootstrap() -> None:
     """Of two seeds a resample has the mean of either alone in one case of four, so the interval ends there."""
-    value, interval = relative(np.array([300.0, 700.0]), np.array([1100.0, 1100.0]), 100.0)
-    assert value == pytest.approx(40.0)
-    assert interval == pytest.approx((20.0, 60.0))
+    found = relative(np.array([300.0, 700.0]), np.array([1100.0, 1100.0]), 100.0)
+    assert found is not None
+    assert found[0] == pytest.approx(40.0)
+    assert found[1] == pytest.approx((20.0, 60.0))
     assert relative(np.array([300.0]), np.array([500.0]), 100.0) == (50.0, None)
-    paired = relative(np.array([100.0, 1000.0]), np.array([200.0, 2000.0]), 0.0)
+    paired = relative(np.array([200.0, 500.0]), np.array([400.0, 1000.0]), 0.0)
+    assert paired is not None
     assert paired[1] == pytest.approx((50.0, 50.0)), "a seed's agent and oracle are drawn together"
+
+
+def test_no_percentage_where_an_oracle_fails() -> None:
+    """A resample of that seed alone would divide by nothing."""
+    mine = np.array([-12.0, -12.0, -12.0])
+    assert relative(mine, np.array([-10.0, -10.0, -49.0]), -46.0) is None
+    assert relative(mine, np.array([-10.0, -10.0, -44.0]), -46.0) is None
+    assert relative(mine, np.array([-10.0, -10.0, -30.0]), -46.0) is not None
+    assert relative(np.array([]), np.array([]), -46.0) is None
 
 
 def test_rows_and_table() -> None:
@@ -310,13 +384,18 @@ def test_rows_and_table() -> None:
     given.append(replace(record("npe", 0, 0.0), status="failed", evaluation={}))
     found = {row.name: row for row in rows(given)}
     assert list(found) == ["truth", "prior", "adr", "adr, wider=2.0"]
-    assert found["truth"].percent == found["adr, wider=2.0"].percent == 100
-    assert found["prior"].percent == 25
-    assert found["adr"].percent == 55
-    assert found["adr"].paper == pytest.approx(100 * 650 / 1100)
+    assert found["truth"].percent == (100, (100, 100))
+    assert found["adr, wider=2.0"].percent == (100, None)
+    assert found["prior"].percent == (25, None)
+    assert found["adr"].percent == (55, (50, 60))
+    assert found["adr"].by_seed == {0: 50, 1: 60}
+    assert found["adr"].paper is not None
+    assert found["adr"].paper[0] == pytest.approx(100 * 650 / 1100)
+    assert contrasts(list(found.values())) == [("adr, wider=2.0", "prior", [75.0], 1)]  # others lack a seed of the two
     assert label(given[-2]) == "adr, wider=2.0"
     text = table(rows(given), given)
-    assert "| adr | 2 | 650.0 ± 50.0 | 55 (50 to 60) | 59 (55 to 64) |" in text
+    assert "| adr | 0.10 | 2 | 650.0 ± 50.0 | 55 (50 to 60) | 59 (55 to 64) |" in text
+    assert "| adr, wider=2.0 | prior (uniform) | 1 | 75.0 | no |" in text
     for figure in (bars(rows(given)), curves(given)):
         assert {t.get_text() for t in figure.legends[0].get_texts()} >= {"truth (oracle)", "prior (uniform)", "adr"}
     heights = sorted(p.get_height() for p in bars(rows(given)).axes[0].patches)
@@ -327,6 +406,45 @@ def test_negative_returns_and_a_missing_oracle() -> None:
     """Where returns are negative the paper's percentage means nothing and is left out; without an oracle there is none at all."""
     given = [record("truth", 0, -200.0, random={"mean": -1200.0}), record("adr", 0, -700.0, random={"mean": -1200.0})]
     found = rows(given)
-    assert [(row.percent, row.paper) for row in found] == [(100.0, None), (50.0, None)]
+    assert [(row.percent, row.paper) for row in found] == [((100.0, None), None), ((50.0, None), None)]
     (alone,) = rows([record("adr", 0, 700.0)])
-    assert (alone.percent, alone.paper, alone.interval) == (None, None, None)
+    assert (alone.percent, alone.paper, alone.by_seed) == (None, None, {})
+
+
+def test_contrasts_are_paired_by_seed_over_targets() -> None:
+    """The two targets differ far more than the two randomisations."""
+    given = []
+    for task, level in (("HalfCheetahLinks", 1100.0), ("FetchPush", 300.0)):
+        for seed in range(3):
+            given += [record("truth", seed, level, task), record("prior", seed, 100 + 0.2 * (level - 100), task)]
+            given.append(record("adr", seed, 100 + (0.5 + 0.01 * seed) * (level - 100), task))
+    found = rows(given)
+    ((name, other, gains, targets),) = contrasts(found)
+    assert (name, other, targets) == ("adr", "prior", 2)
+    np.testing.assert_allclose(gains, [30, 31, 32])
+    assert "| adr | prior (uniform) | 2 | 31.0 ± 0.6 | better |" in table(found, given)
+
+
+def test_the_studys_figures_tell_every_randomisation_apart() -> None:
+    """Each has its own look and one entry of the legend, also the default model, which the first group lacks."""
+    given = [replace(record(c.estimator, c.seed, 400.0 + 100 * c.seed + len(c.estimator), c.task), variant=c.variant, id=c.id, setting=c.id.split("/")[2])
+             for c in select("study")]  # fmt: skip
+    found = rows(given)
+    names = [n for n in dict.fromkeys(row.name for row in found) if n != "truth"]
+    assert len(names) == 12
+    looks = [transfer_report._look(name, names) for name in ["truth", *names]]
+    assert len({(look.colour, look.line) for look in looks}) == len({(look.colour, look.hatch) for look in looks}) == 13
+    for figure in (bars(found), curves(given)):
+        said = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert sorted(said) == sorted({*(transfer_report._WORDS.get(n, n) for n in names), "truth (oracle)"})
+
+
+def test_the_example_runs(tmp_path: Path) -> None:
+    """In small: log, posterior, agents under five randomisations, returns in the target, a picture."""
+    example = Path(__file__).parents[1] / "examples" / "transfer" / "transfer.py"
+    command = [sys.executable, str(example), "--seeds", "1", "--steps", "600", "--out", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    found = json.loads((tmp_path / "transfer.json").read_text(encoding="utf-8"))
+    assert [agent["name"] for agent in found["agents"]] == ["truth", "posterior", "point", "prior", "model as it is"]
+    assert all(-2500 < agent["return"] < 0 and len(agent["curve"]) > 3 for agent in found["agents"])
+    assert (tmp_path / "transfer.png").read_bytes().startswith(b"\x89PNG")

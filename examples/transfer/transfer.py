@@ -2,6 +2,7 @@
 
     python examples/transfer/transfer.py            # minutes on two cores; goes on after an interruption
     python examples/transfer/transfer.py --seeds 1  # a third of that
+    python examples/transfer/transfer.py --seeds 1 --steps 1000 --out /tmp/look   # whether it runs
 
 1. The target, a simulated pendulum that stands for the machine and whose mass and length nobody knows, is moved to and fro for
    5 s and recorded with 5 % noise.
@@ -29,7 +30,7 @@ from sipe_bayes.output import to_json
 from sipe_bayes.posterior import prior
 
 HERE = Path(__file__).parent
-TASK, STEPS, EPISODES, CORES = "Pendulum", 20_000, 50, 2
+TASK, EPISODES, CORES = "Pendulum", 50, 2
 TRUTH = np.array([0.85, 0.8, 0.5])  # theta of mass, length, damping; the model as it is has 0.5 of each
 NAMES = ("truth", "posterior", "point", "prior", "model as it is")
 
@@ -54,7 +55,7 @@ def randomisation(name: str, posterior: sipe.Posterior) -> sipe.Posterior:
     }[name]
 
 
-def trained(name: str, seed: int, runs: Path) -> dict[str, Any]:
+def trained(name: str, seed: int, steps: int, runs: Path) -> dict[str, Any]:
     """An agent's returns in the target: at the end, and along its training."""
     import torch
 
@@ -65,11 +66,11 @@ def trained(name: str, seed: int, runs: Path) -> dict[str, Any]:
 
     torch.set_num_threads(1)
     began = time.process_time()
-    task, folder = sipe.make_task(TASK), runs / f"{name.replace(' ', '-')}-{seed}"
+    task, folder = sipe.make_task(TASK), runs / f"{name.replace(' ', '-')}-{seed}-{steps}"
     under = sipe.Randomization(randomisation(name, sipe.load_posterior(runs / "posterior")))
-    every = STEPS // 10
+    every = steps // 10
     policy = train(
-        *(task, STEPS, seed, folder, settings(task, STEPS)),
+        *(task, steps, seed, folder, settings(task, steps)),
         resume=True,
         randomization=under,
         evaluate_every=every,
@@ -122,6 +123,7 @@ def draw(found: list[dict[str, Any]], posterior: sipe.Posterior) -> bytes:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=20_000, help="control steps of each training")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args()
     began, runs = time.perf_counter(), given.out / "runs"
@@ -132,7 +134,7 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that follow
     found = []
     with ProcessPoolExecutor(CORES, multiprocessing.get_context("spawn")) as pool:
-        jobs = [pool.submit(trained, name, seed, runs) for seed in range(given.seeds) for name in NAMES]
+        jobs = [pool.submit(trained, name, seed, given.steps, runs) for seed in range(given.seeds) for name in NAMES]
         for job in jobs:
             found.append(job.result())
             row = found[-1]
@@ -144,7 +146,7 @@ def main() -> None:
         returns = [row["return"] for row in found if row["name"] == name]
         print(f"{name}: {np.mean(returns):.0f} (seeds {', '.join(f'{r:.0f}' for r in returns)})")
     seconds = time.perf_counter() - began
-    write_text(given.out / "transfer.json", to_json({"steps": STEPS, "seconds": seconds, "agents": found}) + "\n")
+    write_text(given.out / "transfer.json", to_json({"steps": given.steps, "seconds": seconds, "agents": found}) + "\n")
     write_bytes(given.out / "transfer.png", draw(found, posterior))
     print(f"{given.out / 'transfer.png'}, {seconds:.0f} s")
 

@@ -57,13 +57,15 @@ def blank(kind: type[R], cell: Cell, command: str, **more: Any) -> R:
         "status": "done",
         "values": dict(cell.values),
         "versions": versions(),
+        "checksums": {"source": source()},
         "command": command,
     }
     return kind(**{**entries, **more})
 
 
-def measured(record: R, measure: Callable[[R], tuple[R, Files, str]]) -> Done:
-    """What a cell comes to. measure: from the blank record the full one, files to be written before it, and a few words."""
+def measured(record: R, measure: Callable[[R], tuple[R, Files, str]], spent: str = "") -> Done:
+    """What a cell comes to. measure: from the blank record the full one, files to be written before it, and a few words. spent: as of
+    ``Done``."""
     began = time.process_time()
     try:
         with warnings.catch_warnings():
@@ -71,7 +73,7 @@ def measured(record: R, measure: Callable[[R], tuple[R, Files, str]]) -> Done:
             full, files, line = measure(record)
     except Exception:  # a failed cell must not stop the others
         return failed(record, traceback.format_exc(), time.process_time() - began)
-    return Done((*files, full.file), line, time.process_time() - began)
+    return Done((*files, full.file), line, time.process_time() - began, spent=spent)
 
 
 def failed(record: Record, why: str, cpu_seconds: float = 0.0) -> Done:

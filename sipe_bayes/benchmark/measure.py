@@ -15,7 +15,7 @@ import torch
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
-from sipe_bayes.benchmark.frame import Files, blank, failed, measured, source
+from sipe_bayes.benchmark.frame import Files, blank, failed, measured
 from sipe_bayes.benchmark.log import Log, one_step, recorded
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path
 from sipe_bayes.benchmark.work import Done
@@ -27,7 +27,7 @@ from sipe_bayes.inference.registry import estimator_class, get_estimator
 from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.simulator import Simulator
 
-POLICIES = "policies"
+POLICIES, CHECKPOINTS = "policies", "checkpoint"  # a checkpoint holds a replay buffer, which nothing needs at the end
 _ALONG = (0.1, 0.25, 0.5)  # of the budget, where the history looks at an estimate
 _CANDIDATES = 0.1  # of the budget: starting points of the methods that search a likelihood
 
@@ -49,7 +49,8 @@ def run(cell: Cell, folder: Path, command: str) -> Done:
     """Measure a cell. folder: of the results; read for simulations, and a training's checkpoints are kept in it. Where it is not there,
     as this is another machine, the cell makes what it needs for itself."""
     with at_hand(folder) as here:
-        return measured(blank_record(cell, command), lambda record: _measured(cell, record, here))
+        spent = f"{POLICIES}/{file_name(cell.id)}/{CHECKPOINTS}" if cell.with_policy else ""
+        return measured(blank_record(cell, command), lambda record: _measured(cell, record, here), spent)
 
 
 @contextmanager
@@ -104,7 +105,7 @@ def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, 
         determined=None if log.determined is None or cell.with_policy else log.determined.tolist(),
         history=[*rows, last],
         log="policy" if cell.with_policy else log.source,
-        checksums={"model": simulator.checksum(), "log": digest(log.trajectories), "source": source()},
+        checksums={**record.checksums, "model": simulator.checksum(), "log": digest(log.trajectories)},
         **found.more,
     )
     line = f"accuracy {scores.mean_accuracy:.3f}, CRPS {scores.mean_crps:.3f}"

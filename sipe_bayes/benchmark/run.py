@@ -20,7 +20,7 @@ from sipe_bayes.atomic import write_bytes
 from sipe_bayes.benchmark import bank, measure, spent
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
-from sipe_bayes.benchmark.records import Record, file_name, plan
+from sipe_bayes.benchmark.records import Record, plan
 from sipe_bayes.benchmark.work import Done, Executor, Unit
 from sipe_bayes.output import OutputError
 
@@ -160,7 +160,7 @@ def carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor], 
                 flying += 1
             unit, done = executor.next()
             flying -= 1
-            _write(unit, done, folder)
+            _write(done, folder)
             written.add(unit.name)
             failed += done.failed
             log.add(unit, done)
@@ -169,12 +169,11 @@ def carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor], 
     return failed
 
 
-def _write(unit: Unit, done: Done, folder: Path) -> None:
+def _write(done: Done, folder: Path) -> None:
     for name, data in done.files:
         write_bytes(folder / name, data)
-    checkpoint = folder / measure.POLICIES / file_name(unit.name) / "checkpoint"
-    if checkpoint.is_dir() and not done.failed:
-        shutil.rmtree(checkpoint)  # a replay buffer that nothing needs any more
+    if done.spent:
+        shutil.rmtree(folder / done.spent, ignore_errors=True)
 
 
 class _Log:

@@ -12,9 +12,13 @@ evaluated in the target as it is, zero-shot:
   record keeps, which are particles. The cell is measured first where it is not there.
 
 All of them train with equal settings, for equally many control steps, from the same seed. Of the second half of a training that policy
-is kept which earns most in episodes of its own randomisation; the target is never looked at for it, and its curve is made afterwards.
+is kept which earns most in episodes of its own randomisation, ten theta of it, which are the same with every seed; the target is never
+looked at for it, but that the oracle's own randomisation is the target. The curve in the target is made afterwards. Where two cells ask for
+the same training, as the prior does on both variants, it is made once, so that their results are not independent.
 
-Variations of a randomisation, the truth's excepted: ``wider`` (``Posterior.wider``), ``observation_noise`` and ``action_delay``.
+Variations of a randomisation, the truth's excepted: ``wider`` (``Posterior.wider``), ``observation_noise`` and ``action_delay``; and, to
+tell what of a posterior it is that helps, ``point`` ("mean": its mean alone) and ``particles`` (so many of its draws). The study has both
+of one estimator whose posteriors are wide.
 
 Deviations. The paper trains on the default model's variants, which it does not name; here the target is the default or the
 in-distribution variant, whose theta no prior mean guesses. It has neither the prior nor the default model in its figure. The agents are
@@ -57,6 +61,8 @@ _DEMONSTRATION_SHARE = 0.3  # of a batch
 _DEMONSTRATED = ("FetchPush", "FetchPickAndPlace")
 _SMALL = ("Pendulum", "CartPole")
 _STUDY = ("HalfCheetahLinks", "HalfCheetahJoints", "FetchPush")
+_REDUCED = "bayessim"  # also by its mean, and by
+_FEW = 10  # particles
 _SMALL_AGENT: dict[str, Any] = {
     "hidden": (64, 64),
     "batch": 128,
@@ -124,6 +130,13 @@ def cells(
             yield Cell(task, name, SETTING, variant, seed, training=_steps(task))
 
 
+def reduced(tasks: Iterable[str]) -> Iterator[Cell]:
+    """One estimator's posterior as a point and as a few particles."""
+    for cell in cells(tasks, (_REDUCED,), ("in_distribution",)):
+        yield from varied([cell], point="mean")
+        yield from varied([cell], particles=_FEW)
+
+
 def _steps(task: str) -> int:
     return _SMALL_STEPS if task in _SMALL else _STEPS
 
@@ -149,8 +162,8 @@ SUITES = {
         lambda: cells(("Pendulum",), (*REFERENCES, "laplace", "regression"), ("in_distribution",), (0,)),
     ),
     "study": Suite(
-        f"{', '.join(_STUDY)}: the references, the paper's estimators, npe and laplace, three seeds",
-        lambda: cells(_STUDY, (*REFERENCES, *PAPER, "npe", "laplace")),
+        f"{', '.join(_STUDY)}: the references, the paper's estimators, npe and laplace; {_REDUCED} also as a point and as particles",
+        lambda: itertools.chain(cells(_STUDY, (*REFERENCES, *PAPER, "npe", "laplace")), reduced(_STUDY)),
     ),
     "nine": Suite(
         "the same on the paper's nine environments", lambda: cells(NINE, (*REFERENCES, *PAPER, "npe", "laplace"))
@@ -167,15 +180,30 @@ def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
     return matching(cells, patterns, lambda _: such)
 
 
-def varied(chosen: Sequence[Cell], **variations: float | None) -> list[Cell]:
+def varied(chosen: Sequence[Cell], **variations: float | str | None) -> list[Cell]:
     """The cells with variations of their randomisation, those of the truth as they are."""
     given = tuple((name, value) for name, value in variations.items() if value is not None)
-    return [cell if cell.estimator == TRUTH else replace(cell, values=given) for cell in chosen]
+    return [cell if cell.estimator == TRUTH else replace(cell, values=cell.values + given) for cell in chosen]
+
+
+def trained_as(cell: Cell) -> Cell:
+    """The cell whose training is the same: the prior knows no variant, and to train in the default model is to train in the truth of the
+    default variant."""
+    if cell.estimator == DEFAULT and not cell.values:
+        return replace(cell, estimator=TRUTH, variant="default")
+    return replace(cell, variant="default") if cell.estimator in (PRIOR, DEFAULT) else cell
 
 
 def estimate_of(cell: Cell) -> Cell | None:
     """The benchmark's cell whose posterior a cell randomises by, None of a reference."""
     return None if cell.estimator in REFERENCES else replace(cell, setting="direct", values=(), training=Cell.training)
+
+
+def cell_of(record: TransferRecord) -> Cell:
+    """The cell that a record is of."""
+    variant: Any = record.variant
+    what = (record.task, record.estimator, SETTING, variant, record.seed)
+    return Cell(*what, tuple(record.values.items()), record.budget, record.steps, record.training)
 
 
 def agent_of(cell: Cell) -> Settings:

@@ -48,6 +48,8 @@ def run(
     budget: Annotated[int | None, typer.Option(help="Rollouts of each estimate; default 1000.")] = None,
     steps: Annotated[int | None, typer.Option(help="Control steps of an estimate's trajectory.")] = None,
     wider: Annotated[float | None, typer.Option(help="Spread every posterior this many times as far.")] = None,
+    point: Annotated[bool, typer.Option("--point", help="Train under every posterior's mean alone.")] = False,
+    particles: Annotated[int | None, typer.Option(help="Train under so many draws of every posterior.")] = None,
     observation_noise: Annotated[
         float | None, typer.Option(help="Greatest sd of the noise on observations in training, in the channels' units.")
     ] = None,
@@ -66,10 +68,19 @@ def run(
         from sipe_bayes.benchmark.transfer import select as chosen
         from sipe_bayes.benchmark.transfer import varied
 
-        at_least_one(training=training, budget=budget, steps=steps, jobs=jobs, action_delay=action_delay, wider=wider)
+        at_least_one(
+            training=training,
+            budget=budget,
+            steps=steps,
+            jobs=jobs,
+            action_delay=action_delay,
+            wider=wider,
+            particles=particles,
+        )
         if observation_noise is not None and not 0 < observation_noise < float("inf"):
             raise ValueError(f"--observation-noise {observation_noise}: expected an sd above 0; leave it out for none")
         cells = changed(chosen(suite, select or ()), training=training, budget=budget, steps=steps)
+        cells = varied(cells, point="mean" if point else None, particles=particles)
         cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
         start = executor_of(executor, jobs, address)
         failed = transfer_run.run(cells, out, start, command_line(), retry_failed, say)

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.frame import Files, blank, failed, measured, source
-from sipe_bayes.benchmark.measure import POLICIES
+from sipe_bayes.benchmark.frame import Files, blank, failed, measured
+from sipe_bayes.benchmark.measure import CHECKPOINTS, POLICIES
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
 from sipe_bayes.benchmark.transfer import (
     DEFAULT,
@@ -25,6 +26,7 @@ from sipe_bayes.benchmark.transfer import (
     agent_of,
     demonstrations_of,
     estimate_of,
+    trained_as,
 )
 from sipe_bayes.benchmark.work import Done
 from sipe_bayes.envs.registry import make_task
@@ -33,12 +35,19 @@ from sipe_bayes.posterior import Dirac, Particles, Posterior, prior
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.simulator import Simulator
 
+_ROUNDING = 1e-6  # in theta, of the values that a record keeps
 _TARGET_SEED = 4_000_000  # of the target's episodes: other ones than those that a policy is kept by
 
 
 def run(cell: Cell, folder: Path, command: str) -> Done:
     """Measure a cell. folder: of the results; the estimate is read from it, and the training keeps its checkpoint there."""
-    return measured(blank_record(cell, command), lambda record: _measured(cell, record, folder))
+    spent = f"{_trained_in(cell)}/{CHECKPOINTS}"
+    return measured(blank_record(cell, command), lambda record: _measured(cell, record, folder), spent)
+
+
+def _trained_in(cell: Cell) -> str:
+    """The folder of a cell's training, in that of the results."""
+    return f"{POLICIES}/{file_name(trained_as(cell).id)}"
 
 
 def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
@@ -65,6 +74,11 @@ def randomization(cell: Cell, folder: Path) -> Randomization:
         posterior = Dirac(task.theta("default"), task.space)
     else:
         posterior = _estimated(cell, folder, task.space)
+    if "point" in values:
+        posterior = Dirac(posterior.mean, task.space)
+    if "particles" in values:
+        drawn = posterior.sample((int(values["particles"]),), generator=torch.Generator().manual_seed(cell.seed))
+        posterior = Particles(drawn, task.space)
     if "wider" in values and bool((posterior.stddev > 1e-9).any()):  # a point has nothing to widen
         posterior = posterior.wider(values["wider"])
     return Randomization(posterior, values.get("observation_noise", 0.0), int(values.get("action_delay", 0)))
@@ -89,8 +103,13 @@ def _estimated(cell: Cell, folder: Path, space: ParameterSpace) -> Particles:
         raise ValueError(
             f"{record.id}: is a posterior over {', '.join(found)}, and {cell.task} has {', '.join(space.names)}; measure it again"
         )
-    values = np.stack([found[name] for name in space.names], -1)
-    return Particles(space.normalise(values).clip(0.0, 1.0), space)
+    theta = space.normalise(np.stack([found[name] for name in space.names], -1))
+    if np.abs(theta - 0.5).max() > 0.5 + _ROUNDING:
+        name = space.names[int(np.abs(theta - 0.5).max(0).argmax())]
+        raise ValueError(
+            f"{record.id}: has draws of {name} outside the bounds that {cell.task} has now; measure it again"
+        )
+    return Particles(theta.clip(0.0, 1.0), space)
 
 
 def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[TransferRecord, Files, str]:
@@ -100,9 +119,10 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
     from sipe_bayes.rl.train import COUNTS, choose, read_curve, train
 
     began = time.process_time()
-    task, own = make_task(cell.task), folder / POLICIES / file_name(cell.id)
+    task, own = make_task(cell.task), folder / _trained_in(cell)
     drawn, every = randomization(cell, folder), max(cell.training // POINTS, task.episode_steps)
     simulator, truth = Simulator(task, num_threads=1), task.theta(cell.variant)
+    fresh = not own.exists()
     policy = train(
         *(task, cell.training, cell.seed, own, agent_of(cell)),
         resume=True,
@@ -133,7 +153,7 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
         truth=truth.tolist(),
         mean=drawn.posterior.mean.tolist(),
         sd=drawn.posterior.stddev.tolist(),
-        checksums={"model": simulator.checksum(), "randomization": drawn.fingerprint, "source": source()},
+        checksums={**record.checksums, "model": simulator.checksum(), "randomization": drawn.fingerprint},
         evaluation=found,
         random=earned(evaluation.random(task, cell.seed), EPISODES, 0.0),
         curve=curve,
@@ -142,6 +162,6 @@ def _measured(cell: Cell, record: TransferRecord, folder: Path) -> tuple[Transfe
         solved_reference=solves(task, found["mean"], found["success_rate"]),
         redrawn=counts["redrawn"],
         diverged=counts["diverged"],
-        cpu_seconds=time.process_time() - began,
+        cpu_seconds=time.process_time() - began if fresh else None,
     )
     return record, (), line

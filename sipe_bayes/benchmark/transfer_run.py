@@ -13,9 +13,9 @@ from typing import Any
 from sipe_bayes.benchmark import run as runs
 from sipe_bayes.benchmark import transfer_measure
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.records import plan
+from sipe_bayes.benchmark.records import plan, posterior_path
 from sipe_bayes.benchmark.status import headline
-from sipe_bayes.benchmark.transfer import TransferRecord, estimate_of
+from sipe_bayes.benchmark.transfer import TransferRecord, cell_of, estimate_of, trained_as
 from sipe_bayes.benchmark.work import Executor, Unit
 
 
@@ -40,13 +40,19 @@ def run(
         if not left:
             return 0
         plan(folder, [cell.id for cell in lacking])
-        units = [*runs.units_of(lacking, folder, command), *(_unit(cell, lacking, folder, command) for cell in left)]
+        mine = {cell.id for cell in left}
+        units = [
+            *runs.units_of(lacking, folder, command),
+            *(_unit(cell, lacking, mine, folder, command) for cell in left),
+        ]
         return runs.carried_out(units, folder, start, command, report)
 
 
-def _unit(cell: Cell, lacking: Sequence[Cell], folder: Path, command: str) -> Unit:
-    estimate = estimate_of(cell)
+def _unit(cell: Cell, lacking: Sequence[Cell], mine: set[str], folder: Path, command: str) -> Unit:
+    """An agent, which waits for its estimate, and for the cell that shares its training."""
+    estimate, twin = estimate_of(cell), trained_as(cell)
     needs = [estimate.id] if estimate is not None and estimate in lacking else []
+    needs += [twin.id] if twin != cell and twin.id in mine else []
     return runs.unit(transfer_measure, cell, folder, command, needs)
 
 
@@ -55,17 +61,38 @@ def load(folder: Path) -> list[TransferRecord]:
     return TransferRecord.all_in(folder)
 
 
+def stale(records: Sequence[TransferRecord], folder: Path) -> list[str]:
+    """Agents that were trained under another posterior than the one that their estimate's record has now, as far as it is there."""
+    found = []
+    for record in (r for r in records if r.done):
+        cell = cell_of(record)
+        estimate = estimate_of(cell)
+        if estimate is None or not posterior_path(folder, estimate.id).is_file():
+            continue
+        if transfer_measure.randomization(cell, folder).fingerprint != record.checksums["randomization"]:
+            found.append(record.id)
+    return found
+
+
 def summary(folder: Path) -> dict[str, Any]:
     """How far a folder is, as plain data; raises RecordError for one without a transfer."""
     records, found = TransferRecord.progress(folder)
     done = [r for r in records if r.done]
     returns = {r.id: r.evaluation["mean"] for r in done}
-    return {**found, "returns": returns, "training_seconds": sum(r.seconds or 0.0 for r in done)}
+    return {
+        **found,
+        "stale": stale(records, folder),
+        "returns": returns,
+        "training_seconds": sum(r.seconds or 0.0 for r in done),
+    }
 
 
 def lines(found: dict[str, Any]) -> list[str]:
     """``summary`` to be read."""
     said = [f"{headline(found)}; {found['training_seconds']:.0f} s of training"]
     said += [f"{cell}: return {earned:.1f}" for cell, earned in found["returns"].items()]
+    said += [
+        f"stale: {cell}: its estimate was measured anew; delete its record, and run again" for cell in found["stale"]
+    ]
     said += [f"failed: {cell}: {why}" for cell, why in found["failed"].items()]
     return said + [f"missing: {cell}" for cell in found["missing"]]

@@ -13,12 +13,14 @@ ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPEN
 
 @dataclass(frozen=True)
 class Done:
-    """What a unit came to. files: (path in the folder of results, bytes), to be written in this order; line: a few words."""
+    """What a unit came to. files: (path in the folder of results, bytes), to be written in this order; line: a few words; spent: a path in
+    the folder of results that nothing needs any more once the files are written."""
 
     files: tuple[tuple[str, bytes], ...]
     line: str
     cpu_seconds: float
     failed: bool = False
+    spent: str = ""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ It is chosen by few episodes, so its return there flatters it: a card evaluates 
 simulators drawn from it, the same ones at every evaluation, undisturbed: nothing is chosen by what the agent does anywhere else.
 
 The folder holds ``curve.csv``, a TensorBoard log, ``policies/``, at the end ``counts.json`` (steps, updates, theta drawn anew because no
-model can have them, diverged simulations), and ``checkpoint/``: networks, targets, optimisers,
+model can have them, diverged simulations, and which run this was), and ``checkpoint/``: networks, targets, optimisers,
 normaliser, every random generator and the lanes' states in one safetensors file, with the replay buffer beside it. The
 checkpoint names its buffer, and both are written before the previous ones go, so an interruption leaves a whole pair.
 """
@@ -70,7 +70,7 @@ def train(
 
     randomization: what each episode draws; without one all run in the published model. device: where the networks learn, "cpu" or
     "cuda"; a run may go on on the other. resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than
-    before; the result is that of an uninterrupted run. Raises ValueError for arguments out of range, and for a folder that holds
+    before; the result is that of an uninterrupted run; one that is finished is read. Raises ValueError for arguments out of range, and for a folder that holds
     another run or, without ``resume``, any.
     """
     task = make_task(task) if isinstance(task, str) else task
@@ -98,6 +98,8 @@ def train(
         "evaluation_episodes": evaluation_episodes,
     }
     fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
+    if resume and _finished(folder, fingerprint, steps):
+        return load_policy(folder / "expert.safetensors", task.name)
     log = _Log(folder, evaluation_episodes, randomization)
     if resume and (folder / CHECKPOINT).is_file():
         log.load(trainer, fingerprint)
@@ -111,7 +113,7 @@ def train(
             log.save(trainer, fingerprint)
         if report is not None and trainer.steps // 100 > before // 100:
             report(log.line(trainer), trainer.steps, steps)
-    return log.finish(trainer, steps)
+    return log.finish(trainer, steps, fingerprint)
 
 
 class _Log:
@@ -178,7 +180,7 @@ class _Log:
         self.rows, self._spent = json.loads(state["curve"]), float(state["seconds"])
         self._write_curve()
 
-    def finish(self, trainer: Trainer, steps: int) -> Policy:
+    def finish(self, trainer: Trainer, steps: int, fingerprint: str) -> Policy:
         """Copy the two agents to their names, and say what it took."""
         self._writer.close()
         chosen = choose(self.rows, steps)
@@ -190,6 +192,8 @@ class _Log:
             "updates": trainer.agent.updates,
             "redrawn": 0 if trainer.draws is None else trainer.draws.redrawn,
             "diverged": trainer.episodes.simulator.diverged,
+            "asked": steps,
+            "fingerprint": fingerprint,
         }
         write_text(self._folder / COUNTS, to_json(counts) + "\n")
         return load_policy(self._folder / "expert.safetensors", trainer.task.name)
@@ -203,6 +207,15 @@ class _Log:
         writer.writerow(CURVE)
         writer.writerows(self.rows)
         write_text(self._folder / "curve.csv", text.getvalue())
+
+
+def _finished(folder: Path, fingerprint: str, steps: int) -> bool:
+    """Whether the folder holds the end of this very run, be its checkpoint there or not."""
+    try:
+        counts = json.loads((folder / COUNTS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return bool((counts.get("fingerprint"), counts.get("asked")) == (fingerprint, steps))
 
 
 def choose(rows: list[list[Any]], steps: int) -> dict[str, int]:
