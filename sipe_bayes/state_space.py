@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.likelihood import START_SD, BudgetExhausted, chosen_channels, estimate_states, moved, past_commands
 from sipe_bayes.noise import chosen_sd
+from sipe_bayes.read_off import read_off
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories
 from sipe_bayes.tridiagonal import ChainLinearisation
@@ -50,8 +51,8 @@ class StateSpace:
     """States unknown at every sample; measurement and process noise inferred. For ``laplace`` and ``mcmc``.
 
     fit: names of the channels that count, default all. noise_sd: given sd per channel in its unit, None where it is
-    inferred. starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known, the others are left
-    aside.
+    inferred. starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known. All other recorded states are
+    left aside.
     """
 
     fit: tuple[str, ...] | None = None
@@ -78,7 +79,8 @@ class StateSpace:
 class Chain:
     """Recorded trajectories as K unknown states in a row, T + 1 of each log; states of different logs are not linked.
 
-    log, sample (K,): where a state belongs. measured, observed (K, C): what the simulation that starts there predicts.
+    log, sample (K,): where a state belongs. measured, observed (K, C): what the simulation that starts there predicts. reference (K, S): a
+    first guess of the states; placed (D,): which of their coordinates belong to a degree of freedom or an activation that a channel tells.
     rollouts, budget: as ``likelihood.Windows`` counts them; part: of a rollout, not counted yet."""
 
     def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
@@ -100,8 +102,7 @@ class Chain:
         if known and trajectories.states is None:
             raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
-        logs = [replace(t, states=None) if known else t for t in trajectories]
-        reference = np.concatenate([_measured_states(simulator, t) for t in logs])
+        reference = np.concatenate([_measured_states(simulator, replace(t, states=None)) for t in trajectories])
         if known:
             reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
         reference[:, 0] = 0.0
@@ -111,6 +112,18 @@ class Chain:
         self.sizes = (model.nv, model.nv, model.na)
         start_sd = KNOWN_SD if known else START_SD
         self.prior_precision = np.where(self.first[:, None], np.repeat(start_sd, self.sizes) ** -2.0, 0.0)
+        self._place()
+
+    def _place(self) -> None:
+        """Say which coordinates a channel tells; put positions there that one tells only indirectly."""
+        nv, first = self.sizes[0], self.reference[self.first]
+        direct = np.isin(np.arange(self.num_start), [c for c in self.coordinates if c is not None])
+        self.reference, told, idle = read_off(self, self.reference, direct)
+        if self.settings.starts == "recorded":
+            self.reference[self.first] = first
+        moving = direct[nv : 2 * nv]
+        position = direct[:nv] | told | (moving & idle)
+        self.placed = np.concatenate([position, position | moving, direct[2 * nv :]])
 
     def _read(self, trajectories: Trajectories) -> None:
         environment = self.simulator.environment
@@ -157,17 +170,6 @@ class Chain:
             return int(turn[column - 1]) if column <= model.nq else column - 1 - model.nq + model.nv
 
         return [coordinate(columns[c]) for c in self.channels]
-
-    @property
-    def placed(self) -> BoolArray:
-        """Which coordinates (D,) belong to a degree of freedom or an activation that a channel tells, or with estimated starts a recorded
-        state."""
-        nv = self.sizes[0]
-        if self.trajectories.states is not None and self.settings.starts == "estimated":
-            return np.full(self.num_start, True)
-        seen = np.isin(np.arange(self.num_start), [c for c in self.coordinates if c is not None])
-        either = seen[:nv] | seen[nv : 2 * nv]
-        return np.concatenate([either, either, seen[2 * nv :]])
 
     @property
     def fixed_sd(self) -> FloatArray:
@@ -317,12 +319,11 @@ def _floor(sizes: FloatArray) -> FloatArray:
 
 
 def _measured_states(simulator: Simulator, trajectory: Any) -> FloatArray:
-    """A first guess of the states (T+1, S): recorded ones, else what each sample measured, the rest as ``estimate_states``
-    has it. Unlike there nothing is smoothed: the chain does that."""
+    """A first guess of the states (T+1, S) of a trajectory without recorded ones: what each sample measured, the rest as
+    ``estimate_states`` has it. Unlike there nothing is smoothed: the chain does that."""
     states = estimate_states(simulator, trajectory).copy()
-    if trajectory.states is None:
-        for channel, column in enumerate(simulator.environment.state_columns(simulator.model)):
-            seen = np.isfinite(trajectory.observations[:, channel])
-            if column is not None:
-                states[seen, column] = trajectory.observations[seen, channel]
+    for channel, column in enumerate(simulator.environment.state_columns(simulator.model)):
+        seen = np.isfinite(trajectory.observations[:, channel])
+        if column is not None:
+            states[seen, column] = trajectory.observations[seen, channel]
     return states

@@ -97,7 +97,9 @@ def test_files_are_python_and_name_what_has_no_place(case: tuple[MjcfEnvironment
     isaac = (tmp_path / "randomization" / "isaac_lab_events.py").read_text()
     calls = [node for node in ast.walk(ast.parse(isaac)) if isinstance(node, ast.Call)]
     terms = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "EventTerm"]
-    assert len(terms) == 3  # mass, damping, armature
+    assert len(terms) == 2  # mass, armature; damping would be the controller's
+    assert "damping: " in isaac
+    assert "controller's gain" in isaac
     mean, sd = draws[:, 0].mean(), draws[:, 0].std()
     assert f'"mass_distribution_params": ({mean:.9g}, {sd:.9g})' in isaac
     assert "# actuator:motor.gear:" in isaac

@@ -7,7 +7,9 @@ Logs of a torque-driven pendulum (4 s, 100 Hz, angle with noise of sd 0.01 rad, 
 unknown, fitted by `laplace`. Left out of the model, in three sizes: dry friction of 0.03, 0.06 and 0.12 N m, a delay of the command of
 10, 20 and 40 ms, friction of 5, 10 and 20 % of the torque applied; the torque is a sum of four sines of 0.6 N m. For the smallest dry
 friction even a fit that has it as a third parameter leaves an sd of a quarter of it with white noise and of half with AR(1). The null is
-the right model. An alarm is p <= 0.05. Every fit is one line in runs/, so an interrupted study goes on.
+the right model. Beside it a double pendulum with a motor, two unknowns and a channel at each joint, and the effect, of the middle size, at one
+of them in turn: there the cause that is named has to be the right one at the right joint, and the channel that joint's.
+An alarm is p <= 0.05. Every fit is one line in runs/, so an interrupted study goes on.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from _kept import fits, keep
 
 import sipe_bayes as sipe
 from sipe_bayes.atomic import write_text
@@ -34,11 +37,10 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "misspecification"
-XML = """
-<mujoco><option timestep="0.01" integrator="implicitfast"/>
-  <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" damping="0.05"/>
-    <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.01" mass="0.6" contype="0" conaffinity="0"/></body></worldbody>
-  <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+ROD = """<body name="rod{k}" pos="0 0 {z}"><joint name="hinge{k}" axis="0 1 0" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.01" mass="0.6" contype="0" conaffinity="0"/>{rest}</body>"""
+XML = """<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody>{rods}</worldbody>
+<actuator>{motors}</actuator></mujoco>"""
 DT, STEPS, SD = 0.01, 400, 0.01
 SIZES = {  # N m; control steps; share of the torque
     "null": (0.0,),
@@ -50,38 +52,51 @@ SEEDS = {"null": 100, "dry friction": 20, "delay": 20, "friction under load": 20
 NOISES = {"white": 0.0, "ar1": 0.9}
 
 
-def simulator() -> sipe.Simulator:
+def simulator(joints: int) -> sipe.Simulator:
+    """A pendulum of one rod, or of two."""
+    names, rods = range(1, joints + 1), ""
+    for k in reversed(names):
+        rods = ROD.format(k=k, z=0 if k == 1 else -0.5, rest=rods)
+    motors = "".join(f'<motor name="motor{k}" joint="hinge{k}"/>' for k in names)
     parameters = [
-        Parameter("rod_mass", 0.3, 1.0, targets=("body:rod.mass",)),
-        Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",)),
+        unknown
+        for k in names
+        for unknown in (
+            Parameter(f"rod{k}_mass", 0.3, 1.0, targets=(f"body:rod{k}.mass",)),
+            Parameter(f"damping{k}", 0.0, 0.2, targets=(f"joint:hinge{k}.damping",)),
+        )
     ]
-    environment = MjcfEnvironment.build(XML, parameters, ["motor"], ["joint:hinge.position"])
+    xml = XML.format(rods=rods, motors=motors)
+    channels = [f"joint:hinge{k}.position" for k in names]
+    environment = MjcfEnvironment.build(xml, parameters, [f"motor{k}" for k in names], channels)
     return sipe.Simulator(environment, num_threads=1)
 
 
 def recorded(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -> Trajectory:
-    """A log of a machine that has what the cell names, of that size."""
-    rng = np.random.default_rng([seed, int(100 * rho)])
+    """A log of a machine that has what the cell names, of that size, at one of its joints."""
+    joints = engine.model.nv
+    rng, at = np.random.default_rng([seed, int(100 * rho), joints]), seed % joints
     clock = np.arange(STEPS) * DT
-    frequency, phase = rng.uniform(0.3, 1.5, 4), rng.uniform(0, 2 * np.pi, 4)
-    torque = 0.6 * np.sin(2 * np.pi * frequency * clock[:, None] + phase).sum(1)
-    model = engine.written(rng.uniform(0.2, 0.7, 2))
-    model.dof_frictionloss[0] = size if cell == "dry friction" else 0.0
-    data, angle = mujoco.MjData(model), np.empty(STEPS + 1)
+    frequency, phase = rng.uniform(0.3, 1.5, (4, joints)), rng.uniform(0, 2 * np.pi, (4, joints))
+    torque = 0.6 * np.sin(2 * np.pi * frequency * clock[:, None, None] + phase).sum(1)
+    model = engine.written(rng.uniform(0.2, 0.7, 2 * joints))
+    model.dof_frictionloss[at] = size if cell == "dry friction" else 0.0
+    data, angle = mujoco.MjData(model), np.empty((STEPS + 1, joints))
     for k in range(STEPS + 1):
-        angle[k] = data.qpos[0]
-        sent = torque[max(0, min(k, STEPS - 1) - (int(size) if cell == "delay" else 0))]
-        data.ctrl[0] = sent
+        angle[k] = data.qpos
+        sent = torque[min(k, STEPS - 1)].copy()
+        if cell == "delay":
+            sent[at] = torque[max(0, min(k, STEPS - 1) - int(size)), at]
+        data.ctrl[:] = sent
         if cell == "friction under load":
-            data.qfrc_applied[0] = -size * abs(sent) * np.tanh(data.qvel[0] / 0.05)
+            data.qfrc_applied[at] = -size * abs(sent[at]) * np.tanh(data.qvel[at] / 0.05)
         mujoco.mj_step(model, data)
-    noise = np.empty(STEPS + 1)
-    white = rng.standard_normal(STEPS + 1)
+    noise = np.empty_like(angle)
+    white = rng.standard_normal(angle.shape)
     noise[0] = white[0]
     for k in range(1, STEPS + 1):
         noise[k] = rho * noise[k - 1] + np.sqrt(1 - rho**2) * white[k]
-    channels = engine.environment.channels
-    return Trajectory((angle + SD * noise)[:, None], torque[:, None], DT, name=f"seed {seed}", channels=channels)
+    return Trajectory(angle + SD * noise, torque, DT, name=f"seed {seed}", channels=engine.environment.channels)
 
 
 def one(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -> dict[str, Any]:
@@ -96,26 +111,31 @@ def one(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -
 
 
 def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int) -> dict[str, Any]:
-    kept = RUNS / f"{cell.replace(' ', '_')}_{size:g}_{noise}.jsonl"
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
-    for seed in range(len(rows), seeds):
-        rows.append(one(engine, cell, size, NOISES[noise], seed))
-        with kept.open("a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
+    joints = engine.model.nv
+    kept = RUNS / f"{cell.replace(' ', '_')}_{size:g}_{noise}_{joints}.jsonl"
+    rows = fits(kept)
+    rows += [keep(kept, one(engine, cell, size, NOISES[noise], seed)) for seed in range(len(rows), seeds)]
     rows = rows[:seeds]
-    causes = [row["cause"] for row in rows if row["p"] <= LEVEL]
-    alarms = {cause: causes.count(cause) for cause in sorted(set(causes), key=lambda c: -causes.count(c))}
-    seconds = float(np.median([row["cpu_seconds"] for row in rows]))
+    found = [row for row in rows if row["p"] <= LEVEL]
+    causes = [row["cause"] for row in found]
+    right = [row for row in found if row["cause"] == cause_of(cell, row["seed"] % joints)]
+    channel = [row for row in found if row["channel"] == f"joint:hinge{1 + row['seed'] % joints}.position"]
     return {
         "cell": cell,
+        "joints": joints,
         "size": size,
         "noise": noise,
         "logs": len(rows),
-        "alarms": len(causes),
-        "causes": alarms,
-        "cpu_seconds": seconds,
+        "alarms": len(found),
+        **({} if cell == "null" else {"right_cause_and_joint": len(right), "right_channel": len(channel)}),
+        "causes": {cause: causes.count(cause) for cause in sorted(set(causes), key=lambda c: -causes.count(c))},
+        "cpu_seconds": float(np.median([row["cpu_seconds"] for row in rows])),
     }
+
+
+def cause_of(cell: str, joint: int) -> str:
+    """What the check calls it."""
+    return f"a delay of motor{joint + 1}" if cell == "delay" else f"{cell} at hinge{joint + 1}"
 
 
 def main() -> None:
@@ -123,9 +143,11 @@ def main() -> None:
     parser.add_argument("--cells", nargs="*", default=list(SIZES), choices=list(SIZES))
     parser.add_argument("--seeds", type=int, help=f"default: {SEEDS}")
     given = parser.parse_args()
-    engine, rows = simulator(), []
+    one_rod, two_rods, rows = simulator(1), simulator(2), []
     for cell in given.cells:
-        for size, noise in product(SIZES[cell], NOISES):
+        sizes = SIZES[cell]
+        cases = [(one_rod, size) for size in sizes] + [(two_rods, sizes[len(sizes) // 2])]
+        for (engine, size), noise in product(cases, NOISES):
             rows.append(study(engine, cell, size, noise, given.seeds or SEEDS[cell]))
             print(json.dumps(rows[-1]), flush=True)
     settings = {

@@ -26,7 +26,7 @@ from sipe_bayes.output import to_json
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "sbc"
 TASKS, STEPS, NOISE, LEVEL = ("Pendulum", "HalfCheetahLinks"), 100, 0.01, 0.05
-METHODS = {"npe": (2000, 400), "bayessim": (2000, 400), "laplace": (None, 100), "mcmc": (4000, 100)}  # rollouts, logs
+METHODS = {"npe": (2000, 400), "bayessim": (2000, 400), "laplace": (None, 100), "mcmc": (10_000, 100)}  # rollouts, logs
 
 
 def measure(task: str, estimator: str) -> None:
@@ -53,6 +53,7 @@ def row(task: str, estimator: str, found: dict[str, Any]) -> dict[str, Any]:
         "estimator": estimator,
         "logs": found["truths"],
         "failed": found["failed"],
+        "warned": found["warned"],
         "uniform": min(p["p_ranks"] for p in parameters) >= beyond,
         "smallest_p": min(p["p_ranks"] for p in parameters),
         "not_uniform": {
@@ -77,6 +78,7 @@ def line(found: dict[str, Any]) -> str:
     )
     said = "uniform" if found["uniform"] else f"not uniform ({wrong})"
     logs = f"{found['logs']}" + (f", {found['failed']} failed" if found["failed"] else "")
+    logs += f", {found['warned']} with warnings" if found["warned"] else ""
     cells = [found["task"], found["estimator"], logs, said, f"{found['smallest_p']:.2g}"]
     cells += [f"{found['coverage_90']:.3f} ± {found['standard_error']:.3f}", f"{found['tarp_p']:.2g}"]
     return " | ".join(["", *cells, f"{found['contraction']:.2f}", ""]).strip()

@@ -75,18 +75,21 @@ class Study:
 
 @dataclass(frozen=True)
 class Fit:
-    """One simulation and its posterior: truth (N,), draws (M, N) in theta, rollouts, seconds; error: why there are no draws."""
+    """One simulation and its posterior: truth (N,), draws (M, N) in theta, rollouts, seconds; error: why there are no draws; warned: what
+    the estimator said of itself."""
 
     truth: FloatArray
     draws: FloatArray
     rollouts: int
     seconds: float
     error: str = ""
+    warned: tuple[str, ...] = ()
 
     def save(self, path: Path) -> None:
         with replacing(path) as temporary, temporary.open("wb") as file:
-            numbers = np.array([self.rollouts, self.seconds])
-            np.savez_compressed(file, truth=self.truth, draws=self.draws, error=np.array(self.error), numbers=numbers)
+            numbers, error = np.array([self.rollouts, self.seconds]), np.array(self.error)
+            warned = np.array(self.warned, dtype=str)
+            np.savez_compressed(file, truth=self.truth, draws=self.draws, error=error, numbers=numbers, warned=warned)
 
     @classmethod
     def load(cls, path: Path) -> Fit | None:
@@ -94,7 +97,8 @@ class Fit:
         try:
             with np.load(path, allow_pickle=False) as data:
                 rollouts, seconds = data["numbers"].tolist()
-                return cls(data["truth"], data["draws"], int(rollouts), seconds, str(data["error"]))
+                said = str(data["error"]), tuple(str(words) for words in data["warned"])
+                return cls(data["truth"], data["draws"], int(rollouts), seconds, *said)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
             return None
 
@@ -102,7 +106,8 @@ class Fit:
 @dataclass(frozen=True)
 class Finding:
     """check; contraction (N,): mean of 1 - sd / prior sd; interval_score (N,): mean width of 90 % intervals plus 20 times what the
-    truth lies outside, in theta; failed: logs that could not be fitted; standard_error: of the pooled coverage, by fit."""
+    truth lies outside, in theta; failed: logs that could not be fitted; warned: fits of which the estimator itself warned; standard_error: of
+    the pooled coverage, by fit."""
 
     study: Study
     check: CalibrationCheck
@@ -112,6 +117,7 @@ class Finding:
     failed: int
     seconds: float
     rollouts: int
+    warned: int
 
     def sentence(self) -> str:
         """The verdict."""
@@ -121,6 +127,7 @@ class Finding:
             f"of the time ({self.check.truths} logs)"
         )
         lost = f"; {self.failed} more logs could not be fitted" if self.failed else ""
+        lost += f"; the estimator itself warned of {self.warned} fits" if self.warned else ""
         if self.check.calibrated:
             idle = [n for n, c in zip(self.check.names, self.contraction, strict=True) if c < 0.1]
             said = f", but of {', '.join(idle)} the posterior says no more than the prior" if idle else ""
@@ -149,6 +156,7 @@ class Finding:
             "standard_error": self.standard_error,
             "sharpness": {name: {"contraction": c, "interval_score": s} for name, c, s in by_name},
             "failed": self.failed,
+            "warned": self.warned,
             "rollouts": self.rollouts,
             "seconds": round(self.seconds, 1),
             **self.check.to_dict(),
@@ -195,6 +203,7 @@ def compare(study: Study, fits: list[Fit]) -> Finding:
         len(fits) - len(good),
         sum(fit.seconds for fit in fits),
         sum(fit.rollouts for fit in fits),
+        sum(bool(fit.warned) for fit in good),
     )
 
 
@@ -218,7 +227,8 @@ class _Worker:
                 draws = found.sample((_DRAWS,), generator=generator).numpy()
             except ValueError as problem:  # LinAlgError is one
                 error = " ".join(str(problem).split()) or type(problem).__name__
-        return Fit(truth, draws, estimator.rollouts, time.monotonic() - began, error)
+        seconds, warned = time.monotonic() - began, tuple(estimator.warnings)
+        return Fit(truth, draws, estimator.rollouts, seconds, error, warned)
 
     def _log(self, number: int) -> tuple[FloatArray, Trajectories]:
         rng, generator = np.random.default_rng([self.study.seed, 1, number]), torch.Generator()

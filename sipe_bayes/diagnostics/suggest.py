@@ -148,6 +148,8 @@ def _wave(kind: str, time: FloatArray, low: float, high: float, rng: np.random.G
         wave = scipy.signal.sosfiltfilt(sections, rng.standard_normal(len(time)), padlen=0)
     else:
         multiples = np.arange(np.ceil(low * time[-1]), np.floor(high * time[-1]) + 1)
+        if not len(multiples):  # a narrow band
+            multiples = np.array([np.sqrt(low * high) * time[-1]])
         chosen = rng.choice(multiples, min(_MOST_SINES, len(multiples)), replace=False) / time[-1]
         wave = np.sin(2 * np.pi * chosen * time[:, None] + rng.uniform(0, 2 * np.pi, len(chosen))).sum(1)
     return np.asarray(wave / np.abs(wave).max())

@@ -24,8 +24,9 @@ times the sd of what was learned, about its mean. The last regression leaves out
 Deviations. Issue and textbook name regression of truth on estimate; here estimate on truth, turned round by Bayes' rule, so that the
 width of the neighbourhood is not a second prior. One mode: estimates that jump between several make V wide. Uniform priors are
 normals of sd 10 about the cube's centre, flat within it to half a percent. Replicas have first-order autoregressive noise as
-``laplace`` finds it in a measured log, whatever noise the estimator believes in; where states are recorded, or a function makes
-its own noise, as ``noise_level`` says. A model that is wrong is not mended by simulating it.
+``laplace`` finds it in a measured log, whatever noise the estimator believes in; where states are recorded, the noise that the estimator
+infers, and for those that infer none, or where a function makes its own, as ``noise_level`` says. A model that is wrong is not mended by
+simulating it.
 """
 
 from __future__ import annotations
@@ -213,8 +214,7 @@ class Recalibrated(Estimator):
             noise, rollouts = fitted_noise(self.simulator, self.likelihood, trajectories, self.prior, theta)
             self.rollouts += rollouts
             return noise
-        diagnostics = base.diagnostics if trajectories.states is None else {}
-        return observation_noise(diagnostics, trajectories, self.likelihood)
+        return observation_noise(base.diagnostics, trajectories, self.likelihood)
 
     def _bound_budget(self, trajectories: Trajectories) -> None:
         if self._asked is None:
