@@ -302,7 +302,7 @@ def calibrate(
         comparison=compare_errors(bound["holdout"], theta) if "holdout" in bound else None,
         misfit=lacking,
         outside=outside,
-        left_out=_left_out(problem),
+        left_out=_left_out(problem, method),
         noise=_noise(fitted, noise),
         mixing=method.diagnostics.get("mixing"),
         logs=[r.to_dict() for r in problem.reports],
@@ -340,13 +340,18 @@ def _alarms(lacking: Misfit | None, outside: Sequence[OutsidePrior]) -> list[str
     return [look.text for look in (*outside, lacking) if look is not None and look.alarm]
 
 
-def _left_out(problem: Problem) -> list[str]:
+def _left_out(problem: Problem, method: Estimator) -> list[str]:
+    """What the report does not look at with a ``StateSpace``, and what its process noise says instead."""
     if isinstance(problem.likelihood, Segments):
         return []
-    return [
+    said = (
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, and process "
         "noise, which is inferred, takes what the model lacks. Errors and signals are over windows from measured starts."
-    ]
+    )
+    if not {"process_noise", "movement"} <= method.diagnostics.keys():
+        return [said]
+    chain = problem.likelihood.bind(problem.simulator, problem.train)
+    return [said, chain.lacking(*(np.array(method.diagnostics[key]) for key in ("process_noise", "movement")))]
 
 
 def _run_name(config: Config) -> str:

@@ -43,6 +43,7 @@ _THETA_STEP = 1e-4  # finite differences, of the unit cube
 _STATE_STEP = 1e-5  # rad or m, rad/s or m/s
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known: position, velocity, activation
 _LEAST_MOVEMENT = 1e-2  # of the largest among the positions, the velocities or the activations
+_MUCH_PROCESS = 0.1  # of a movement
 _LEAST_SD = 1e-6  # of a channel's or coordinate's size: noise below it is not told from rounding
 
 
@@ -170,6 +171,27 @@ class Chain:
             return int(turn[column - 1]) if column <= model.nq else column - 1 - model.nq + model.nv
 
         return [coordinate(columns[c]) for c in self.channels]
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the D coordinates: position and velocity of joints, activations."""
+        model, nv = self.simulator.model, self.sizes[0]
+        joints = [model.joint(int(k)).name or f"joint {k}" for k in model.dof_jntid[:nv]]
+        kinds = [f"{what} of {name}" for what in ("position", "velocity") for name in joints]
+        return [*kinds, *(f"activation {k}" for k in range(self.sizes[2]))]
+
+    def lacking(self, process: FloatArray, movement: FloatArray) -> str:
+        """What inferred process noise (D,) says of the model, held against how far states move in a control step (D,): a hint, no test."""
+        share = process / movement
+        worst = int(share.argmax())
+        percent = f"{100 * share[worst]:.0f}" if share[worst] > 0.1 else f"{100 * share[worst]:.2g}"
+        found = (
+            f"Process noise is largest in the {self.labels[worst]}: its sd is {process[worst]:.2g}, {percent} % of how far "
+            "that moves in a control step."
+        )
+        if share[worst] < _MUCH_PROCESS:
+            return f"{found} The model follows the logs closely."
+        return f"{found} A model that lacks nothing needs next to none: look for what it lacks there before you trust the values."
 
     @property
     def fixed_sd(self) -> FloatArray:

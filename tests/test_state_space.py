@@ -538,6 +538,23 @@ def test_given_noise_is_kept_and_process_noise_shrinks_where_the_model_is_right(
     assert noise.process[0] < 1e-3
 
 
+def test_process_noise_says_where_the_model_lacks_something() -> None:
+    """A pendulum whose pivot sways, which the model does not know, and one whose does not."""
+    said = {}
+    for name, share in (("right", 0.0), ("wrong", 0.1)):
+        simulator = pendulum()
+        log = pendulum_log(simulator, [0.6, 0.05], 3, steps=200)
+        log = replace(log, observations=log.observations + share * np.sin(np.arange(201)[:, None] * 0.4))
+        estimator = Laplace(simulator, likelihood=StateSpace(), restarts=1, candidates=0)
+        estimator.fit(log)
+        chain = Chain(StateSpace(), simulator, Trajectories.stack(log))
+        said[name] = chain.lacking(*(np.array(estimator.diagnostics[k]) for k in ("process_noise", "movement")))
+    print(said)
+    assert "The model follows the logs closely." in said["right"]
+    assert "of hinge" in said["wrong"]
+    assert "look for what it lacks there" in said["wrong"]
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [

@@ -119,6 +119,7 @@ class Laplace(Estimator):
         }
         if "mode_process" in state:
             self.diagnostics["process_noise"] = state["mode_process"][kept[0]].tolist()
+            self.diagnostics["movement"] = state["movement"].tolist()
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         weights = torch.tensor(np.array(evidence) - np.max(evidence))
