@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import sipe_bayes as sipe_package
-from sipe_bayes.benchmark import transfer, transfer_measure, transfer_report
+from sipe_bayes.benchmark import transfer, transfer_figures, transfer_measure
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.measure import POLICIES, _netcdf
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
@@ -31,7 +31,9 @@ from sipe_bayes.benchmark.transfer import (
     trained_as,
     varied,
 )
-from sipe_bayes.benchmark.transfer_report import bars, contrasts, curves, label, relative, rows, table
+from sipe_bayes.benchmark.transfer_figures import bars, curves
+from sipe_bayes.benchmark.transfer_report import table
+from sipe_bayes.benchmark.transfer_rows import WORDS, contrasts, label, relative, rows
 from sipe_bayes.benchmark.transfer_run import load, summary
 from sipe_bayes.cli import app
 from sipe_bayes.envs.registry import TASKS, make_task
@@ -432,11 +434,11 @@ def test_the_studys_figures_tell_every_randomisation_apart() -> None:
     found = rows(given)
     names = [n for n in dict.fromkeys(row.name for row in found) if n != "truth"]
     assert len(names) == 12
-    looks = [transfer_report._look(name, names) for name in ["truth", *names]]
+    looks = [transfer_figures._look(name, names) for name in ["truth", *names]]
     assert len({(look.colour, look.line) for look in looks}) == len({(look.colour, look.hatch) for look in looks}) == 13
     for figure in (bars(found), curves(given)):
         said = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert sorted(said) == sorted({*(transfer_report._WORDS.get(n, n) for n in names), "truth (oracle)"})
+        assert sorted(said) == sorted({*(WORDS.get(n, n) for n in names), "truth (oracle)"})
 
 
 def test_the_example_runs(tmp_path: Path) -> None:
