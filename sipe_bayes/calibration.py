@@ -350,7 +350,7 @@ def _left_out(problem: Problem, method: Estimator) -> list[str]:
     )
     if not {"process_noise", "movement"} <= method.diagnostics.keys():
         return [said]
-    chain = problem.likelihood.bind(problem.simulator, problem.train)
+    chain: Any = method.windows(problem.train)
     return [said, chain.lacking(*(np.array(method.diagnostics[key]) for key in ("process_noise", "movement")))]
 
 

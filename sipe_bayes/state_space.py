@@ -82,7 +82,8 @@ class Chain:
 
     log, sample (K,): where a state belongs. measured, observed (K, C): what the simulation that starts there predicts. reference (K, S): a
     first guess of the states; placed (D,): which of their coordinates belong to a degree of freedom or an activation that a channel tells.
-    rollouts, budget: as ``likelihood.Windows`` counts them; part: of a rollout, not counted yet."""
+    rollouts, budget: as ``likelihood.Windows`` counts them; part: of a rollout, not counted yet;
+    prepared: rollouts that placing them took, which a search counts when it starts."""
 
     def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
@@ -125,6 +126,7 @@ class Chain:
         moving = direct[nv : 2 * nv]
         position = direct[:nv] | told | (moving & idle)
         self.placed = np.concatenate([position, position | moving, direct[2 * nv :]])
+        self.prepared, self.rollouts, self.part = math.ceil(self.rollouts + self.part), 0, 0.0
 
     def _read(self, trajectories: Trajectories) -> None:
         environment = self.simulator.environment

@@ -171,6 +171,22 @@ def test_nothing_is_best_where_the_truth_is_the_centre() -> None:
     assert section.sentences[1] == report_contents._RADARS
 
 
+def test_what_stands_beside_from_another_setting_does_not_compete(found: report_contents.Contents) -> None:
+    """laplace of the direct setting is in the table of policies, and neither its best nor said to be."""
+    section = next(s for s in found.sections if s.anchor == "policy-in_distribution")
+    accuracy = next(t for t in section.tables if t.measure.name == "accuracy")
+    assert "laplace, direct" in dict(accuracy.rows)
+    assert not any(e.best for name, row in accuracy.rows for e in row if e and name != "adr")
+    assert any(sentence.startswith("Best accuracy over all environments: adr") for sentence in section.sentences)
+
+
+def test_a_pair_without_a_common_seed_is_said() -> None:
+    left = [make("Door", "adr", 0), make("FetchPush", "adr", 1)]
+    right = [make("Door", "adr", 0, "policy"), make("FetchPush", "adr", 2, "policy")]
+    (said,) = findings.pair_findings(left, [*right, make("FetchPush", "adr", 1, "policy")], ("one", "two"))
+    assert said == "adr: no seed has every environment with one and with two; nothing is compared."
+
+
 def test_against_a_constant() -> None:
     assert tables.against([0.6, 0.61, 0.62], 0.5) == 1
     assert tables.against([0.6, 0.61, 0.62], 0.7) == -1

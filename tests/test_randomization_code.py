@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -29,6 +31,7 @@ PARAMETERS = [
     Parameter("com", -0.1, 0.1, targets=("body:tip.com_x",)),
     Parameter("gravity", -11.0, -9.0, targets=("option.gravity_z",)),
     Parameter("density", 0.0, 2.0, targets=("option.density",)),
+    Parameter("friction", 0.0, 0.1, targets=("joint:slide.frictionloss",)),
     Parameter("bias", -0.1, 0.1, targets=("sensor:joint:hinge.position.bias",)),
 ]
 FILES = {"mujoco_playground.py", "gymnasium_wrapper.py", "isaac_lab_events.py"}
@@ -97,7 +100,8 @@ def test_files_are_python_and_name_what_has_no_place(case: tuple[MjcfEnvironment
     isaac = (tmp_path / "randomization" / "isaac_lab_events.py").read_text()
     calls = [node for node in ast.walk(ast.parse(isaac)) if isinstance(node, ast.Call)]
     terms = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "EventTerm"]
-    assert len(terms) == 2  # mass, armature; damping would be the controller's
+    assert len(terms) == 3  # mass, armature, friction; damping would be the controller's
+    assert "# dry friction in N m" in isaac
     assert "damping: " in isaac
     assert "controller's gain" in isaac
     mean, sd = draws[:, 0].mean(), draws[:, 0].std()
@@ -117,6 +121,25 @@ def test_unphysical_draws_are_left_out(case: tuple[MjcfEnvironment, np.ndarray])
         sources(environment, wrong[:1])
 
 
+def test_friction_that_mjx_would_not_know_is_refused(
+    case: tuple[MjcfEnvironment, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """MJX makes no friction rows where the loaded model has none. The refusal comes before JAX is used, which need not be there."""
+    jax = ModuleType("jax")
+    jax.numpy = ModuleType("jax.numpy")  # type: ignore[attr-defined]
+    for name, module in (("jax", jax), ("jax.numpy", jax.numpy)):  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, name, module)
+    environment, draws = case
+    space: dict[str, Any] = {}
+    exec(sources(environment, draws)["mujoco_playground.py"], space)
+    model = environment.compile()
+    with pytest.raises(ValueError, match=r"dof_frictionloss is 0 where it is drawn.*load identified\.xml"):
+        space["randomize_fn"](model, None)
+    model.dof_frictionloss[:] = 0.05
+    with pytest.raises(AttributeError, match="jax"):  # now it goes on, to what is not there
+        space["randomize_fn"](model, None)
+
+
 def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, np.ndarray]) -> None:
     mjx = pytest.importorskip("mujoco.mjx", reason="mujoco-mjx is not installed")
     import jax
@@ -124,7 +147,9 @@ def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, 
     environment, draws = case
     space: dict[str, Any] = {}
     exec(sources(environment, draws)["mujoco_playground.py"], space)
-    model = mjx.put_model(environment.compile())
+    given = environment.compile()
+    given.dof_frictionloss[1] = 0.05
+    model = mjx.put_model(given)
     batched, in_axes = space["randomize_fn"](model, jax.random.split(jax.random.key(0), 5))
     assert batched.body_mass.shape == (5, 3)
     assert in_axes.body_mass == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -287,6 +288,33 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, setti
     assert states[0]["updates"] > 100
     assert states[0]["redrawn"] > 0
     assert len(list((short / "checkpoint").glob("replay-*.npz"))) == 1
+
+
+def test_a_finished_training_is_read_and_another_one_is_not(tmp_path: Path) -> None:
+    """Without its checkpoint: the same run is there at once; under another randomisation, and for more steps, it is trained."""
+    space, folder = sipe.make_task("Pendulum").space, tmp_path / "run"
+    run = {"evaluate_every": 90, "evaluation_episodes": 2, "checkpoint_every": 75}
+
+    def trained(theta: float, steps: int) -> list[float]:
+        train(
+            "Pendulum",
+            steps,
+            0,
+            folder,
+            SMALL,
+            resume=True,
+            randomization=Randomization(sipe.Dirac([theta] * 3, space)),
+            **run,
+        )  # type: ignore[arg-type]
+        return [path.stat().st_mtime_ns for path in sorted((folder / "policies").iterdir())]
+
+    first = trained(0.5, 270)
+    shutil.rmtree(folder / "checkpoint")
+    assert trained(0.5, 270) == first
+    assert not (folder / "checkpoint").exists()
+    assert trained(0.6, 270) != first
+    shutil.rmtree(folder / "checkpoint")
+    assert trained(0.6, 360)[-1] > first[-1]
 
 
 def test_every_episode_gets_a_theta_of_its_own() -> None:

@@ -394,8 +394,42 @@ def test_an_angle_is_read_off_its_cosine_and_sine() -> None:
         np.testing.assert_array_equal(turns, turns[0])
         assert np.abs(angle - true - 2 * np.pi * turns).max() < 4 * 0.01
         assert chain.placed.all()
+        assert (chain.rollouts, chain.prepared > 30) == (0, True)
         given = Chain(StateSpace(), simulator, Trajectories.stack(log))
         np.testing.assert_array_equal(given.reference, chain.reference)
+
+
+TIPS = """
+<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="one"><joint name="a" axis="0 1 0" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.01" mass="0.6" contype="0" conaffinity="0"/>{rest}</body></worldbody>
+<actuator><motor name="m" joint="a"/></actuator><sensor><framepos name="tip" objtype="site" objname="tip"/></sensor></mujoco>"""
+SECOND = """<body name="two" pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -0.5"
+size="0.01" mass="0.6" contype="0" conaffinity="0"/><site name="tip" pos="0 0 -0.5"/></body>"""
+
+
+@pytest.mark.parametrize(("links", "seen", "told"), [(1, "xz", True), (1, "z", False), (2, "xz", False)])
+def test_an_angle_that_is_not_unique_is_not_read_off(links: int, seen: str, told: bool) -> None:
+    """The place of a rod's tip tells its angle; its height alone leaves two, and two angles move the tip of a second rod together: there
+    nothing is made up, and the search goes by the filter as before."""
+    xml = TIPS.format(rest=SECOND if links == 2 else '<site name="tip" pos="0 0 -0.5"/>')
+    unknown = [Parameter("mass", 0.3, 1.0, targets=("body:one.mass",))]
+    channels = [f"sensor:tip[{'xyz'.index(axis)}]" for axis in seen]
+    simulator = Simulator(sipe.MjcfEnvironment.build(xml, unknown, ["m"], channels), num_threads=1)
+    start = simulator.default_state()
+    start[1] = 0.4
+    actions = 0.5 * np.sin(np.arange(80)[:, None] * 0.2)
+    motion = simulator.rollout(np.array([0.5]), actions, start, dt=0.01)
+    assert motion.states is not None
+    noise = 0.001 * np.random.default_rng(0).standard_normal(motion.observations[0].shape)
+    chain = Chain(
+        StateSpace(), simulator, Trajectories.stack(Trajectory(motion.observations[0] + noise, actions, 0.01))
+    )
+    assert chain.placed[0] == told
+    if told:
+        np.testing.assert_allclose(chain.reference[:, 1], motion.states[0, :, 1], atol=0.05)
+    else:
+        assert not chain.placed[: simulator.model.nv].any()
+        assert (chain.reference[1:, 1] == chain.reference[0, 1]).all()
 
 
 def test_what_no_channel_depends_on_stays_where_it_is() -> None:

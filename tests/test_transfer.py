@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from typer.testing import CliRunner, Result
 
 import sipe_bayes as sipe_package
@@ -136,6 +137,18 @@ def test_variations_are_in_the_id_and_not_of_the_truth() -> None:
     assert estimate_of(second) == estimate_of(CELL)
 
 
+def test_variations_come_once() -> None:
+    """A suite that holds some already; a point has neither mean nor particles nor spread of its own."""
+    points = varied(select("study", ["fetch_push/*/transfer*/in_distribution/seed0"]), point="mean")
+    ids = [cell.id for cell in points]
+    assert len(set(ids)) == len(ids)
+    assert [i for i in ids if "bayessim" in i] == ["FetchPush/bayessim/transfer,point=mean/in_distribution/seed0"]
+    (default,) = varied([replace(CELL, estimator="default")], wider=2.0, point="mean", action_delay=1)
+    assert default.values == (("action_delay", 1),)
+    (fewer,) = varied(varied([CELL], particles=10), particles=5)
+    assert fewer.values == (("particles", 5),)
+
+
 def test_cells_that_ask_for_the_same_training() -> None:
     """The prior has no variant, and the default model is the truth of its own."""
     study = select("study")
@@ -188,11 +201,15 @@ def test_agents_of_an_estimate_that_was_measured_anew_are_named(undisturbed: Pat
     for path in (undisturbed / "transfer" / "records", undisturbed / "records"):
         shutil.copytree(path, tmp_path / path.relative_to(undisturbed))
     shutil.copy(undisturbed / "transfer" / "plan.json", tmp_path / "transfer" / "plan.json")
-    assert summary(tmp_path)["stale"] == []
+    assert summary(tmp_path)["stale"] == {}
     space = make_task("Pendulum").space
     posterior_path(tmp_path, "Pendulum/laplace/direct/in_distribution/seed0").write_bytes(_netcdf(prior(space), 0))
-    assert summary(tmp_path)["stale"] == ["Pendulum/laplace/transfer/in_distribution/seed0"]
+    assert summary(tmp_path)["stale"] == {
+        "Pendulum/laplace/transfer/in_distribution/seed0": "its estimate was measured anew"
+    }
     assert "its estimate was measured anew" in sipe("status", str(tmp_path)).output
+    record_path(tmp_path, "Pendulum/laplace/direct/in_distribution/seed0").unlink()  # as another status advises
+    assert summary(tmp_path)["stale"] == {}
 
 
 def test_status_and_report(undisturbed: Path, tmp_path: Path) -> None:
@@ -308,6 +325,7 @@ def test_draws_outside_the_bounds_are_refused_by_name(tmp_path: Path) -> None:
         (["--suite", "studies"], ["--suite studies", "quick, study, nine, all"]),
         (["--select", "pendulum/truht"], ["pendulum/truht", "sipe transfer cells quick"]),
         (["--training", "0"], ["--training 0"]),
+        (["--point", "--particles", "3"], ["--particles 3", "does not go with --point"]),
         (["--wider", "0.5"], ["--wider 0.5", "at least 1"]),
         (["--observation-noise", "-1"], ["--observation-noise -1"]),
         (["--executor", "slurm"], ["pool, ray or inline"]),
@@ -434,6 +452,16 @@ def test_the_studys_figures_tell_every_randomisation_apart() -> None:
     found = rows(given)
     names = [n for n in dict.fromkeys(row.name for row in found) if n != "truth"]
     assert len(names) == 12
+    drawn = {
+        **{
+            p.get_label(): p.patches[0].get_facecolor()[:3]
+            for p in bars(found).axes[0].containers
+            if hasattr(p, "patches") and not str(p.get_label()).startswith("_")
+        },
+    }
+    lines = {line.get_label(): to_rgb(line.get_color()) for axes in curves(given).axes for line in axes.get_lines()}
+    assert len(drawn) == 12
+    assert drawn == {name: lines[name] for name in drawn}
     looks = [transfer_figures._look(name, names) for name in ["truth", *names]]
     assert len({(look.colour, look.line) for look in looks}) == len({(look.colour, look.hatch) for look in looks}) == 13
     for figure in (bars(found), curves(given)):

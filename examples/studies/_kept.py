@@ -18,7 +18,7 @@ def fits(path: Path) -> list[dict[str, Any]]:
     if whole != text:
         path.write_text(whole, encoding="utf-8")
     found = [json.loads(line) for line in whole.splitlines()]
-    if any(row["source"] != source() for row in found):
+    if any(row.get("source") != source() for row in found):
         raise SystemExit(f"{path}: holds fits that another state of the package's code made; delete it and run again")
     return found
 

@@ -8,8 +8,8 @@ on the hand, where a truth that keeps from the bounds would be held too often. E
 states are withheld. Noise, process noise, states and theta are all inferred. On the half-cheetah the excitation policy acts for 200 control
 steps and the start is unknown; velocities are observed. On Door and Relocate the expert acts for 100, the start is known, as these tasks
 always start alike, one starting point is followed, and no velocities are observed, nor the flag that says whether the door is open; a channel's spread counts as at least a tenth
-of the largest. Fits are kept one by one in runs/state_space, so an interrupted study goes on and several processes may share it; each run
-writes the summary of all fits there are to results/. Coverage of the 90 % intervals is pooled over the parameters, its standard
+of the largest. Fits are kept one by one in runs/state_space, so an interrupted study goes on and several processes may share it; those of another state of
+the code are made anew. Each run writes the summary of all fits there are to results/. Coverage of the 90 % intervals is pooled over the parameters, its standard
 error clustered by fit; a parameter counts as determined in a fit that leaves less than half of the prior's sd. Seconds are the processor's over all
 threads: the wall time of a quiet machine with one.
 """
@@ -139,7 +139,7 @@ def table(steps: int | None) -> None:
         names, length = sipe.make_task(task).space.names, steps or STEPS[task]
         files = sorted(RUNS.glob(path(task, level, length, 0).name.replace("-0.json", "-*.json")))
         rows = [json.loads(f.read_text(encoding="utf-8")) for f in files]
-        if len({row["source"] for row in rows}) > 1:
+        if len({row.get("source") for row in rows}) > 1:
             raise SystemExit(
                 f"{RUNS}: holds fits of {task} by several states of the code; delete those of the older ones"
             )
@@ -170,7 +170,7 @@ def main() -> None:
         simulator, steps = sipe.Simulator(sipe.make_task(task), num_threads=given.threads), given.steps or STEPS[task]
         for seed in range(*(given.seeds or (0, FITS[task]))):
             file = path(task, level, steps, seed)
-            if not file.exists():
+            if not file.exists() or json.loads(file.read_text(encoding="utf-8")).get("source") != source():
                 write_text(file, json.dumps(one_fit(simulator, task, level, seed, steps)) + "\n")
     table(given.steps)
 

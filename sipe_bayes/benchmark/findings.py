@@ -17,6 +17,7 @@ from sipe_bayes.benchmark.tables import (
     Entry,
     Table,
     against,
+    competes,
     differ,
     order_estimators,
     order_tasks,
@@ -132,13 +133,17 @@ def table_findings(tables: Sequence[Table]) -> list[str]:
             continue
         column = ALL if ALL in table.columns else table.columns[0]
         rows = {name: entry for name, _ in table.rows if (entry := table.entry(name, column)) is not None}
-        mine = {name: entry for name, entry in rows.items() if name not in BASELINES}
+        mine = {name: entry for name, entry in rows.items() if competes(name)}
         if not mine:
             continue
         sign = MEASURES[table.measure.name].better
         first = max(mine, key=lambda name: sign * mine[name].mean)
         where = "over all environments" if column == ALL else f"on {column}"
-        noise = "ahead of every other outside noise" if mine[first].best else "not ahead of every other outside noise"
+        noise = (
+            "ahead of every other outside noise"
+            if mine[first].best
+            else "not ahead of every other and of the baselines outside noise"
+        )
         found.append(f"Best {table.measure.name} {where}: {first}, {text(mine[first])}; {noise}.")
         reference = "prior_mean" if table.measure.name == "accuracy" else "prior"
         if reference in rows:
@@ -158,7 +163,7 @@ def _against(measure: str, sign: int, reference: str, level: float, mine: dict[s
 
 def pair_findings(left: Sequence[Record], right: Sequence[Record], labels: tuple[str, str]) -> list[str]:
     """For each estimator what a setting gains in mean accuracy over another, paired by environment and seed; its error and the test
-    are over seeds, of the environments that each seed has in both."""
+    are over the seeds that have every shared environment in both."""
     found = []
     for estimator in order_estimators({r.estimator for r in right}):
         one, two = (
@@ -168,6 +173,9 @@ def pair_findings(left: Sequence[Record], right: Sequence[Record], labels: tuple
         tasks = order_tasks({task for task, _ in one.keys() & two.keys()})
         seeds = sorted({seed for _, seed in two if all((t, seed) in one and (t, seed) in two for t in tasks)})
         if not seeds:
+            found.append(
+                f"{estimator}: no seed has every environment with {labels[0]} and with {labels[1]}; nothing is compared."
+            )
             continue
         gains = {t: [two[t, s] - one[t, s] for s in seeds] for t in tasks}
         over = tuple(float(np.mean([gains[t][k] for t in tasks])) for k in range(len(seeds)))

@@ -17,11 +17,13 @@ from sipe_bayes.benchmark.findings import facts, pair_findings, sweep_findings, 
 from sipe_bayes.benchmark.records import Record, load_all, planned
 from sipe_bayes.benchmark.spent import runs
 from sipe_bayes.benchmark.tables import (
+    BESIDE,
     OUTSIDE,
     VARIANT_NAMES,
     Context,
     Entry,
     Table,
+    competes,
     counted,
     measures,
     order_tasks,
@@ -173,7 +175,7 @@ def _radars(anchor: str, records: Sequence[Record]) -> Iterator[Picture]:
     found = results(records)
     beside = {name: found[name] for name in found if name in BASELINES or _is_reference(name)}
     reference = next((name for name in beside if _is_reference(name)), None)
-    mine = [name for name in found if name not in BASELINES and name != f"{REFERENCE}, direct"]
+    mine = [name for name in found if competes(name)]
     for k, part in enumerate(_parts(mine, COMPARED)):
         drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, "mean", None if reference in part else reference)
         yield Picture(f"{anchor}-compared{k}", f"Means over parameters and seeds: {', '.join(part)}.", drawn)
@@ -225,11 +227,11 @@ def _pair(
     said = [f"With {label}: {s}" for label, s in zip(labels, (of_one, of_two), strict=True) if s]
     section.sentences.extend([*said, unequal(rows)] if unequal(rows) else said)
     section.sentences.extend([*pair_findings(left, right, labels), _RADARS])
-    everything, reference = results([*left, *beside]), f"{REFERENCE}, direct"
-    names = [n for n in everything if n not in (*BASELINES, reference)]
+    everything = results([*left, *beside])
+    names = [n for n in everything if competes(n)]
     for k, part in enumerate(_parts(names, _PER_FIGURE)):
         shown = {n: everything[n] for n in everything if n in part or n not in names}
-        figure = settings_plot(shown, results(right), labels, reference if reference in everything else None)
+        figure = settings_plot(shown, results(right), labels, BESIDE if BESIDE in everything else None)
         caption = (
             f"Means over parameters and seeds with {labels[0]} (green) and {labels[1]} (orange): {', '.join(part)}."
         )

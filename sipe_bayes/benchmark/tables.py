@@ -30,6 +30,7 @@ from sipe_bayes.benchmark.records import Record
 LEVEL = 0.05
 OUTSIDE = "out_of_distribution"
 ALL = "mean of all"
+BESIDE = f"{REFERENCE}, direct"
 VARIANT_NAMES = {"in_distribution": "in distribution", "default": "default", OUTSIDE: "out of distribution"}
 
 Value = Callable[[Record, "Context"], float | None]
@@ -213,7 +214,7 @@ def _over_tasks(row: dict[str, dict[int, float]], columns: Sequence[str]) -> tup
 
 def _best(column: dict[str, tuple[float, ...]], better: int) -> str | None:
     """The estimator that is the best outside noise, if there is one."""
-    mine = {e: v for e, v in column.items() if e not in BASELINES and v}
+    mine = {e: v for e, v in column.items() if competes(e) and v}
     if better == 0 or len(mine) < 2:
         return None
     first = max(mine, key=lambda e: better * float(np.mean(mine[e])))
@@ -221,6 +222,11 @@ def _best(column: dict[str, tuple[float, ...]], better: int) -> str | None:
     trivial = [float(np.mean(v)) for e, v in column.items() if e in BASELINES and v]
     ahead = all(better * against(mine[first], t) > 0 for t in trivial)
     return first if ahead and all(differ(mine[first], other) for other in rest) else None
+
+
+def competes(name: str) -> bool:
+    """Whether a row is an estimator of the table's own setting: neither a baseline nor what stands beside from the direct one."""
+    return name not in (*BASELINES, BESIDE)
 
 
 def differ(a: Sequence[float], b: Sequence[float]) -> bool:

@@ -62,6 +62,7 @@ _DEMONSTRATED = ("FetchPush", "FetchPickAndPlace")
 _SMALL = ("Pendulum", "CartPole")
 _STUDY = ("HalfCheetahLinks", "HalfCheetahJoints", "FetchPush")
 _REDUCED = "bayessim"  # also by its mean, and by
+_REDUCING, _DISTURBING = {"point", "particles"}, {"observation_noise", "action_delay"}  # variations
 _FEW = 10  # particles
 _SMALL_AGENT: dict[str, Any] = {
     "hidden": (64, 64),
@@ -181,15 +182,26 @@ def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
 
 
 def varied(chosen: Sequence[Cell], **variations: float | str | None) -> list[Cell]:
-    """The cells with variations of their randomisation, those of the truth as they are."""
-    given = tuple((name, value) for name, value in variations.items() if value is not None)
-    return [cell if cell.estimator == TRUTH else replace(cell, values=cell.values + given) for cell in chosen]
+    """The cells with variations of their randomisation, each once. The truth has none, and what is a point already only noise and delay."""
+    given = {name: value for name, value in variations.items() if value is not None}
+    return list(dict.fromkeys(replace(cell, values=_values(cell, given)) for cell in chosen))
+
+
+def _values(cell: Cell, given: dict[str, Any]) -> tuple[tuple[str, Any], ...]:
+    if cell.estimator == TRUTH:
+        return ()
+    if cell.estimator == DEFAULT:
+        given = {name: value for name, value in given.items() if name in _DISTURBING}
+    before = dict(cell.values)
+    if _REDUCING & given.keys():
+        before = {name: value for name, value in before.items() if name not in _REDUCING}
+    return tuple({**before, **given}.items())
 
 
 def trained_as(cell: Cell) -> Cell:
     """The cell whose training is the same: the prior knows no variant, and to train in the default model is to train in the truth of the
     default variant."""
-    if cell.estimator == DEFAULT and not cell.values:
+    if cell.estimator == DEFAULT and not cell.values:  # the truth has no variations
         return replace(cell, estimator=TRUTH, variant="default")
     return replace(cell, variant="default") if cell.estimator in (PRIOR, DEFAULT) else cell
 

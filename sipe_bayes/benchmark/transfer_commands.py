@@ -80,6 +80,8 @@ def run(
         if observation_noise is not None and not 0 < observation_noise < float("inf"):
             raise ValueError(f"--observation-noise {observation_noise}: expected an sd above 0; leave it out for none")
         cells = changed(chosen(suite, select or ()), training=training, budget=budget, steps=steps)
+        if point and particles is not None:
+            raise ValueError(f"--particles {particles}: does not go with --point; leave one of them out")
         cells = varied(cells, point="mean" if point else None, particles=particles)
         cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
         start = executor_of(executor, jobs, address)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from sipe_bayes.benchmark.tables import order_tasks
 from sipe_bayes.benchmark.transfer import TRUTH, TransferRecord
-from sipe_bayes.benchmark.transfer_rows import WORDS, Row, label, ordered
+from sipe_bayes.benchmark.transfer_rows import WORDS, Row, in_order, label, ordered
 from sipe_bayes.diagnostics.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, _figure, _styled
 
 _COLOURS = {"truth": MEASURED, "prior": PRIOR, "default": DEFAULT}
@@ -25,7 +25,7 @@ def bars(found: Sequence[Row]) -> Figure:
     """The paper's Figure 6: a group of bars for each task and variant, the oracle as the line at 100 %, the uniform prior as a dashed line
     in each group. A bar without a whisker has one seed."""
     groups = list(dict.fromkeys(row.group for row in found if row.percent is not None))
-    names = [n for n in dict.fromkeys(row.name for row in found) if n != TRUTH]
+    names = [n for n in in_order({row.name for row in found}) if n != TRUTH]
     figure = _figure(3.6 + 0.15 * (len(names) // 4), max(4.8, 1.6 + 0.17 * (len(names) + 1) * len(groups)))
     axes = figure.add_subplot()
     width, drawn = 0.8 / max(1, len(names)), set[str]()

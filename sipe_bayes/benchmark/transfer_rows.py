@@ -96,8 +96,19 @@ def rows(records: Sequence[TransferRecord]) -> list[Row]:
 
 
 def ordered(records: Sequence[TransferRecord]) -> list[str]:
-    order = [*REFERENCES, *order_estimators({r.estimator for r in records} - set(REFERENCES))]
-    return sorted({label(r) for r in records}, key=lambda name: (order.index(name.split(",")[0]), name))
+    """The randomisations with their variations, the references first."""
+    return in_order({label(r) for r in records})
+
+
+def in_order(names: set[str]) -> list[str]:
+    """Randomisations as every table and figure has them."""
+    order = [*REFERENCES, *order_estimators({_plain(n) for n in names} - set(REFERENCES))]
+    return sorted(names, key=lambda name: (order.index(_plain(name)), name))
+
+
+def _plain(name: str) -> str:
+    """A randomisation without its variations."""
+    return name.split(",")[0]
 
 
 def _row(mine: Sequence[TransferRecord], name: str, oracle: dict[int, float], zero: float) -> Row:
@@ -125,6 +136,12 @@ def _row(mine: Sequence[TransferRecord], name: str, oracle: dict[int, float], ze
     )
 
 
+def _prior(name: str, names: set[str]) -> str:
+    """The prior that a randomisation is held against: with the same noise and delay, where there is that."""
+    same = f"prior{name.removeprefix(_plain(name))}"
+    return same if same in names else "prior"
+
+
 def contrasts(found: Sequence[Row]) -> list[tuple[str, str, list[float], int]]:
     """(randomisation, what it is held against, differences in percent of the oracle of each seed, over how many targets): every
     randomisation against the prior, and variations against what they vary. A seed's difference is the mean over the targets that have
@@ -132,8 +149,8 @@ def contrasts(found: Sequence[Row]) -> list[tuple[str, str, list[float], int]]:
     by_name: dict[str, dict[tuple[str, str], dict[int, float]]] = {}
     for row in found:
         by_name.setdefault(row.name, {})[row.group] = row.by_seed
-    pairs = [(name, "prior") for name in by_name if name not in ("prior", TRUTH)]
-    pairs += [(name, name.split(",")[0]) for name in by_name if "," in name]
+    pairs = [(name, _prior(name, set(by_name))) for name in by_name if _plain(name) not in ("prior", TRUTH)]
+    pairs += [(name, _plain(name)) for name in by_name if "," in name]
     said = []
     for name, other in pairs:
         if other not in by_name:

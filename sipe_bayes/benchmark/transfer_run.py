@@ -13,7 +13,7 @@ from typing import Any
 from sipe_bayes.benchmark import run as runs
 from sipe_bayes.benchmark import transfer_measure
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.records import plan, posterior_path
+from sipe_bayes.benchmark.records import plan, posterior_path, record_path
 from sipe_bayes.benchmark.status import headline
 from sipe_bayes.benchmark.transfer import TransferRecord, cell_of, estimate_of, trained_as
 from sipe_bayes.benchmark.work import Executor, Unit
@@ -61,16 +61,20 @@ def load(folder: Path) -> list[TransferRecord]:
     return TransferRecord.all_in(folder)
 
 
-def stale(records: Sequence[TransferRecord], folder: Path) -> list[str]:
-    """Agents that were trained under another posterior than the one that their estimate's record has now, as far as it is there."""
-    found = []
+def stale(records: Sequence[TransferRecord], folder: Path) -> dict[str, str]:
+    """Agents that were trained under another posterior than their estimate's record has now, as far as that is there, and why."""
+    found = {}
     for record in (r for r in records if r.done):
         cell = cell_of(record)
         estimate = estimate_of(cell)
-        if estimate is None or not posterior_path(folder, estimate.id).is_file():
+        there = estimate is not None and (record_path(folder, estimate.id), posterior_path(folder, estimate.id))
+        if not there or not all(path.is_file() for path in there):
             continue
-        if transfer_measure.randomization(cell, folder).fingerprint != record.checksums["randomization"]:
-            found.append(record.id)
+        try:
+            if transfer_measure.randomization(cell, folder).fingerprint != record.checksums["randomization"]:
+                found[record.id] = "its estimate was measured anew"
+        except ValueError as error:
+            found[record.id] = str(error)
     return found
 
 
@@ -78,12 +82,13 @@ def summary(folder: Path) -> dict[str, Any]:
     """How far a folder is, as plain data; raises RecordError for one without a transfer."""
     records, found = TransferRecord.progress(folder)
     done = [r for r in records if r.done]
+    seconds = {trained_as(cell_of(r)).id: r.seconds or 0.0 for r in done}  # of a shared training once
     returns = {r.id: r.evaluation["mean"] for r in done}
     return {
         **found,
         "stale": stale(records, folder),
         "returns": returns,
-        "training_seconds": sum(r.seconds or 0.0 for r in done),
+        "training_seconds": sum(seconds.values()),
     }
 
 
@@ -91,8 +96,6 @@ def lines(found: dict[str, Any]) -> list[str]:
     """``summary`` to be read."""
     said = [f"{headline(found)}; {found['training_seconds']:.0f} s of training"]
     said += [f"{cell}: return {earned:.1f}" for cell, earned in found["returns"].items()]
-    said += [
-        f"stale: {cell}: its estimate was measured anew; delete its record, and run again" for cell in found["stale"]
-    ]
+    said += [f"stale: {cell}: {why}; delete its record, and run again" for cell, why in found["stale"].items()]
     said += [f"failed: {cell}: {why}" for cell, why in found["failed"].items()]
     return said + [f"missing: {cell}" for cell in found["missing"]]

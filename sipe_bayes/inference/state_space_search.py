@@ -50,6 +50,7 @@ _SAME = 0.02  # distance of regressed thetas that is none
 
 def start(search: Search, chain: Chain) -> State:
     """The first state of a fit."""
+    chain.rollouts += chain.prepared
     points = search.initial
     if points is None:
         points = _shot(search, chain) if chain.settings.starts == "recorded" else _screened(search, chain)
