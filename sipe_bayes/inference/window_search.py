@@ -51,7 +51,13 @@ _MAX_ITERATIONS = 80
 _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move along, as foretold or not
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
+_CRAWL, _CRAWLED = 0.01, 2  # of the foretold gain: what is less is a crawl, which so many times in a row ends
+_NOT_SMOOTH = (
+    "at the optimum the linearisation still foretold a gain of {:.1f} nats that no step found: the "
+    "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
+)
 _MOST_POLLS = 20  # looks around that lead on from one starting point
+_TRIALS = 10  # rollouts of a step beside its linearisation
 _MOST_POINTS = 10  # starting points, with those found on the way
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
 
@@ -142,6 +148,7 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "moved": True,
         "centred": False,
         "polls": 0,
+        "crawled": 0,
         "theta_step": windows.theta_step,
     }
 
@@ -190,17 +197,22 @@ def step(search: Search, windows: Windows, state: State) -> State:
         "drift": np.inf if fit.converged and not converged else drift,
         "keep_starts": _foretold(fit),
         "moved": fit.gained > 0,
+        "crawled": state["crawled"] + 1 if _crawls(windows, fit) else 0,
     }
-    if settled or iteration >= _MAX_ITERATIONS:
-        if not settled:
+    ends = not len(state["mode_evidence"]) and _ends(windows, len(theta))
+    if settled or iteration >= _MAX_ITERATIONS or state["crawled"] >= _CRAWLED or ends:
+        if ends and not settled:
+            search.warn(
+                "the budget ended before the search had settled: the estimate is the best so far, and its intervals are too narrow; raise the budget"
+            )
+        elif state["crawled"] >= _CRAWLED:
+            search.warn(_NOT_SMOOTH.format(fit.expected))
+        elif not settled:
             search.warn(
                 f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
             )
         elif fit.refused > _DRIFT:
-            search.warn(
-                f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
-                "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
-            )
+            search.warn(_NOT_SMOOTH.format(fit.refused))
         moments = windows.moments(linearisation) if rough else moments
         return _finish(search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian))
     return _next(windows, state) if not state["polls"] and known(state) else state
@@ -329,7 +341,14 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     if around is None or around.better is None or polls >= _MOST_POLLS:
         return _next(windows, state)
     size = min(state["theta_step"], max(float(np.abs(around.better - theta).max()), SHORTEST))
-    onward = {"theta": around.better, "theta_step": size, "polls": polls + 1, "iteration": 0, "moved": True}
+    onward = {
+        "theta": around.better,
+        "theta_step": size,
+        "polls": polls + 1,
+        "iteration": 0,
+        "moved": True,
+        "crawled": 0,
+    }
     return {**state, **onward, **_AFRESH}
 
 
@@ -382,6 +401,18 @@ def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArra
     shift = np.linalg.pinv(arrow.precision, rcond=1e-12, hermitian=True) @ arrow.gradient
     precision = arrow.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ arrow.precision
     return precision, precision @ shift
+
+
+def _crawls(windows: Windows, fit: Fit) -> bool:
+    """Whether a step of theta alone found next to nothing of the gain that the linearisation foretold, so that another one hardly will: there
+    points around the optimum are looked at instead."""
+    return not windows.num_start and 0 < fit.gained < _CRAWL * fit.expected
+
+
+def _ends(windows: Windows, size: int) -> bool:
+    """Whether the budget has room for another step or for a look around, where theta alone is searched, but not for both."""
+    each = len(windows.trajectories)
+    return not windows.num_start and windows.rollouts + (cost(size) + size + _TRIALS) * each >= windows.budget
 
 
 def _foretold(fit: Fit) -> bool:
