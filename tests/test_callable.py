@@ -290,6 +290,31 @@ def test_intervals_stay_honest_where_the_simulation_is_chaotic() -> None:
         assert any("rough at every scale" in w for w in estimator.warnings)
 
 
+@pytest.mark.parametrize("budget", [60, 100])
+def test_a_search_that_the_budget_ends_is_no_surer_than_its_way_was_long(budget: int) -> None:
+    """A curve with teeth of a hundredth, of which the slope says sd 2e-6: before it has settled the truth lies within four sds."""
+    space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "abcde")
+    mix, phase = np.random.default_rng(1).normal(size=(5, 30)), np.random.default_rng(0).uniform(size=30)
+
+    def toothed(values: np.ndarray) -> np.ndarray:
+        line = np.sin(3 * values) @ mix
+        return line + 1e-2 * (np.abs((line / 2e-2 + phase) % 1 - 0.5) * 4 - 1)
+
+    count = 0
+    for k in range(5):
+        truth = np.random.default_rng(100 + k).uniform(0.1, 0.9, size=5)
+        simulator = sipe.CallableSimulator(toothed, space, likelihood=1e-5)
+        estimator = Laplace(simulator, seed=k, budget=budget, candidates=5, restarts=1)
+        posterior = estimator.fit(toothed(truth[None])[0])
+        unsettled = any("before the search had settled" in w for w in estimator.warnings)
+        z = (posterior.mean.numpy() - truth) / posterior.stddev.numpy()
+        print(k, z, posterior.stddev.numpy(), estimator.rollouts)
+        assert not unsettled or np.sqrt((z**2).mean()) < 4
+        assert estimator.rollouts <= budget
+        count += unsettled
+    assert count >= 2
+
+
 def test_poll_widens_to_what_fits_as_well() -> None:
     """A contact that is not made below one half: the slope seen from there says sd .002, but a tenth below fits as well."""
     space = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=1.0)])

@@ -9,7 +9,8 @@ Where a direction is open (a ridge), the search goes on once from its middle, si
 place to place, and the place would otherwise be an accident of the start.
 
 Where the starts are recorded and theta alone is searched, points around each optimum are tried as well (``poll``), and the search
-goes on from a better one, with finite differences no longer than the way there. The normal that is left is no narrower than the
+goes on from a better one, with finite differences no longer than the way there. Where the budget ends before the first optimum, what is
+kept of it is spent on such a look at the best point so far, which is then known no better than the way to it is long. The normal that is left is no narrower than the
 shortest of these ways, and holds the points that fit as well as the optimum, whatever the curvature says; one that fits as
 well but lies beyond worse ones becomes a further starting point. Where already the shortest way leads to a far worse fit, the optimum is a stroke
 of luck: then its neighbours say how large the noise is and what fits as well, and a warning says so.
@@ -37,7 +38,7 @@ from sipe_bayes.inference.window_noise import (
     same_noise,
     updated_noise,
 )
-from sipe_bayes.likelihood import Linearisation, Windows
+from sipe_bayes.likelihood import BudgetExhausted, Linearisation, Windows
 from sipe_bayes.noise import Arrow, Moments, Noise, eliminate, restricted
 from sipe_bayes.noise_spread import noise_cloud, sandwich
 
@@ -51,11 +52,6 @@ _MAX_ITERATIONS = 80
 _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move along, as foretold or not
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
-_CRAWL, _CRAWLED = 0.01, 2  # of the foretold gain: what is less is a crawl, which so many times in a row ends
-_NOT_SMOOTH = (
-    "at the optimum the linearisation still foretold a gain of {:.1f} nats that no step found: the "
-    "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
-)
 _MOST_POLLS = 20  # looks around that lead on from one starting point
 _TRIALS = 10  # rollouts of a step beside its linearisation
 _MOST_POINTS = 10  # starting points, with those found on the way
@@ -148,7 +144,6 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "moved": True,
         "centred": False,
         "polls": 0,
-        "crawled": 0,
         "theta_step": windows.theta_step,
     }
 
@@ -174,7 +169,13 @@ def step(search: Search, windows: Windows, state: State) -> State:
     value = energy_of(windows, noise, prior, theta, starts, linearisation.residual)
     tolerance = max(_ROUGH * value, _TOLERANCE) if rough else _TOLERANCE
     here = Fit(theta, starts, value, state["damping"], residual=linearisation.residual)
-    fit = descend(windows, noise, prior, here, moments, tolerance, stale)
+    unrecorded = not windows.num_start and not len(state["mode_evidence"])
+    try:
+        fit = descend(windows, noise, prior, here, moments, tolerance, stale)
+    except BudgetExhausted:
+        if not unrecorded:
+            raise
+        fit = here
     drift = drift + abs(fit.gained - fit.expected)
     converged = fit.converged and drift < _DRIFT
     iteration = state["iteration"] + 1
@@ -197,24 +198,26 @@ def step(search: Search, windows: Windows, state: State) -> State:
         "drift": np.inf if fit.converged and not converged else drift,
         "keep_starts": _foretold(fit),
         "moved": fit.gained > 0,
-        "crawled": state["crawled"] + 1 if _crawls(windows, fit) else 0,
     }
-    ends = not len(state["mode_evidence"]) and _ends(windows, len(theta))
-    if settled or iteration >= _MAX_ITERATIONS or state["crawled"] >= _CRAWLED or ends:
+    ends = unrecorded and (fit is here or _ends(windows, len(theta)))
+    if settled or iteration >= _MAX_ITERATIONS or ends:
         if ends and not settled:
             search.warn(
-                "the budget ended before the search had settled: the estimate is the best so far, and its intervals are too narrow; raise the budget"
+                "the budget ended before the search had settled: the estimate is the best so far, and its intervals are as wide as the way "
+                "it has come; raise the budget"
             )
-        elif state["crawled"] >= _CRAWLED:
-            search.warn(_NOT_SMOOTH.format(fit.expected))
         elif not settled:
             search.warn(
                 f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
             )
         elif fit.refused > _DRIFT:
-            search.warn(_NOT_SMOOTH.format(fit.refused))
+            search.warn(
+                f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
+                "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
+            )
         moments = windows.moments(linearisation) if rough else moments
-        return _finish(search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian))
+        way = theta - state["points"][state["point"]] if ends and not settled else np.zeros_like(theta)
+        return _finish(search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian, way))
     return _next(windows, state) if not state["polls"] and known(state) else state
 
 
@@ -273,13 +276,15 @@ def _next(windows: Windows, state: State) -> State:
 
 @dataclass(frozen=True)
 class _Optimum:
-    """Where a search ended: theta (N,), starts (W, D), noise, and the linearisation (W, L, C, N + D) there with its moments."""
+    """Where a search ended: theta (N,), starts (W, D), noise, and the linearisation (W, L, C, N + D) there with its moments; way (N,): that it
+    had come, where it ended with the budget, else zero."""
 
     theta: FloatArray
     starts: FloatArray
     noise: Noise
     moments: Moments
     jacobian: FloatArray
+    way: FloatArray
 
 
 def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
@@ -330,7 +335,8 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
             )
     elif state["polls"]:  # the budget ends: at least as wide as the optimum before, which this one betters
         found["covariance"] = found["covariance"] + state["mode_covariance"][-1]
-    further = None if state["centred"] else _middle(search, windows, found)
+    found["covariance"] = found["covariance"] + np.diag(optimum.way**2)
+    further = None if state["centred"] or optimum.way.any() else _middle(search, windows, found)
     if further is not None:
         return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
     before = len(state["mode_evidence"]) - (state["polls"] > 0)  # an optimum that a poll has bettered is none
@@ -341,14 +347,7 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     if around is None or around.better is None or polls >= _MOST_POLLS:
         return _next(windows, state)
     size = min(state["theta_step"], max(float(np.abs(around.better - theta).max()), SHORTEST))
-    onward = {
-        "theta": around.better,
-        "theta_step": size,
-        "polls": polls + 1,
-        "iteration": 0,
-        "moved": True,
-        "crawled": 0,
-    }
+    onward = {"theta": around.better, "theta_step": size, "polls": polls + 1, "iteration": 0, "moved": True}
     return {**state, **onward, **_AFRESH}
 
 
@@ -403,16 +402,11 @@ def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArra
     return precision, precision @ shift
 
 
-def _crawls(windows: Windows, fit: Fit) -> bool:
-    """Whether a step of theta alone found next to nothing of the gain that the linearisation foretold, so that another one hardly will: there
-    points around the optimum are looked at instead."""
-    return not windows.num_start and 0 < fit.gained < _CRAWL * fit.expected
-
-
 def _ends(windows: Windows, size: int) -> bool:
-    """Whether the budget has room for another step or for a look around, where theta alone is searched, but not for both."""
+    """Whether the budget leaves no room for another step; or, where a look around takes less than half of it, for that as well."""
     each = len(windows.trajectories)
-    return not windows.num_start and windows.rollouts + (cost(size) + size + _TRIALS) * each >= windows.budget
+    left, step, look = windows.budget - windows.rollouts, (size + _TRIALS) * each, cost(size) * each
+    return left < step or (2 * look < windows.budget and left < step + look)
 
 
 def _foretold(fit: Fit) -> bool:
