@@ -478,6 +478,18 @@ def test_what_latex_refuses_is_said(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["report.tex"]
 
 
+def test_commands_are_told_once() -> None:
+    """Whatever they selected."""
+    runs = [
+        make(command=f"sipe benchmark run --suite direct --select '{part}/*' --select Door --out x")
+        for part in ("a", "b")
+    ]
+    assert (
+        dict(findings.facts(runs, []))["commands"] == "sipe benchmark run --suite direct --out x, in parts by --select"
+    )
+    assert dict(findings.facts([make()], []))["commands"] == "sipe benchmark run --suite quick"
+
+
 def test_the_least_there_can_be(tmp_path: Path) -> None:
     make().write(tmp_path)
     found = report_contents.contents(tmp_path)

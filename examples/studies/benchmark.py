@@ -67,7 +67,7 @@ def section(found: Section) -> Iterator[str]:
 def page(found: Contents) -> Iterator[str]:
     yield "# The benchmark\n"
     yield f"{found.headline}. Means and standard errors over seeds; bold is the best outside noise.\n"
-    yield from (f"- {label}: {text}" for label, text in found.facts if label != "command")
+    yield from (f"- {label}: {text}" for label, text in found.facts)
     for part in found.sections:
         if part.anchor in SHOWN:
             yield from section(part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -47,7 +48,7 @@ def facts(records: Sequence[Record], runs: Sequence[dict[str, Any]]) -> list[tup
         ("versions", "; ".join(f"{p} {_listed(r.versions.get(p, '') for r in records)}" for p in _packages(records))),
         ("states of the code", _sources(records)),
         ("not comparable", ", ".join(f"{group}: its cells were given different logs" for group in mixed(records))),
-        ("command", _listed(r.command for r in records)),
+        ("commands", _commands(records)),
     ]
     return [(label, text) for label, text in found if text]
 
@@ -85,6 +86,13 @@ def _sources(records: Sequence[Record]) -> str:
     """Where several states of the package's code made the records."""
     found = {r.checksums.get("source", "not kept") for r in records if r.done}
     return f"{len(found)}: {', '.join(sorted(found))}" if len(found) > 1 else ""
+
+
+def _commands(records: Sequence[Record]) -> str:
+    """The commands behind the records; of those that differ in what they selected only one."""
+    plain = {re.sub(r" --select (?:'[^']*'|\S+)", "", r.command) for r in records}
+    chosen = any(" --select " in r.command for r in records)
+    return _listed(plain) + (", in parts by --select" if chosen else "")
 
 
 def _packages(records: Sequence[Record]) -> list[str]:

@@ -188,7 +188,7 @@ def _rows(
         for ax, measure in zip(line, _MEASURES, strict=True):
             _radar(ax, [*curves[measure], *baselines[measure]], spokes, _RANGES[measure])
             ax.set_title(f"{title}: {measure}", fontweight="bold", pad=26)
-    figure.legend(handles=_legend(rows, baselines), loc="outside upper center", ncols=4 if len(rows) > 1 else 7)
+    figure.legend(handles=_legend(rows, baselines), loc="outside upper center", ncols=7)
     return figure
 
 
