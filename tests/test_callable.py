@@ -292,12 +292,13 @@ def test_intervals_stay_honest_where_the_simulation_is_chaotic() -> None:
 
 @pytest.mark.parametrize("budget", [60, 100])
 def test_a_search_that_the_budget_ends_is_no_surer_than_its_way_was_long(budget: int) -> None:
-    """A curve with teeth of a hundredth, of which the slope says sd 2e-6: before it has settled the truth lies within four sds."""
+    """A curve with teeth of a hundredth, of which the slope says sd 2e-6: before it has settled, or where no step finds what was foretold, the
+    truth lies within four sds."""
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "abcde")
     mix, phase = np.random.default_rng(1).normal(size=(5, 30)), np.random.default_rng(0).uniform(size=30)
 
     def toothed(values: np.ndarray) -> np.ndarray:
-        line = np.sin(3 * values) @ mix
+        line = (values + 0.5 * values**2) @ mix
         return line + 1e-2 * (np.abs((line / 2e-2 + phase) % 1 - 0.5) * 4 - 1)
 
     count = 0
@@ -309,7 +310,7 @@ def test_a_search_that_the_budget_ends_is_no_surer_than_its_way_was_long(budget:
         unsettled = any("before the search had settled" in w for w in estimator.warnings)
         z = (posterior.mean.numpy() - truth) / posterior.stddev.numpy()
         print(k, z, posterior.stddev.numpy(), estimator.rollouts)
-        assert not unsettled or np.sqrt((z**2).mean()) < 4
+        assert np.sqrt((z**2).mean()) < 4
         assert estimator.rollouts <= budget
         count += unsettled
     assert count >= 2

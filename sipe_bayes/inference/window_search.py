@@ -9,11 +9,15 @@ Where a direction is open (a ridge), the search goes on once from its middle, si
 place to place, and the place would otherwise be an accident of the start.
 
 Where the starts are recorded and theta alone is searched, points around each optimum are tried as well (``poll``), and the search
-goes on from a better one, with finite differences no longer than the way there. Where the budget ends before the first optimum, what is
-kept of it is spent on such a look at the best point so far, which is then known no better than the way to it is long. The normal that is left is no narrower than the
+goes on from a better one, with finite differences no longer than the way there. The normal that is left is no narrower than the
 shortest of these ways, and holds the points that fit as well as the optimum, whatever the curvature says; one that fits as
 well but lies beyond worse ones becomes a further starting point. Where already the shortest way leads to a far worse fit, the optimum is a stroke
 of luck: then its neighbours say how large the noise is and what fits as well, and a warning says so.
+
+Where theta alone is searched and the budget ends before the first optimum, what is kept of it is spent on such a look at the best point so far.
+Of that, of an optimum where no step found the gain that its linearisation foretold, and of one that is a stroke of luck, the normal says
+nothing; its sd is guessed: the way from the starting point (root mean square over theta), times the share of the first misfit that is left, as a misfit that is theta's shrinks with
+the distance.
 """
 
 from __future__ import annotations
@@ -53,6 +57,7 @@ _HALF, _LITTLE = 0.5, 0.1  # of the energy: gains below which the starts move al
 _FAIR, _DRIFT = 0.2, 0.5  # how well the starts' Jacobian must foretell gains: relative, nats in all
 _OPEN, _OFF_CENTRE, _AS_GOOD = 0.5, 0.1, 2.0  # sd of an open direction, distance from its middle, nats
 _MOST_POLLS = 20  # looks around that lead on from one starting point
+_STILL = 1e-9  # of the largest spread of a channel: one below it does not move
 _TRIALS = 10  # rollouts of a step beside its linearisation
 _MOST_POINTS = 10  # starting points, with those found on the way
 _AFRESH = {"residual": np.empty(0), "jacobian": np.empty(0), "drift": 0.0, "due": False, "damping": 1e-4}
@@ -116,6 +121,14 @@ def _plain_loss(windows: Windows, points: FloatArray) -> FloatArray:
     return np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
 
 
+def _misfit(windows: Windows, residual: FloatArray) -> float:
+    """Root mean square of residuals (W, L, C), in units of the spread of each channel that has one."""
+    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
+    moves = spread > _STILL * spread.max()
+    size = np.where(moves, spread, np.inf) if moves.any() else np.ones_like(spread)
+    return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or 1e-300
+
+
 def _by_loss(loss: FloatArray) -> NDArray[np.int64]:
     """Places of the finite ones, the least first."""
     return np.argsort(loss, kind="stable")[: int(np.isfinite(loss).sum())]
@@ -144,6 +157,7 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "moved": True,
         "centred": False,
         "polls": 0,
+        "misfit": 0.0,
         "theta_step": windows.theta_step,
     }
 
@@ -198,12 +212,13 @@ def step(search: Search, windows: Windows, state: State) -> State:
         "drift": np.inf if fit.converged and not converged else drift,
         "keep_starts": _foretold(fit),
         "moved": fit.gained > 0,
+        "misfit": state["misfit"] or _misfit(windows, linearisation.residual),
     }
     ends = unrecorded and (fit is here or _ends(windows, len(theta)))
     if settled or iteration >= _MAX_ITERATIONS or ends:
         if ends and not settled:
             search.warn(
-                "the budget ended before the search had settled: the estimate is the best so far, and its intervals are as wide as the way "
+                "the budget ended before the search had settled: the estimate is the best so far, and its intervals are guessed from the way "
                 "it has come; raise the budget"
             )
         elif not settled:
@@ -216,8 +231,12 @@ def step(search: Search, windows: Windows, state: State) -> State:
                 "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
             )
         moments = windows.moments(linearisation) if rough else moments
-        way = theta - state["points"][state["point"]] if ends and not settled else np.zeros_like(theta)
-        return _finish(search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian, way))
+        left, gone = _misfit(windows, linearisation.residual) / state["misfit"], theta - state["points"][state["point"]]
+        guess = float(np.sqrt((gone**2).mean())) * min(1.0, left)
+        doubtful = not windows.num_start and ((ends and not settled) or fit.refused > _DRIFT)
+        return _finish(
+            search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian, guess, doubtful)
+        )
     return _next(windows, state) if not state["polls"] and known(state) else state
 
 
@@ -247,6 +266,7 @@ def _held_step(windows: Windows, state: State, prior: QuadraticPrior) -> State:
         "iteration": state["iteration"] + 1,
         "held": held,
         "peeked": True,
+        "misfit": state["misfit"] or _misfit(view, found.residual),
         "residual": fit.residual if held or view is windows else np.empty(0),
     }
     return _next(windows, state) if known(state) else state
@@ -276,15 +296,16 @@ def _next(windows: Windows, state: State) -> State:
 
 @dataclass(frozen=True)
 class _Optimum:
-    """Where a search ended: theta (N,), starts (W, D), noise, and the linearisation (W, L, C, N + D) there with its moments; way (N,): that it
-    had come, where it ended with the budget, else zero."""
+    """Where a search ended: theta (N,), starts (W, D), noise, and the linearisation (W, L, C, N + D) there with its moments; guess: of
+    an sd, from the way and the misfit; doubtful: whether the normal says nothing."""
 
     theta: FloatArray
     starts: FloatArray
     noise: Noise
     moments: Moments
     jacobian: FloatArray
-    way: FloatArray
+    guess: float
+    doubtful: bool
 
 
 def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
@@ -335,8 +356,9 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
             )
     elif state["polls"]:  # the budget ends: at least as wide as the optimum before, which this one betters
         found["covariance"] = found["covariance"] + state["mode_covariance"][-1]
-    found["covariance"] = found["covariance"] + np.diag(optimum.way**2)
-    further = None if state["centred"] or optimum.way.any() else _middle(search, windows, found)
+    if optimum.doubtful or (around is not None and around.rough):
+        found["covariance"] = found["covariance"] + optimum.guess**2 * np.eye(len(theta))
+    further = None if state["centred"] else _middle(search, windows, found)
     if further is not None:
         return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
     before = len(state["mode_evidence"]) - (state["polls"] > 0)  # an optimum that a poll has bettered is none
@@ -389,6 +411,8 @@ def _middle(search: Search, windows: Windows, found: State) -> FloatArray | None
         return None
     prior = search.quadratic_prior
     trials = np.clip(theta + np.array([0.0, 1.0, 0.5, 0.25])[:, None] * move, 0, 1)
+    if windows.rollouts + len(trials) * len(windows.trajectories) > windows.budget:
+        return None
     residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
     values = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(trials, residual, strict=True)]
     good = [k for k in range(1, len(trials)) if valid[k] and values[k] < values[0] + _AS_GOOD]
