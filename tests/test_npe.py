@@ -148,8 +148,8 @@ def test_sbi_leaves_argument_validation_as_it_was() -> None:
         "import os\nfrom torch.distributions import Distribution as D\nimport pyro\n"
         "parent = os.fork() > 0\nD.set_default_validate_args(parent)\n"
         "from sipe_bayes.models.sbi_tools import import_sbi\nimport_sbi('inference')\n"
-        "print('kept' if D._validate_args == parent else 'changed', flush=True)\n"
-        "if parent: os.wait()"
+        "if parent: os.wait()\n"  # one line at a time
+        "print('kept' if D._validate_args == parent else 'changed', flush=True)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["kept", "kept"]
