@@ -24,10 +24,8 @@ _GRID, _STEPS, _DIFFERENCE = 32, 6, 1e-5  # values tried, Gauss-Newton steps, fi
 _SAMPLES, _VALUES = 16, 4  # with which it is seen whether a position matters at all
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _MATTERS = 1e-6  # of a channel's spread
-_UNIQUE, _CLEAR = (
-    0.9,
-    0.1,
-)  # share of the samples at which the next best place must fit worse, by so many squared spreads
+_UNIQUE = 0.9  # share of the samples at which the next best place must fit worse,
+_CLEAR = 0.1  # by so many squared spreads
 _FITS = 0.2  # of a channel's spread: root mean square of what may be left
 
 

@@ -70,8 +70,8 @@ def train(
 
     randomization: what each episode draws; without one all run in the published model. device: where the networks learn, "cpu" or
     "cuda"; a run may go on on the other. resume: go on from the folder's checkpoint, if it has one, also with more ``steps`` than
-    before; the result is that of an uninterrupted run; one that is finished is read. Raises ValueError for arguments out of range, and for a folder that holds
-    another run or, without ``resume``, any.
+    before; the result is that of an uninterrupted run; one that is finished is read. Raises ValueError for arguments out of range, and for
+    a folder that holds another run or, without ``resume``, any.
     """
     task = make_task(task) if isinstance(task, str) else task
     settings = settings or Settings()
