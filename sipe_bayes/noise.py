@@ -66,7 +66,7 @@ class Moments:
     residual (W, L, C); jacobian (W, L, C, N + D): derivatives of the prediction by theta and the window's start.
     With x a row and y the row before it, each of the G pairs of channel and gap has the sums x x', x y' + y x' and
     y y' over its samples: ``products`` (3 G, W K K). gaps, owner (its channel) and counts are (G,). white: for white noise
-    alone, quickly: one endless gap a channel.
+    alone, quickly: one endless gap a channel. Without starts (D = 0) only sums over all windows matter: W is 1 then.
     """
 
     def __init__(
@@ -78,13 +78,15 @@ class Moments:
         white: bool = False,
     ) -> None:
         windows, length, channels, columns = jacobian.shape
-        self.num_theta, self.num_start, self.windows = num_theta, columns - num_theta, windows
+        self.num_theta, self.num_start = num_theta, columns - num_theta
+        self.windows = windows if self.num_start else 1
         self.sequences = all_sequences
         if white:
             rows = np.concatenate([jacobian, residual[..., None]], axis=-1).transpose(2, 0, 1, 3)
+            rows = rows.reshape(channels, self.windows, -1, columns + 1)
             self.gaps, self.owner = np.full(channels, np.inf), np.arange(channels)
             self.counts = np.array([len(s.index) for s in all_sequences])
-            squares = np.zeros((channels, 2, windows, 2 * columns + 2, 2 * columns + 2))
+            squares = np.zeros((channels, 2, self.windows, 2 * columns + 2, 2 * columns + 2))
             squares[:, 0, :, : columns + 1, : columns + 1] = np.swapaxes(rows, 2, 3) @ rows
             self.products = self._spread(squares).reshape(3 * channels, -1)
             return
@@ -103,13 +105,14 @@ class Moments:
         before = np.where((s.previous >= 0)[:, None], rows[s.previous], 0.0)
         both = np.concatenate([rows[s.index], before], axis=1)
         out = np.zeros((len(s.gaps), 2, self.windows, both.shape[1], both.shape[1]))
-        key = (s.window * len(s.gaps) + s.gap) * 2 + s.crosses
+        own = s.window if self.num_start else np.zeros_like(s.window)
+        key = (own * len(s.gaps) + s.gap) * 2 + s.crosses
         order = np.argsort(key, kind="stable")
         edges = np.flatnonzero(np.diff(key[order], prepend=-1, append=-1)).tolist()
         sorted_rows = both[order]
         for begin, end in itertools.pairwise(edges):
-            window, first, part = s.window[order[begin]], order[begin], sorted_rows[begin:end]
-            out[s.gap[first], int(s.crosses[first]), window] = part.T @ part
+            first, part = order[begin], sorted_rows[begin:end]
+            out[s.gap[first], int(s.crosses[first]), own[first]] = part.T @ part
         return out
 
     def _spread(self, squares: FloatArray) -> FloatArray:
@@ -202,13 +205,13 @@ def eliminate(
     """Eliminate the starts from the normal equations.
 
     normal (W, K, K) as Moments.normal gives; start_precision (D,): weak prior on the starts; start_pull (W, D): its
-    gradient; damping: relative Levenberg-Marquardt damping of the starts' block.
+    gradient; damping: relative Levenberg-Marquardt damping of the starts' block. Without starts normal is (1, K, K).
     """
     windows, width, _ = normal.shape
     n, d = num_theta, (width - 1 - num_theta) // 2
     theta, own, prev, r = slice(0, n), slice(n, n + d), slice(n + d, n + 2 * d), width - 1
     if not d:  # recorded starts
-        whole, none = normal.sum(0), np.zeros((windows, 0, n))
+        whole, none = normal[0], np.zeros((len(start_pull), 0, n))
         return Arrow(
             whole[theta, theta], whole[theta, r], 0.0, 0.0, float(whole[r, r]), none[..., 0], none, np.zeros((0, 0))
         )
@@ -317,20 +320,22 @@ def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[flo
     arrow = eliminate(moments.normal(noise), moments.num_theta, pulls.start_precision, pulls.start_pull)
     value, move, covariance = _restricted(moments, noise, pulls, arrow)
     n, d, windows = moments.num_theta, moments.num_start, moments.windows
-    slope, starts = arrow.start_slope, arrow.starts(move)
-    same, apart = _start_covariance(arrow.factor, windows)
     size = n + 2 * d
     by_start = np.zeros((windows, size, n))  # how the window's unknowns follow theta
     by_start[:, :n] = np.eye(n)
-    by_start[:, n : n + d], by_start[1:, n + d :] = -slope, -slope[:-1]
-    inner = np.zeros((windows, size + 1, size + 1))
-    inner[:, :size, :size] = by_start @ covariance @ np.swapaxes(by_start, 1, 2)
-    inner[:, n : n + d, n : n + d] += same
-    inner[1:, n + d : size, n + d : size] += same[:-1]
-    inner[1:, n : n + d, n + d : size] += apart[1:]
-    inner[1:, n + d : size, n : n + d] += np.swapaxes(apart[1:], 1, 2)
     v = np.zeros((windows, size + 1))
-    v[:, :n], v[:, n : n + d], v[1:, n + d : size], v[:, -1] = move, starts, starts[:-1], -1.0
+    v[:, :n], v[:, -1] = move, -1.0
+    inner = np.zeros((windows, size + 1, size + 1))
+    if d:
+        slope, starts = arrow.start_slope, arrow.starts(move)
+        by_start[:, n : n + d], by_start[1:, n + d :] = -slope, -slope[:-1]
+        v[:, n : n + d], v[1:, n + d : size] = starts, starts[:-1]
+        same, apart = _start_covariance(arrow.factor, windows)
+        inner[:, n : n + d, n : n + d] += same
+        inner[1:, n + d : size, n + d : size] += same[:-1]
+        inner[1:, n : n + d, n + d : size] += apart[1:]
+        inner[1:, n + d : size, n : n + d] += np.swapaxes(apart[1:], 1, 2)
+    inner[:, :size, :size] += by_start @ covariance @ np.swapaxes(by_start, 1, 2)
     inner += v[:, :, None] * v[:, None, :]
     by_sd, by_tau = moments.slopes(noise, inner)
     return value, -0.5 * by_sd, -0.5 * by_tau

@@ -22,6 +22,7 @@ from sipe_bayes.noise import (
     eliminate,
     estimate_noise,
     restricted,
+    restricted_slopes,
     whiten,
 )
 from sipe_bayes.sequences import sequences
@@ -219,6 +220,46 @@ def test_restricted_likelihood_is_the_dense_one(name: str, noise: Noise, free: t
     explained = right @ np.linalg.solve(matrix, right)
     expected = -0.5 * (log_covariance + np.linalg.slogdet(matrix)[1] + square - explained)
     close(restricted(case.moments(), noise, pulls), expected)
+
+
+@ALL
+@EVERY_NOISE
+@pytest.mark.parametrize("free", [(True, True, True), (True, False, True), (False, False, False)])
+def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tuple[bool, ...]) -> None:
+    """Normal equations, restricted likelihood and its slopes against dense algebra; white noise also by the quick way."""
+    case, rng = PROBLEMS[name], np.random.default_rng(6)
+    channels, (covariance, jacobian, residual) = case.observed.shape[2], dense(case, noise)
+    jacobian, moving = jacobian[:, :N], np.array(free)
+    prior, prior_pull, none = np.diag([0.5, 1.0, 2.0]), rng.normal(size=N), np.zeros((len(case.log), 0))
+    pulls = Pulls(prior, prior_pull, np.zeros(0), none, moving)
+    noise = Noise(noise.sd[:channels], noise.tau[:channels])
+
+    def expected(noise: Noise) -> float:
+        covariance = dense(case, noise)[0]
+        matrix = jacobian.T @ np.linalg.solve(covariance, jacobian) + prior
+        right = jacobian.T @ np.linalg.solve(covariance, residual) + prior_pull
+        matrix, right = matrix[np.ix_(moving, moving)], right[moving]
+        square = residual @ np.linalg.solve(covariance, residual) - right @ np.linalg.solve(matrix, right)
+        return float(-0.5 * (np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(matrix)[1] + square))
+
+    coloured = bool(noise.tau.any())
+    for white in (False,) if coloured else (False, True):
+        moments = Moments(case.residual, case.jacobian[..., :N], N, case.sequences, white)
+        assert moments.windows == 1
+        arrow = eliminate(moments.normal(noise), N, np.zeros(0), none)
+        close(arrow.precision, jacobian.T @ np.linalg.solve(covariance, jacobian))
+        close(arrow.gradient, jacobian.T @ np.linalg.solve(covariance, residual))
+        assert (arrow.starts(np.ones(N)).shape, arrow.start_slope.shape) == (none.shape, (*none.shape, N))
+        value, by_sd, by_tau = restricted_slopes(moments, noise, pulls)
+        close([value, restricted(moments, noise, pulls)], expected(noise))
+        h = 1e-6
+        for c in range(channels):
+            up = np.exp(h * np.eye(channels)[c])
+            for slope, more, less in (
+                (by_sd[c], Noise(noise.sd * up, noise.tau), Noise(noise.sd / up, noise.tau)),
+                (by_tau[c], Noise(noise.sd, noise.tau * up), Noise(noise.sd, noise.tau / up)),
+            ):
+                np.testing.assert_allclose(slope, (expected(more) - expected(less)) / (2 * h), rtol=1e-5, atol=1e-5)
 
 
 @ALL

@@ -153,7 +153,8 @@ class MCMC(Estimator):
         prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
         start_pull = -windows.start_precision * picked["starts"]
         here = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
-        spread = noise_covariance(windows.moments(linearisation), noise, here, free_noise(windows))
+        moments = windows.moments(linearisation, white=self.likelihood.noise == "white")
+        spread = noise_covariance(moments, noise, here, free_noise(windows))
         jacobian = np.ascontiguousarray(linearisation.jacobian[..., len(self.space) :])
         return {**{f"fit_{k}": v for k, v in picked.items()}, "fit_jacobian": jacobian}, spread
 

@@ -174,7 +174,8 @@ def step(search: Search, windows: Windows, state: State) -> State:
     if not linearisation.valid and state["peeked"]:  # every other window went well, but not all
         begin = _begin(windows, state["points"][state["point"]])
         return {**state, **begin, "held": False, "peeked": False}
-    moments = windows.moments(linearisation, white=rough)
+    white = windows.settings.noise == "white"
+    moments = windows.moments(linearisation, white=rough or white)
     noise = before = Noise(state["sd"], state["tau"])
     if rough:
         noise = present_noise(windows, linearisation.residual)
@@ -230,7 +231,7 @@ def step(search: Search, windows: Windows, state: State) -> State:
                 f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
                 "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
             )
-        moments = windows.moments(linearisation) if rough else moments
+        moments = windows.moments(linearisation) if rough and not white else moments
         left, gone = _misfit(windows, linearisation.residual) / state["misfit"], theta - state["points"][state["point"]]
         guess = float(np.sqrt((gone**2).mean())) * min(1.0, left)
         doubtful = not windows.num_start and ((ends and not settled) or fit.refused > _DRIFT)
