@@ -209,6 +209,9 @@ def test_status(undisturbed: Path) -> None:
     assert took["cpu_use"] == took["cpu_seconds"] / took["seconds"] > 0
     assert took["units"] == 7
     assert "6 cells, 6 done, 0 failed, 0 missing" in lines(found)[0]
+    (cpu,) = [line for line in lines(found) if line.startswith("CPU time of these cells")]
+    seconds = sum(record.cpu_seconds or 0 for record in load_all(undisturbed))
+    assert f"{spent.duration(seconds)} for the methods (direct {spent.duration(seconds)})" in cpu
     twice = {
         **found,
         "runs": [

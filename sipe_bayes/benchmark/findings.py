@@ -10,7 +10,7 @@ import numpy as np
 
 from sipe_bayes.benchmark.cells import BASELINES, SUITES, suite
 from sipe_bayes.benchmark.records import Record, mixed
-from sipe_bayes.benchmark.spent import by_suite, duration, percent, together
+from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, together
 from sipe_bayes.benchmark.tables import (
     ALL,
     MEASURES,
@@ -43,7 +43,7 @@ def facts(records: Sequence[Record], runs: Sequence[dict[str, Any]]) -> list[tup
         ("seeds", _numbers(r.seed for r in records)),
         ("budget", f"{_numbers(r.budget for r in records)} rollouts"),
         ("trajectories", f"{_horizons(records)} control steps; by {_listed(r.log for r in records)}"),
-        ("CPU time", _cpu_time(records)),
+        ("CPU time", cpu_time(records)),
         ("wall time", _wall_time(runs)),
         ("versions", "; ".join(f"{p} {_listed(r.versions.get(p, '') for r in records)}" for p in _packages(records))),
         ("states of the code", _sources(records)),
@@ -58,15 +58,6 @@ def _suites(records: Sequence[Record]) -> str:
     done = {r.id for r in records if r.done}
     counts = {name: [cell.id for cell in suite(name)] for name in SUITES if name not in ("all", "quick")}
     return ", ".join(f"{name} {len(done.intersection(ids)):,} of {len(ids):,}" for name, ids in counts.items())
-
-
-def _cpu_time(records: Sequence[Record]) -> str:
-    method = sum(r.cpu_seconds or 0.0 for r in records)
-    banks: dict[tuple[str, str, int, int], float] = {}  # each shared by several records
-    for r in records:
-        bank = (r.task, r.variant, r.seed, r.steps)
-        banks[bank] = max(banks.get(bank, 0.0), r.simulation_cpu_seconds)
-    return f"{duration(method)} for the methods, {duration(sum(banks.values()))} for shared simulations"
 
 
 def _wall_time(runs: Sequence[dict[str, Any]]) -> str:

@@ -1,14 +1,15 @@
-"""``runs.json``: what each run in a folder of results took, and what that comes to."""
+"""What it took: ``runs.json``, each run in a folder of results, and what its records and runs come to."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from sipe_bayes.atomic import write_text
+from sipe_bayes.benchmark.records import Record
 from sipe_bayes.output import OutputError, to_json
 
 LOG = "runs.json"
@@ -65,6 +66,18 @@ def _suite(command: str) -> str:
 def _use(rows: list[dict[str, Any]]) -> float | None:
     whole = sum(row["seconds"] * row["workers"] for row in rows)
     return sum(row["cpu_seconds"] for row in rows) / whole if whole else None
+
+
+def cpu_time(records: Sequence[Record]) -> str:
+    """What the cells that are there took, each once, by setting; simulations that several of them share are counted once."""
+    method, banks = dict[str, float](), dict[tuple[str, str, int, int], float]()
+    for r in records:
+        method[r.setting] = method.get(r.setting, 0.0) + (r.cpu_seconds or 0.0)
+        bank = (r.task, r.variant, r.seed, r.steps)
+        banks[bank] = max(banks.get(bank, 0.0), r.simulation_cpu_seconds)
+    parts = ", ".join(f"{name} {duration(seconds)}" for name, seconds in method.items())
+    shared = duration(sum(banks.values()))
+    return f"{duration(sum(method.values()))} for the methods ({parts}), {shared} for shared simulations"
 
 
 def percent(share: float | None) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sipe_bayes.benchmark.records import Record, mixed
-from sipe_bayes.benchmark.spent import by_suite, duration, percent, runs, together
+from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, runs, together
 
 _SHOWN = 20  # missing cells that are named
 
@@ -20,6 +20,7 @@ def summary(folder: Path) -> dict[str, Any]:
         **found,
         "mixed": mixed(records),
         "converged": _converged(records),
+        "cpu_time": cpu_time(records),
         "runs": [{**row, **together([row])} for row in rows],
         "suites": by_suite(rows),
         "all": together(rows),
@@ -51,6 +52,8 @@ def lines(found: dict[str, Any]) -> list[str]:
     said += [f"converged: {name}: {count} seeds" for name, count in found["converged"].items()]
     if found["failed"]:
         said.append("the same command with --retry-failed measures those that failed again")
+    if found["done"]:
+        said.append(f"CPU time of these cells: {found['cpu_time']}")
     for row in found["runs"]:
         use = f"{row['units']} units in {row['seconds']:.0f} s, CPU use {percent(row['cpu_use'])} of {row['workers']} workers"
         said.append(f"{row['started']}: {use}{_simulating(row)}: {row['command']}")
