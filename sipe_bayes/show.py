@@ -20,9 +20,12 @@ from sipe_bayes.posterior import prior as default_prior
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from sipe_bayes.parameters import ParameterSpace
+
 Estimates = Mapping[str, Posterior] | Mapping[str, Mapping[str, Posterior | Sequence[Posterior]]]
 
 _DRAWS = 4000
+_BEYOND = 1.5  # from the middle, in ranges: the benchmark's truths out of distribution lie nearer
 
 
 def show_results(
@@ -37,13 +40,20 @@ def show_results(
     Estimates of several environments: print accuracy and CRPS skill, return the SiPE plot. They are given as environment ->
     posterior, or as estimator -> environment -> a posterior or those of several seeds; truth: environment -> (N,) in theta.
 
-    path: where to save the figure, as PNG. Raises ValueError for a truth that is missing or has another shape."""
+    path: where to save the figure, as PNG. Raises ValueError for a truth that is missing, has another shape or is no theta, and for
+    another path. What a folder of the benchmark's results says, `sipe benchmark report` shows."""
+    if path is not None and Path(path).suffix.lower() != ".png":
+        raise ValueError(f"path {str(path)!r}: the figure is saved as PNG; end its name in .png")
     if isinstance(posterior, Mapping):
         figure, table = _several(posterior, truth)
+    elif not isinstance(posterior, Posterior):
+        raise ValueError(
+            f"posterior: expected a Posterior, or environment -> Posterior, got {posterior!r}; sipe.load_posterior(path) reads one"
+        )
     else:
         from sipe_bayes.diagnostics.posterior_plots import marginals
 
-        known = None if truth is None else posterior.space.check_shape(truth)
+        known = None if truth is None else _theta(posterior.space, truth, "truth")
         figure, table = marginals(posterior, truth=known), results_table(posterior, known)
     (console or Console()).print(table)
     if path is not None:
@@ -70,7 +80,12 @@ def _several(estimates: Estimates, truth: Any) -> tuple[Figure, Table]:
     scores: dict[str, dict[str, list[Any]]] = {}
     for estimator, of in runs.items():
         for name, posteriors in of.items():
+            wrong = next((p for p in posteriors if not isinstance(p, Posterior)), None)
+            if wrong is not None:
+                raise ValueError(f"estimates[{name!r}]: expected a Posterior or those of several seeds, got {wrong!r}")
             known = _truth_of(name, truth)
+            if posteriors:
+                known = _theta(posteriors[0].space, known, f"truth[{name!r}]")
             scores.setdefault(estimator, {})[name] = [score(posterior, known) for posterior in posteriors]
             if posteriors:
                 center = Dirac(default_prior(posteriors[0].space).mean, posteriors[0].space)
@@ -87,6 +102,19 @@ def _truth_of(environment: str, truth: Any) -> Any:
             f"sipe.make_task({environment!r}).theta(variant) has it"
         )
     return truth[environment]
+
+
+def _theta(space: ParameterSpace, truth: Any, name: str) -> Any:
+    """A truth as theta; raises ValueError for one that is likely in units: nearly a range beyond the bounds."""
+    try:
+        theta = space.check_shape(truth)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}; give theta, space.normalise(values) of values in units") from None
+    if (np.abs(np.asarray(theta) - 0.5) > _BEYOND).any():
+        raise ValueError(
+            f"{name} {np.asarray(theta).tolist()}: expected theta, 0 and 1 at the bounds; space.normalise(values) makes it of values in units"
+        )
+    return theta
 
 
 def _sipe_table(scores: Mapping[str, Mapping[str, Sequence[Any]]]) -> Table:

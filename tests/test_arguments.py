@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.models.training import Training
-from sipe_bayes.posterior import Dirac, IndependentPrior
+from sipe_bayes.posterior import IndependentPrior
 from tests.pendulums import log, pendulum
 
 
@@ -91,12 +90,14 @@ def test_what_a_search_makes_of_a_prior_is_said(name: str, words: str) -> None:
 def test_the_guides_example_is_an_estimator(tmp_path: Path) -> None:
     """Its code, as printed: it spends the budget, keeps the best, resumes, and is better than the prior mean."""
     code = textwrap.dedent(inspect.getdoc(Estimator).split("keeps the best::")[1].split("``warn``")[0])  # type: ignore[union-attr]
-    names = {"Estimator": Estimator, "np": np, "torch": torch, "Dirac": Dirac, "simulate": simulate}
-    exec(code, names := {**names, "StateDifference": StateDifference, "channel_scale": channel_scale})
+    exec(code, names := dict[str, Any]())
     simulator = pendulum()
     truth = simulator.space.normalise(np.array([0.45, 0.16]))
-    made = [names["RandomSearch"](simulator, budget=60, seed=2, checkpoint=tmp_path / "state") for _ in "ab"]  # type: ignore[operator]
+    made = [names["RandomSearch"](simulator, budget=60, seed=2, checkpoint=tmp_path / "state") for _ in "ab"]
     one, again = (fit.fit(log(simulator, [0.45, 0.16], 3)) for fit in made)
     assert made[0].rollouts == 60
     assert torch.equal(one.mean, again.mean)
     assert np.abs(one.mean.numpy() - truth).mean() < 0.5 * np.abs(0.5 - truth).mean()
+    other = names["RandomSearch"](simulator, budget=60, seed=3)
+    assert other.fit(log(simulator, [0.45, 0.16], 3)).mean.tolist() != one.mean.tolist()
+    assert not set(other._state["theta"][:, 0]) & set(made[0]._state["theta"][:, 0])

@@ -305,7 +305,7 @@ def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) 
     chosen = ["--select", "pendulum/middle/direct/in_distribution"]
     found = measured(tmp_path, *chosen)
     assert found.exit_code == 1
-    assert "1 cells failed" in found.stderr
+    assert "1 cell failed" in found.stderr
     assert "seed1 failed: ArithmeticError: no middle" in found.stdout
     status = {r.seed: r.status for r in load_all(tmp_path)}
     assert status == {0: "done", 1: "failed", 2: "done"}
@@ -315,7 +315,8 @@ def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) 
     assert "failed: Pendulum/middle/direct/in_distribution/seed1: ArithmeticError: no middle" in lines(
         summary(tmp_path)
     )
-    assert measured(tmp_path, *chosen).exit_code == 0
+    before = measured(tmp_path, *chosen)
+    assert (before.exit_code, before.stdout) == (1, "3 cells, 3 of them there already, 1 failed\n")
     again = measured(tmp_path, *chosen, "--retry-failed")
     assert (again.exit_code, again.stdout.splitlines()[0]) == (1, "3 cells, 2 of them there already")
     assert "--retry-failed" in again.stderr
@@ -373,7 +374,7 @@ def refused(found: Result, *words: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--select", "fetch_pushh/npe"], ["fetch_pushh/npe", "nearest is FetchPush/npe"]),
+        (["--suite", "paper", "--select", "fetch_pushh/npe"], ["fetch_pushh/npe", "nearest is FetchPush/npe"]),
         (["--suite", "paper", "--select", "Hopper/npe"], ["of the suite paper", "--suite all"]),
         (["--suite", "papers"], ["--suite papers", "quick"]),
         (["--jobs", "0", "--executor", "pool"], ["--jobs 0"]),
@@ -390,6 +391,14 @@ def test_bad_input_is_one_line(arguments: list[str], words: list[str], tmp_path:
     out = [] if "--out" in arguments else ["--out", str(tmp_path / "out")]
     chosen = [] if {"--suite", "--select"} & set(arguments) else ["--suite", "all", "--select", "pendulum/prior/direct"]
     refused(sipe("benchmark", "run", *chosen, *arguments, *out), *words)
+
+
+@pytest.mark.parametrize("kind", ["benchmark", "transfer"])
+def test_no_suite_is_no_suite(kind: str, tmp_path: Path) -> None:
+    """None is run, or shown, by accident."""
+    refused(sipe(kind, "run", "--out", str(tmp_path / "out")), "--suite", "quick")
+    refused(sipe(kind, "cells", "--select", "Door"), "--select Door")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark import figures, findings, report_contents, report_html, report_latex, spent, tables
+from sipe_bayes.benchmark.cells import suite
 from sipe_bayes.benchmark.commands import report
 from sipe_bayes.benchmark.records import Record, RecordError, plan
 from sipe_bayes.diagnostics.scores import score
@@ -488,6 +489,37 @@ def test_commands_are_told_once() -> None:
         dict(findings.facts(runs, []))["commands"] == "sipe benchmark run --suite direct --out x, in parts by --select"
     )
     assert dict(findings.facts([make()], []))["commands"] == "sipe benchmark run --suite quick"
+
+
+def test_options_in_another_order_are_the_same_command() -> None:
+    runs = [
+        make(command=f"sipe benchmark run {options}")
+        for options in ("--suite direct --out x", "--out x --suite direct")
+    ]
+    assert dict(findings.facts(runs, []))["commands"] == "sipe benchmark run --suite direct --out x"
+
+
+def test_only_suites_that_were_asked_for_are_counted() -> None:
+    """And of theirs only cells with the suite's own budget and length."""
+    cell = next(c for c in suite("quick") if c.estimator == "prior")
+    asked = make(cell.task, "prior", cell.seed, budget=cell.budget, steps=cell.horizon, variant=cell.variant)
+    assert asked.id == cell.id
+    total = len(suite("quick"))
+    assert dict(findings.facts([asked], []))["suites"] == f"quick 1 of {total}"
+    other = dataclasses.replace(asked, budget=cell.budget + 1, command="sipe benchmark run --suite direct --out x")
+    assert dict(findings.facts([other], []))["suites"] == "direct 0 of 810"
+
+
+def test_one_seed_is_no_test() -> None:
+    records = [make("Door", name, scores={**make().scores}) for name in ("adr", "simopt")]
+    made = [
+        t
+        for n in ("accuracy", "CRPS skill")
+        if (t := tables.score_table(records, n, tables.Context.of(records))) is not None
+    ]
+    said = findings.table_findings(made)
+    assert len(said) == 2
+    assert all(s.endswith("one seed tells no more.") for s in said), said
 
 
 def test_the_least_there_can_be(tmp_path: Path) -> None:

@@ -166,6 +166,8 @@ def test_the_baselines_are_those_of_the_cells() -> None:
 
 # sipe.show_results
 
+POINT = Dirac([0.3, 0.7, 0.9], SPACE)
+
 
 def test_several_environments_are_shown_as_the_sipe_plot(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=80)
@@ -187,3 +189,22 @@ def test_estimates_without_their_truth_or_half_nested() -> None:
         sipe.show_results(estimates)
     with pytest.raises(ValueError, match=r"'Door'.*expected environment"):
         sipe.show_results({"adr": estimates, **estimates}, {"Door": TRUTH})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("results",), r"posterior: expected a Posterior.*got 'results'; sipe\.load_posterior"),
+        (({"Door": "results"}, {"Door": TRUTH}), r"estimates\['Door'\]: expected a Posterior"),
+        (
+            ({"Door": POINT}, {"Door": [9.81, 1.0, 1.0]}),
+            r"truth\['Door'\] \[9\.81, 1\.0, 1\.0\]: expected theta.*space\.normalise",
+        ),
+        ((POINT, [0.5]), r"truth: expected 3 parameters.*space\.normalise"),
+        ((POINT, [9.81, 1.0, 1.0]), r"truth \[9\.81"),
+        ((POINT, None, "a.pdf"), r"path 'a\.pdf': the figure is saved as PNG"),
+    ],
+)
+def test_what_cannot_be_shown_is_named(given: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        sipe.show_results(*given)

@@ -68,7 +68,7 @@ def report(
 
 @app.command()
 def run(
-    suite: Annotated[str, typer.Option(help="See `sipe benchmark cells`.")] = "paper",
+    suite: Annotated[str | None, typer.Option(help="See `sipe benchmark cells`.")] = None,
     select: Annotated[
         list[str] | None, typer.Option(help="Only ids like this one, such as 'half_cheetah*/adr/*'; again for several.")
     ] = None,
@@ -87,9 +87,9 @@ def run(
         from sipe_bayes.benchmark.cells import select as chosen
 
         at_least_one(budget=budget, steps=steps, training=training, jobs=jobs)
-        cells = runs.changed(chosen(suite, select or ()), budget=budget, steps=steps, training=training)
+        cells = runs.changed(chosen(asked(suite), select or ()), budget=budget, steps=steps, training=training)
         failed = runs.run(cells, out, executor_of(executor, jobs, address), command_line(), retry_failed, say)
-    exit_if_failed(f"{failed} cells", failed, f"benchmark status {out}")
+    exit_if_failed("cell", failed, f"benchmark status {out}")
 
 
 @app.command()
@@ -112,6 +112,7 @@ def cells(
         from sipe_bayes.benchmark.cells import SUITES
         from sipe_bayes.benchmark.cells import select as chosen
 
+        needs_suite(suite, select)
         found = about(SUITES) if suite is None else [cell.id for cell in chosen(suite, select or ())]
     print("\n".join(found))
 
@@ -174,6 +175,18 @@ def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[]
     return Inline if name == "inline" else lambda: Pool(jobs or cores())
 
 
+def asked(suite: str | None, first: str = "quick") -> str:
+    """The suite; raises ValueError where none is named, as most take hours."""
+    if suite is None:
+        raise ValueError(f"--suite: expected the name of one, such as --suite {first}; the cells command lists them")
+    return suite
+
+
+def needs_suite(suite: str | None, select: list[str] | None) -> None:
+    if suite is None and select:
+        raise ValueError(f"--select {select[0]}: goes with a suite; name one before it, such as all")
+
+
 def at_least_one(**options: float | None) -> None:
     for option, value in options.items():
         if value is not None and value < 1:
@@ -193,10 +206,11 @@ def print_status(found: dict[str, Any], lines: Callable[[dict[str, Any]], list[s
 
 
 def exit_if_failed(what: str, failed: int, status: str) -> None:
-    """Exit code 1 where something failed, with the command that shows why."""
+    """Exit code 1 where so many of ``what`` failed, with the command that shows why."""
     if failed:
         print(
-            f"sipe: {what} failed; `sipe {status}` shows why, the same command with --retry-failed tries again",
+            f"sipe: {failed} {what}{'s' * (failed > 1)} failed; `sipe {status}` shows why; the same command with --retry-failed tries "
+            "again, and other settings go into a new --out",
             file=sys.stderr,
         )
         raise typer.Exit(1)

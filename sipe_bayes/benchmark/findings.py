@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from sipe_bayes.benchmark.cells import BASELINES, SUITES, suite
 from sipe_bayes.benchmark.records import Record, mixed
-from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, together
+from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, suite_of, together
 from sipe_bayes.benchmark.tables import (
     ALL,
     MEASURES,
@@ -54,10 +55,15 @@ def facts(records: Sequence[Record], runs: Sequence[dict[str, Any]]) -> list[tup
 
 
 def _suites(records: Sequence[Record]) -> str:
-    """How much of each suite there is, as it is run by default."""
-    done = {r.id for r in records if r.done}
-    counts = {name: [cell.id for cell in suite(name)] for name in SUITES if name not in ("all", "quick")}
-    return ", ".join(f"{name} {len(done.intersection(ids)):,} of {len(ids):,}" for name, ids in counts.items())
+    """How much there is, as run by default, of each suite that was asked for."""
+    done = {(r.id, r.budget, r.steps) for r in records if r.done}
+    asked = {suite_of(r.command) for r in records}
+    counts = {
+        name: {(cell.id, cell.budget, cell.horizon) for cell in suite(name)}
+        for name in SUITES
+        if name in asked - {"all"}
+    }
+    return ", ".join(f"{name} {len(done & cells):,} of {len(cells):,}" for name, cells in counts.items())
 
 
 def _wall_time(runs: Sequence[dict[str, Any]]) -> str:
@@ -74,16 +80,22 @@ def _wall_time(runs: Sequence[dict[str, Any]]) -> str:
 
 
 def _sources(records: Sequence[Record]) -> str:
-    """Where several states of the package's code made the records."""
-    found = {r.checksums.get("source", "not kept") for r in records if r.done}
-    return f"{len(found)}: {', '.join(sorted(found))}" if len(found) > 1 else ""
+    """Where several states of the package's code made the records; older records do not say by which they were made."""
+    found = Counter(r.checksums.get("source", "not kept") for r in records if r.done)
+    return ", ".join(f"{name} ({count:,} cells)" for name, count in found.most_common()) if len(found) > 1 else ""
 
 
 def _commands(records: Sequence[Record]) -> str:
     """The commands behind the records; of those that differ in what they selected only one."""
-    plain = {re.sub(r" --select (?:'[^']*'|\S+)", "", r.command) for r in records}
+    plain = {_ordered(re.sub(r" --select (?:'[^']*'|\S+)", "", r.command)) for r in records}
     chosen = any(" --select " in r.command for r in records)
     return _listed(plain) + (", in parts by --select" if chosen else "")
+
+
+def _ordered(command: str) -> str:
+    """A command with its options in the order of their names."""
+    what, *options = command.split(" --")
+    return " --".join([what, *sorted(options, reverse=True)])
 
 
 def _packages(records: Sequence[Record]) -> list[str]:
@@ -138,6 +150,9 @@ def table_findings(tables: Sequence[Table]) -> list[str]:
         sign = MEASURES[table.measure.name].better
         first = max(mine, key=lambda name: sign * mine[name].mean)
         where = "over all environments" if column == ALL else f"on {column}"
+        if all(len(entry.values) < 2 for entry in mine.values()):
+            found.append(f"Best {table.measure.name} {where}: {first}, {text(mine[first])}; one seed tells no more.")
+            continue
         noise = (
             "ahead of every other outside noise"
             if mine[first].best

@@ -49,10 +49,11 @@ _PAIRS = (
 )  # fmt: skip
 _NOTES = {
     "default": "The truth is the centre of every range here, where knowing nothing is a perfect guess: neither accuracy nor CRPS skill tells learning from not learning, so nothing is set in bold. Judge by the other variants.",
-    "in_distribution": "Each environment has one truth, .1 to .4 of the range from its centre in every parameter; logs and estimators differ with the seed. Standard errors are over seeds, so they do not tell how another truth would come out.",
+    "in_distribution": "accuracy is 1 - |mean - truth|, each parameter in units of its range. Each environment has one truth, .1 to .4 of the range from its centre in every parameter; logs and estimators differ with the seed. Standard errors are over seeds, so they do not tell how another truth would come out.",
     OUTSIDE: "The truth lies outside every range here, so only CRPS, the energy score and whether a method noticed mean anything.",
 }
 _PER_FIGURE = 3  # estimators
+_SIGHT = "laplace compares single control steps from the recorded states, which are free of noise here, and a tenth of its rollouts find its starting points; the others see statistics of the log or windows of it."
 _RADARS = "Radars: the radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
 
 
@@ -162,6 +163,8 @@ def _group(anchor: str, title: str, records: Sequence[Record], context: Context)
     tables = [t for name in measures(variant) if (t := score_table(shown, name, context)) is not None]
     notes = [_NOTES[variant], sentence, unequal(shown)]
     found = [] if variant == "default" else table_findings(tables)
+    if any(r.estimator == REFERENCE for r in shown):
+        notes.append(_SIGHT)
     section = Section(anchor, title, [*(n for n in notes if n), *found], tables)
     if variant != OUTSIDE:
         section.sentences.append(_RADARS)

@@ -36,16 +36,28 @@ def run(
     retry_failed: bool = False,
     report: Report = print,
 ) -> int:
-    """Measure the cells that have no record in ``folder`` yet; returns how many failed. start: makes the executor, once the folder
-    is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
+    """Measure the cells that have no record in ``folder`` yet; returns how many failed, now or before. start: makes the executor, once
+    the folder is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
     budgets, lengths or agents, or that another run is at work in, and OSError where it cannot be written."""
     with claimed(folder):
         left = lacking(cells, folder, retry_failed)
         plan(folder, [cell.id for cell in cells])
-        report(f"{len(cells)} cells, {len(cells) - len(left)} of them there already")
+        before = failures(cells, left, folder)
+        report(there_already(cells, left, before))
         if not left:
-            return 0
-        return carried_out(units_of(left, folder, command), folder, start, command, report)
+            return before
+        return before + carried_out(units_of(left, folder, command), folder, start, command, report)
+
+
+def failures(cells: Sequence[Cell], left: Sequence[Cell], folder: Path, kind: type[Record] = Record) -> int:
+    """How many of the cells that are not measured now have failed before."""
+    there = {cell.id for cell in cells} - {cell.id for cell in left}
+    return sum(not record.done for record in kind.every(folder) if record.id in there)
+
+
+def there_already(cells: Sequence[Cell], left: Sequence[Cell], failed: int) -> str:
+    text = f"{len(cells)} cells, {len(cells) - len(left)} of them there already"
+    return f"{text}, {failed} failed" if failed else text
 
 
 def simulate(

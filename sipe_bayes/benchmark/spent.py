@@ -50,11 +50,11 @@ def by_suite(rows: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """``together`` of each suite's runs."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(_suite(row["command"]), []).append(row)
+        groups.setdefault(suite_of(row["command"]), []).append(row)
     return {name: together(group) for name, group in groups.items()}
 
 
-def _suite(command: str) -> str:
+def suite_of(command: str) -> str:
     """The suite that a command asks for."""
     words = command.split()
     if len(words) > 1 and words[1] in _ELSEWHERE:

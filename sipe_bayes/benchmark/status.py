@@ -10,6 +10,7 @@ from sipe_bayes.benchmark.records import Record, mixed
 from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, runs, together
 
 _SHOWN = 20  # missing cells that are named
+_RUNS = 3  # latest runs that are shown
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -54,9 +55,11 @@ def lines(found: dict[str, Any]) -> list[str]:
         said.append("the same command with --retry-failed measures those that failed again")
     if found["done"]:
         said.append(f"CPU time of these cells: {found['cpu_time']}")
-    for row in found["runs"]:
+    for row in found["runs"][-_RUNS:]:
         use = f"{row['units']} units in {row['seconds']:.0f} s, CPU use {percent(row['cpu_use'])} of {row['workers']} workers"
         said.append(f"{row['started']}: {use}{_simulating(row)}: {row['command']}")
+    if len(found["runs"]) > _RUNS:
+        said.append(f"and {len(found['runs']) - _RUNS} runs before; --json has them all")
     if len(found["runs"]) > 1:
         said += [f"{name}: {_time(row)}" for name, row in (*found["suites"].items(), ("all runs", found["all"]))]
     return said

@@ -17,10 +17,12 @@ from sipe_bayes.benchmark.commands import (
     Retry,
     Where,
     about,
+    asked,
     at_least_one,
     command_line,
     executor_of,
     exit_if_failed,
+    needs_suite,
     print_status,
     refusing,
     say,
@@ -35,7 +37,7 @@ app = typer.Typer(
 
 @app.command()
 def run(
-    suite: Annotated[str, typer.Option(help="See `sipe transfer cells`.")] = "study",
+    suite: Annotated[str | None, typer.Option(help="See `sipe transfer cells`.")] = None,
     select: Annotated[
         list[str] | None,
         typer.Option(help="Only ids like this one, such as 'half_cheetah*/laplace/*'; again for several."),
@@ -79,14 +81,14 @@ def run(
         )
         if observation_noise is not None and not 0 < observation_noise < float("inf"):
             raise ValueError(f"--observation-noise {observation_noise}: expected an sd above 0; leave it out for none")
-        cells = changed(chosen(suite, select or ()), training=training, budget=budget, steps=steps)
+        cells = changed(chosen(asked(suite), select or ()), training=training, budget=budget, steps=steps)
         if point and particles is not None:
             raise ValueError(f"--particles {particles}: does not go with --point; leave one of them out")
         cells = varied(cells, point="mean" if point else None, particles=particles)
         cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
         start = executor_of(executor, jobs, address)
         failed = transfer_run.run(cells, out, start, command_line(), retry_failed, say)
-    exit_if_failed(f"{failed} units", failed, f"transfer status {out}")
+    exit_if_failed("unit", failed, f"transfer status {out}")
 
 
 @app.command()
@@ -126,6 +128,7 @@ def cells(
         from sipe_bayes.benchmark.transfer import SUITES
         from sipe_bayes.benchmark.transfer import select as chosen
 
+        needs_suite(suite, select)
         cells = [] if suite is None else chosen(suite, select or ())
         found = about(SUITES) if suite is None else [f"{c.id} ({c.training:,} control steps)" for c in cells]
     print("\n".join(found))

@@ -27,25 +27,24 @@ def run(
     retry_failed: bool = False,
     report: runs.Report = print,
 ) -> int:
-    """Measure the cells that have no record in ``folder`` yet, after the estimates that they need; returns how many failed. Arguments
+    """Measure the cells that have no record in ``folder`` yet, after the estimates that they need; returns how many failed, now or before. Arguments
     and errors as of ``benchmark.run.run``."""
     with runs.claimed(folder):
         left = runs.lacking(cells, folder, retry_failed, transfer_measure.blank_record)
         estimates = {e.id: e for cell in left if (e := estimate_of(cell)) is not None}
         lacking = runs.lacking(estimates.values(), folder, retry_failed)
         plan(folder / TransferRecord.FOLDER, [cell.id for cell in cells])
-        report(
-            f"{len(cells)} cells, {len(cells) - len(left)} of them there already; {len(lacking)} estimates to make first"
-        )
+        before = runs.failures(cells, left, folder, TransferRecord)
+        report(f"{runs.there_already(cells, left, before)}; {len(lacking)} estimates to make first")
         if not left:
-            return 0
+            return before
         plan(folder, [cell.id for cell in lacking])
         mine = {cell.id for cell in left}
         units = [
             *runs.units_of(lacking, folder, command),
             *(_unit(cell, lacking, mine, folder, command) for cell in left),
         ]
-        return runs.carried_out(units, folder, start, command, report)
+        return before + runs.carried_out(units, folder, start, command, report)
 
 
 def _unit(cell: Cell, lacking: Sequence[Cell], mine: set[str], folder: Path, command: str) -> Unit:

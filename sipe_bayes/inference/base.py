@@ -56,6 +56,13 @@ class Estimator(ABC):
 
     The simplest method draws from the prior and keeps the best::
 
+        import numpy as np
+        import torch
+
+        from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
+        from sipe_bayes.inference.base import Estimator
+        from sipe_bayes.posterior import Dirac
+
         class RandomSearch(Estimator):
             name = "random_search"
 
@@ -63,7 +70,8 @@ class Estimator(ABC):
                 return {"theta": np.empty((0, len(self.space))), "cost": np.empty(0), "done": False}
 
             def step(self, state, trajectories):
-                generator = torch.Generator().manual_seed(self.seed + len(state["theta"]))
+                drawn = np.random.SeedSequence([self.seed, len(state["theta"])])  # other draws with every seed
+                generator = torch.Generator().manual_seed(int(drawn.generate_state(1)[0]))
                 theta = self.prior.sample((1,), generator=generator).numpy()
                 windows = self.windows(trajectories)
                 predicted = simulate(windows, theta)  # raises BudgetExhausted
@@ -75,6 +83,9 @@ class Estimator(ABC):
                 }
 
             def posterior(self, state, trajectories):
+                lost = int(np.isinf(state["cost"]).sum())
+                if lost:
+                    self.warn(f"{lost} of {len(state['cost'])} simulations {self.simulator.failure} and do not count")
                 return Dirac(state["theta"][state["cost"].argmin()], self.space)
 
     ``warn`` adds to ``warnings``, ``digest`` tells trajectories apart.
