@@ -85,6 +85,25 @@ def test_one_mode_has_a_curve_per_estimator() -> None:
     )
 
 
+@pytest.mark.parametrize("names", [["Door"], ["FetchPush", "Door"]])
+def test_with_too_few_spokes_for_a_line_nothing_lies_on_anything(names: list[str]) -> None:
+    """Estimators of the same accuracy stand side by side, at it, and the prior mean is an arc across them."""
+    results = some(1, names)
+    results = {"e0": results["e0"], "e1": results["e0"], "prior_mean": results["prior_mean"]}
+    accuracy, _ = plot.sipe_plot(results, "mean").axes
+    points = [line for line in drawn(accuracy) if len(line.get_xdata()) == 1]
+    arcs = [line for line in drawn(accuracy) if len(line.get_xdata()) > 1]
+    assert (len(points), len(arcs)) == (2 * len(names), len(names))
+    for k, name in enumerate(n for n in ENVIRONMENTS if n in names):
+        two = [points[k], points[k + len(names)]]
+        value = np.mean([s["mean_accuracy"] for s in results["e0"][name]])
+        np.testing.assert_allclose([line.get_ydata()[0] for line in two], value)
+        places = sorted(float(line.get_xdata()[0]) for line in two)
+        assert places[1] - places[0] > 0.1
+        assert arcs[k].get_xdata().min() < places[0] < places[1] < arcs[k].get_xdata().max()
+        np.testing.assert_allclose(arcs[k].get_ydata(), 1 - np.abs(TRUTH - 0.5).mean())
+
+
 def test_two_settings_share_the_environments_that_both_have() -> None:
     first, second = some(2), some(1, ["Door", "FetchPush", "Relocate", "HumanoidLinks"])
     figure = plot.settings_plot(first, second, ("demonstrations", "policy"))

@@ -57,9 +57,10 @@ _MARKERS = ("o", "v", "^", "s", "D", "P")
 _MEASURES = ("accuracy", "CRPS skill")
 _RANGES = {"accuracy": (0.0, 1.0), "CRPS skill": (-1.0, 1.0)}
 _SIDE = 3.5  # inches, of one radar
+_FEWEST, _STEP = 3, 0.14  # spokes of a closed line; rad between estimators where there are fewer
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """A closed line of a radar: values (E,), one per spoke, NaN where there is none."""
 
@@ -214,12 +215,29 @@ def _radar(ax: PolarAxes, curves: Sequence[Curve], spokes: Sequence[str], limits
     _spoke_labels(ax, angle, spokes)
     if limits[0] < 0:
         ax.plot(np.linspace(0, 2 * np.pi, 200), np.zeros(200), color="#888888", lw=0.9)  # the prior itself
+    if len(spokes) < _FEWEST:
+        _apart(ax, curves, angle, limits)
+        return
     for curve in curves:
         closed = np.clip(np.append(curve.values, curve.values[:1]), *limits)
         ax.plot(
             np.append(angle, angle[:1]), closed, color=curve.colour, ls=curve.line, lw=1.5 if curve.marker else 1.2,
             marker=curve.marker or None, ms=4, clip_on=False, zorder=3 if curve.marker else 2.5,
         )  # fmt: skip
+
+
+def _apart(ax: PolarAxes, curves: Sequence[Curve], angle: FloatArray, limits: tuple[float, float]) -> None:
+    """Where there are too few spokes for a closed line: estimators side by side about each spoke, baselines as arcs across them."""
+    own = [curve for curve in curves if curve.marker]
+    places = _STEP * (np.arange(len(own)) - (len(own) - 1) / 2)
+    arc = np.linspace(-0.5, 0.5, 50) * _STEP * (len(own) + 1)
+    for curve in curves:
+        for turn, value in zip(angle, np.clip(curve.values, *limits), strict=True):
+            if curve.marker:
+                place = turn + places[own.index(curve)]
+                ax.plot([place], [value], color=curve.colour, marker=curve.marker, ms=5, ls="", clip_on=False, zorder=3)
+            else:
+                ax.plot(turn + arc, np.full(len(arc), value), color=curve.colour, ls=curve.line, lw=1.2, zorder=2.5)
 
 
 def _spoke_labels(ax: PolarAxes, angle: FloatArray, spokes: Sequence[str]) -> None:
