@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Estimates = Mapping[str, Posterior] | Mapping[str, Mapping[str, Posterior | Sequence[Posterior]]]
 
 _DRAWS = 4000
-_BEYOND = 1.5  # from the middle, in ranges: the benchmark's truths out of distribution lie nearer
+_BEYOND = 5.0  # from the middle, in ranges: no truth is so far out
 
 
 def show_results(
@@ -42,7 +42,7 @@ def show_results(
 
     path: where to save the figure, as PNG. Raises ValueError for a truth that is missing, has another shape or is no theta, and for
     another path. What a folder of the benchmark's results says, `sipe benchmark report` shows."""
-    if path is not None and Path(path).suffix.lower() != ".png":
+    if path is not None and Path(path).suffix.lower() not in ("", ".png"):
         raise ValueError(f"path {str(path)!r}: the figure is saved as PNG; end its name in .png")
     if isinstance(posterior, Mapping):
         figure, table = _several(posterior, truth)
@@ -74,15 +74,11 @@ def _several(estimates: Estimates, truth: Any) -> tuple[Figure, Table]:
         )
     by_estimator: Mapping[str, Any] = nested or {"estimate": estimates}
     runs = {
-        estimator: {name: [found] if isinstance(found, Posterior) else list(found) for name, found in of.items()}
-        for estimator, of in by_estimator.items()
+        estimator: {name: _seeds(name, found) for name, found in of.items()} for estimator, of in by_estimator.items()
     }
     scores: dict[str, dict[str, list[Any]]] = {}
     for estimator, of in runs.items():
         for name, posteriors in of.items():
-            wrong = next((p for p in posteriors if not isinstance(p, Posterior)), None)
-            if wrong is not None:
-                raise ValueError(f"estimates[{name!r}]: expected a Posterior or those of several seeds, got {wrong!r}")
             known = _truth_of(name, truth)
             if posteriors:
                 known = _theta(posteriors[0].space, known, f"truth[{name!r}]")
@@ -92,6 +88,15 @@ def _several(estimates: Estimates, truth: Any) -> tuple[Figure, Table]:
                 scores.setdefault(BASELINE, {})[name] = [score(center, known)]
     figure = sipe_plot(scores)
     return figure, _sipe_table({name: scores[name] for name in [*estimators(scores), BASELINE]})
+
+
+def _seeds(name: str, found: Any) -> list[Posterior]:
+    seeds = [found] if isinstance(found, Posterior) else found
+    if not isinstance(seeds, list | tuple) or not all(isinstance(p, Posterior) for p in seeds):
+        raise ValueError(
+            f"estimates[{name!r}]: expected a Posterior or a list of those of several seeds, got {found!r}"
+        )
+    return list(seeds)
 
 
 def _truth_of(environment: str, truth: Any) -> Any:
@@ -105,7 +110,7 @@ def _truth_of(environment: str, truth: Any) -> Any:
 
 
 def _theta(space: ParameterSpace, truth: Any, name: str) -> Any:
-    """A truth as theta; raises ValueError for one that is likely in units: nearly a range beyond the bounds."""
+    """A truth as theta; raises ValueError for one so many ranges beyond the bounds that it must be in units."""
     try:
         theta = space.check_shape(truth)
     except ValueError as error:

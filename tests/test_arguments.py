@@ -101,3 +101,10 @@ def test_the_guides_example_is_an_estimator(tmp_path: Path) -> None:
     other = names["RandomSearch"](simulator, budget=60, seed=3)
     assert other.fit(log(simulator, [0.45, 0.16], 3)).mean.tolist() != one.mean.tolist()
     assert not set(other._state["theta"][:, 0]) & set(made[0]._state["theta"][:, 0])
+    lost = other._state["cost"].copy()
+    lost[int(lost.argmin())] = np.inf  # the best diverges
+    assert (
+        other.posterior({**other._state, "cost": lost}, None).mean.tolist()
+        != other.posterior(other._state, None).mean.tolist()
+    )
+    assert other.warnings[-1:] == ["1 of 60 simulations diverged and do not count"]

@@ -222,6 +222,14 @@ def test_status(undisturbed: Path) -> None:
     assert lines({**twice, "suites": {}, "all": spent.together(twice["runs"])})[-1].startswith(
         "all runs: 2.0 h, 1.2 h of CPU"
     )
+    many = [{**took, "command": f"run {k}"} for k in range(5)]
+    shown = lines({**found, "runs": many, "suites": {}, "all": spent.together(many)})
+    assert [line.rsplit(": ", 1)[1] for line in shown if "CPU use" in line and "run" in line][:3] == [
+        "run 2",
+        "run 3",
+        "run 4",
+    ]
+    assert "and 2 runs before; --json has them all" in shown
     assert json.loads(sipe("benchmark", "status", str(undisturbed), "--json").output)["done"] == 6
 
 

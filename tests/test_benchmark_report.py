@@ -505,9 +505,16 @@ def test_only_suites_that_were_asked_for_are_counted() -> None:
     asked = make(cell.task, "prior", cell.seed, budget=cell.budget, steps=cell.horizon, variant=cell.variant)
     assert asked.id == cell.id
     total = len(suite("quick"))
-    assert dict(findings.facts([asked], []))["suites"] == f"quick 1 of {total}"
+    assert dict(findings.facts([asked], []))["suites"] == f"quick 1 of {total}, each in its own sizes"
     other = dataclasses.replace(asked, budget=cell.budget + 1, command="sipe benchmark run --suite direct --out x")
-    assert dict(findings.facts([other], []))["suites"] == "direct 0 of 810"
+    assert dict(findings.facts([other], []))["suites"] == "direct 0 of 810, each in its own sizes"
+
+
+def test_what_is_not_known_of_old_records_is_counted() -> None:
+    untimed = make(checksums={"log": "a"}, cpu_seconds=None)
+    said = dict(findings.facts([make(), make("Relocate"), untimed], []))
+    assert said["states of the code"] == "a (2 cells), not kept (1 cells)"
+    assert "; 1 cells" in said["CPU time"]
 
 
 def test_one_seed_is_no_test() -> None:
@@ -557,6 +564,7 @@ def test_shared_simulations_are_counted_once() -> None:
         100,
         20,
         "done",
+        cpu_seconds=1.0,
         simulation_cpu_seconds=60.0,
         checksums={"log": "x"},
     )

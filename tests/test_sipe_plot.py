@@ -214,7 +214,8 @@ def test_estimates_without_their_truth_or_half_nested() -> None:
     ("given", "words"),
     [
         (("results",), r"posterior: expected a Posterior.*got 'results'; sipe\.load_posterior"),
-        (({"Door": "results"}, {"Door": TRUTH}), r"estimates\['Door'\]: expected a Posterior"),
+        (({"Door": "results"}, {"Door": TRUTH}), r"estimates\['Door'\]: expected a Posterior.*got 'results'"),
+        (({"Door": None}, {"Door": TRUTH}), r"estimates\['Door'\]: expected a Posterior.*got None"),
         (
             ({"Door": POINT}, {"Door": [9.81, 1.0, 1.0]}),
             r"truth\['Door'\] \[9\.81, 1\.0, 1\.0\]: expected theta.*space\.normalise",

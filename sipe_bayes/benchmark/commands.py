@@ -80,7 +80,7 @@ def report(
 
 @app.command()
 def run(
-    suite: Annotated[str | None, typer.Option(help="See `sipe benchmark cells`.")] = None,
+    suite: Annotated[str | None, typer.Option(help="Required; see `sipe benchmark cells`.")] = None,
     select: Annotated[
         list[str] | None, typer.Option(help="Only ids like this one, such as 'half_cheetah*/adr/*'; again for several.")
     ] = None,
@@ -187,10 +187,10 @@ def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[]
     return Inline if name == "inline" else lambda: Pool(jobs or cores())
 
 
-def asked(suite: str | None, first: str = "quick") -> str:
+def asked(suite: str | None) -> str:
     """The suite; raises ValueError where none is named, as most take hours."""
     if suite is None:
-        raise ValueError(f"--suite: expected the name of one, such as --suite {first}; the cells command lists them")
+        raise ValueError("--suite: expected the name of one, such as --suite quick; the cells command lists them")
     return suite
 
 

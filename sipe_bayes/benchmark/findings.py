@@ -63,7 +63,8 @@ def _suites(records: Sequence[Record]) -> str:
         for name in SUITES
         if name in asked - {"all"}
     }
-    return ", ".join(f"{name} {len(done & cells):,} of {len(cells):,}" for name, cells in counts.items())
+    found = ", ".join(f"{name} {len(done & cells):,} of {len(cells):,}" for name, cells in counts.items())
+    return f"{found}, each in its own sizes" if found else ""
 
 
 def _wall_time(runs: Sequence[dict[str, Any]]) -> str:
@@ -93,9 +94,9 @@ def _commands(records: Sequence[Record]) -> str:
 
 
 def _ordered(command: str) -> str:
-    """A command with its options in the order of their names."""
-    what, *options = command.split(" --")
-    return " --".join([what, *sorted(options, reverse=True)])
+    """A command with its options in one order."""
+    what, *options = re.split(r" (?=--[a-z])", command)
+    return " ".join([what, *sorted(options, reverse=True)])
 
 
 def _packages(records: Sequence[Record]) -> list[str]:

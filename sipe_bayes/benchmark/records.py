@@ -39,8 +39,8 @@ class Record:
     """
 
     FOLDER: ClassVar[str] = ""  # of records and plan, in a folder of results
-    NONE: ClassVar[str] = "no records; make some with `sipe benchmark run"
-    NEVER: ClassVar[str] = "no run was started in it; start one with `sipe benchmark run"
+    NONE: ClassVar[str] = "no records; make some with `sipe benchmark run --suite quick"
+    NEVER: ClassVar[str] = "no run was started in it; start one with `sipe benchmark run --suite quick"
     # alike in all runs of a cell in one folder:
     FIXED: ClassVar[tuple[str, ...]] = ("budget", "steps", "training", "agent", "versions")
 

@@ -53,7 +53,7 @@ _NOTES = {
     OUTSIDE: "The truth lies outside every range here, so only CRPS, the energy score and whether a method noticed mean anything.",
 }
 _PER_FIGURE = 3  # estimators
-_SIGHT = "laplace compares single control steps from the recorded states, which are free of noise here, and a tenth of its rollouts find its starting points; the others see statistics of the log or windows of it."
+_SIGHT = "laplace simulates single control steps from the recorded states, which are free of noise here, and a tenth of its rollouts find its starting points; regression and maml learn from single steps, too, the others from statistics of the log or windows of it."
 _RADARS = "Radars: the radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
 
 

@@ -76,8 +76,9 @@ def cpu_time(records: Sequence[Record]) -> str:
         bank = (r.task, r.variant, r.seed, r.steps)
         banks[bank] = max(banks.get(bank, 0.0), r.simulation_cpu_seconds)
     parts = ", ".join(f"{name} {duration(seconds)}" for name, seconds in method.items())
-    shared = duration(sum(banks.values()))
-    return f"{duration(sum(method.values()))} for the methods ({parts}), {shared} for shared simulations"
+    shared, untimed = duration(sum(banks.values())), sum(r.done and r.cpu_seconds is None for r in records)
+    text = f"{duration(sum(method.values()))} for the methods ({parts}), {shared} for shared simulations"
+    return f"{text}; {untimed} cells that went on after an interruption are not timed" if untimed else text
 
 
 def percent(share: float | None) -> str:

@@ -108,8 +108,8 @@ class TransferRecord(Record):
     """
 
     FOLDER: ClassVar[str] = "transfer"
-    NONE: ClassVar[str] = "no transfer; make one with `sipe transfer run"
-    NEVER: ClassVar[str] = "no transfer was started in it; start one with `sipe transfer run"
+    NONE: ClassVar[str] = "no transfer; make one with `sipe transfer run --suite quick"
+    NEVER: ClassVar[str] = "no transfer was started in it; start one with `sipe transfer run --suite quick"
 
     evaluation: dict[str, Any] = field(default_factory=dict)
     random: dict[str, Any] = field(default_factory=dict)

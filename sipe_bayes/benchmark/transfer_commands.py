@@ -37,7 +37,7 @@ app = typer.Typer(
 
 @app.command()
 def run(
-    suite: Annotated[str | None, typer.Option(help="See `sipe transfer cells`.")] = None,
+    suite: Annotated[str | None, typer.Option(help="Required; see `sipe transfer cells`.")] = None,
     select: Annotated[
         list[str] | None,
         typer.Option(help="Only ids like this one, such as 'half_cheetah*/laplace/*'; again for several."),
