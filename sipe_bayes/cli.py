@@ -35,13 +35,28 @@ app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 
 BAD_INPUT = 2
+_ABORTED = 1
+_REFUSED: Any = typer.BadParameter.__mro__[
+    2
+]  # what the parser says of options and arguments; typer keeps its name private
 _PIPED_WIDTH = 120
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
 def main() -> None:
     """Entry point: input errors are one line on standard error and exit code 2."""
-    app()
+    try:
+        code = app(standalone_mode=False)
+    except typer.Abort:
+        code = _ABORTED
+    except _REFUSED as error:
+        message = error.format_message()
+        if not message or "\n" in message:  # the help, where a command was given nothing
+            error.show()
+        else:
+            print(f"sipe: {message[:1].lower()}{message[1:].rstrip('.')}; see --help of the command", file=sys.stderr)
+        code = error.exit_code
+    sys.exit(code or 0)
 
 
 @app.callback()

@@ -21,7 +21,7 @@ from safetensors import safe_open
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli import app
+from sipe_bayes.cli import app, main
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.randomization import Randomization, load_randomization
 
@@ -558,3 +558,36 @@ def wait_for_growth(checkpoint: Path, process: subprocess.Popen[bytes]) -> int:
             sizes.add(checkpoint.stat().st_size)
         time.sleep(0.02)
     return max(sizes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["benchmark", "run", "--suite", "quick", "--budget", "many"], 2, "invalid value for '--budget'"),
+        (["benchmark", "run", "quick"], 2, "(quick); see --help"),
+        (["--foo"], 2, "no such option: --foo"),
+        (["calibrate"], 2, "missing argument 'config'"),
+        (["calibrate", "nowhere.toml"], 2, "nowhere.toml"),
+        (["benchmark", "cells"], 0, ""),
+    ],
+)
+def test_what_the_parser_refuses_is_one_line(
+    arguments: list[str], code: int, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["sipe", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr().err
+    assert ended.value.code == code
+    assert said.count("\n") == (code == 2)
+    assert words in said
+    assert code == 0 or said.startswith("sipe: ")
+
+
+def test_a_group_alone_shows_its_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["sipe", "benchmark"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    printed = capsys.readouterr()
+    assert "[OPTIONS] COMMAND" in printed.out + printed.err
