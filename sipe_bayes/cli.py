@@ -36,9 +36,8 @@ app.command()(rl_commands.agents)
 
 BAD_INPUT = 2
 _ABORTED = 1
-_REFUSED: Any = typer.BadParameter.__mro__[
-    2
-]  # what the parser says of options and arguments; typer keeps its name private
+# what the parser says of options and arguments, whose name typer keeps private
+_REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
