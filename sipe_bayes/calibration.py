@@ -348,10 +348,11 @@ def _left_out(problem: Problem, method: Estimator) -> list[str]:
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, and process "
         "noise, which is inferred, takes what the model lacks. Errors and signals are over windows from measured starts."
     )
-    if not {"process_noise", "movement"} <= method.diagnostics.keys():
+    known = ("process_noise", "movement", "loose")
+    if not set(known) <= method.diagnostics.keys():
         return [said]
     chain: Any = method.windows(problem.train)
-    return [said, chain.lacking(*(np.array(method.diagnostics[key]) for key in ("process_noise", "movement")))]
+    return [said, chain.lacking(*(np.array(method.diagnostics[key]) for key in known))]
 
 
 def _run_name(config: Config) -> str:

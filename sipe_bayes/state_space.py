@@ -22,6 +22,7 @@ are predicted by the step that led to the sample, so that process noise does not
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -44,6 +45,7 @@ _STATE_STEP = 1e-5  # rad or m, rad/s or m/s
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known: position, velocity, activation
 _LEAST_MOVEMENT = 1e-2  # of the largest among the positions, the velocities or the activations
 _MUCH_PROCESS = 0.1  # of a movement
+_NAMED = 4  # steps that a sentence names
 _LEAST_SD = 1e-6  # of a channel's or coordinate's size: noise below it is not told from rounding
 
 
@@ -182,8 +184,9 @@ class Chain:
         kinds = [f"{what} of {name}" for what in ("position", "velocity") for name in joints]
         return [*kinds, *(f"activation {k}" for k in range(self.sizes[2]))]
 
-    def lacking(self, process: FloatArray, movement: FloatArray) -> str:
-        """What inferred process noise (D,) says of the model, held against how far states move in a control step (D,): a hint, no test."""
+    def lacking(self, process: FloatArray, movement: FloatArray, loose: Sequence[int] = ()) -> str:
+        """What inferred process noise (D,) says of the model, held against how far states move in a control step (D,): a hint, no test.
+        loose: after which samples of the chain a jump was let go."""
         share = process / movement
         worst = int(share.argmax())
         percent = f"{100 * share[worst]:.0f}" if share[worst] > 0.1 else f"{100 * share[worst]:.2g}"
@@ -191,9 +194,24 @@ class Chain:
             f"Process noise is largest in the {self.labels[worst]}: its sd is {process[worst]:.2g}, {percent} % of how far "
             "that moves in a control step."
         )
+        if len(loose):
+            found += f" {self._let_go(loose)}"
         if share[worst] < _MUCH_PROCESS:
-            return f"{found} The model follows the logs closely."
+            return f"{found} The model follows the logs closely{' elsewhere' if len(loose) else ''}."
         return f"{found} A model that lacks nothing needs next to none: look for what it lacks there before you trust the values."
+
+    def _let_go(self, loose: Sequence[int]) -> str:
+        """How many jumps are loose, and when the first ones happen."""
+        many = len(self.trajectories) > 1
+        when = [
+            f"{self.sample[k] * self.dt[k]:.3g} s" + (f" of {self.names[k] or f'log {self.log[k]}'}" if many else "")
+            for k in loose[:_NAMED]
+        ]
+        rest = ", ..." if len(loose) > _NAMED else ""
+        return (
+            f"{len(loose)} of {int(self.linked.sum())} control steps stand out and count for little, as where a contact is "
+            f"missed: at {', '.join(when)}{rest}."
+        )
 
     @property
     def fixed_sd(self) -> FloatArray:

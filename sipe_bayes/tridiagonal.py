@@ -31,10 +31,28 @@ _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 
 @dataclass(frozen=True)
 class ChainNoise:
-    """sd (C,) of the measurements, process (D,) of the jumps from one state to the next."""
+    """sd (C,) of the measurements, process (D,) of the jumps from one state to the next, but wide (D,) of those that are
+    loose (K-1,); None: none is."""
 
     sd: FloatArray
     process: FloatArray
+    wide: FloatArray | None = None
+    loose: BoolArray | None = None
+
+    @property
+    def jump_sd(self) -> FloatArray:
+        """(D,), or (K-1, D) where some are loose."""
+        return self.process if self.loose is None else np.where(self.loose[:, None], self.loose_sd, self.process)
+
+    @property
+    def loose_sd(self) -> FloatArray:
+        """(D,) of those that are loose."""
+        return self.process if self.wide is None else np.maximum(self.wide, self.process)
+
+    @property
+    def tight(self) -> BoolArray:
+        """(K-1,) of the jumps, or of all at once."""
+        return np.array(True) if self.loose is None else ~self.loose
 
 
 @dataclass(frozen=True)
@@ -58,7 +76,7 @@ class ChainLinearisation:
 
     def weights(self, noise: ChainNoise) -> tuple[FloatArray, FloatArray]:
         """Precisions of the residuals (K, C) and jumps (K-1, D)."""
-        return self.observed * noise.sd**-2.0, self.linked[:, None] * noise.process**-2.0
+        return self.observed * noise.sd**-2.0, self.linked[:, None] * noise.jump_sd**-2.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +175,7 @@ def neighbours(factor: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
 def log_likelihood(found: ChainLinearisation, noise: ChainNoise, solved: Eliminated) -> float:
     """log p(y | theta), the states integrated out; exact where measurement and transition are linear in them."""
     first = found.precision > 0
-    scales = (found.observed * np.log(noise.sd)).sum() + found.linked.sum() * np.log(noise.process).sum()
+    scales = (found.observed * np.log(noise.sd)).sum() + (found.linked[:, None] * np.log(noise.jump_sd)).sum()
     constants = 0.5 * np.log(found.precision[first]).sum() - 0.5 * np.log(2 * np.pi) * found.observed.sum()
     best = energy(found, noise) - 0.5 * solved.explained
     return float(constants - scales - best - 0.5 * solved.log_determinant)
@@ -195,15 +213,15 @@ def restricted(found: ChainLinearisation, noise: ChainNoise, border: Border) -> 
     step, covariance, determinant = border.solve(solved)
     pulled = solved.gradient + border.pull
     value = log_likelihood(found, noise, solved) + 0.5 * float(step @ pulled) - 0.5 * determinant
-    squares, jumps = expected_squares(found, solved, step, covariance)
+    squares, jumps = expected_squares(found, solved, step, covariance, noise.tight)
     by_sd = squares / noise.sd**2 - found.observed.sum(0)
-    return value, by_sd, jumps / noise.process**2 - found.linked.sum()
+    return value, by_sd, jumps / noise.process**2 - (found.linked & noise.tight).sum()
 
 
 def expected_squares(
-    found: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray
+    found: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray, tight: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums over the chain of the expected squares of residuals (C,) and jumps (D,), after the best step."""
+    """Sums over the chain of the expected squares of residuals (C,) and of the jumps (D,) that are ``tight``, after the best step."""
     moved = solved.states(step)
     own, cross = neighbours(solved.factor, moved.shape[1])
     measured, transition = found.measurement, found.transition
@@ -215,7 +233,23 @@ def expected_squares(
     mixed = np.einsum("kij,kij->ki", transition, cross)
     jumps = jump**2 + _quadratic(transition, own[:-1]) + np.einsum("kii->ki", own[1:]) - 2 * mixed
     jumps = jumps + _quadratic(by_theta, covariance)
-    return (found.observed * squares).sum(0), (found.linked[:, None] * jumps).sum(0)
+    return (found.observed * squares).sum(0), ((found.linked & tight)[:, None] * jumps).sum(0)
+
+
+def jump_normal(
+    found: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray, at: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Posterior means (J, D) and covariances (J, D, D) of the jumps ``at`` (J,), after the best step."""
+    moved = solved.states(step)
+    own, cross = neighbours(solved.factor, moved.shape[1])
+    turn = found.transition[at]
+    back = np.swapaxes(turn, 1, 2)
+    ahead = moved[at + 1] - np.einsum("kij,kj->ki", turn, moved[at])
+    mean = found.jump[at] + ahead - found.transition_theta[at] @ step
+    by_theta = turn @ solved.slope[at] - solved.slope[at + 1] - found.transition_theta[at]
+    mixed = cross[at] @ back
+    spread = own[at + 1] + turn @ own[at] @ back - mixed - np.swapaxes(mixed, 1, 2)
+    return mean, spread + by_theta @ covariance @ np.swapaxes(by_theta, 1, 2)
 
 
 def _quadratic(rows: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -119,7 +119,10 @@ class Laplace(Estimator):
         }
         if "mode_process" in state:
             self.diagnostics["process_noise"] = state["mode_process"][kept[0]].tolist()
-            self.diagnostics["movement"] = state["movement"].tolist()
+            self.diagnostics["movement"] = state["mode_movement"][kept[0]].tolist()
+            self.diagnostics["loose"] = np.flatnonzero(state["mode_loose"][kept[0]]).tolist()
+            if not state["mode_settled"][kept[0]]:
+                self.warn("the noise had not settled: compare with mcmc before you trust the intervals")
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         weights = torch.tensor(np.array(evidence) - np.max(evidence))

@@ -160,7 +160,8 @@ class MCMC(Estimator):
 
     def _on_states(self, chain: Chain, mode: State) -> tuple[State, FloatArray]:
         """The same of a chain of states, whose noise is not free."""
-        picked = {f"fit_{k}": mode[k] for k in ("theta", "states", "slope", "sd", "tau", "process")}
+        names = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose")
+        picked = {f"fit_{k}": mode[k] for k in names}
         return {**picked, **at_optimum(chain, mode["theta"], mode["states"])}, np.empty((0, 0))
 
     def _target(self, windows: Windows | Chain, state: State) -> Any:

@@ -2,13 +2,17 @@
 
 A search regresses theta on the measured states, or follows the commands where some coordinate is not measured, then smooths and infers
 the noise in turn (``inference.smoother``). Where the logs' first states are known, it begins at the optima of whole logs without process
-noise (``window_search``). The optimum's normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of. A later
-starting point is dropped once its regression ends where an earlier one did.
+noise (``window_search``). A later starting point is dropped once its regression ends where an earlier one did.
+
+At an optimum, or where the noise does not settle, jumps that stand out are let go and the search goes on; from the optimum without them the
+filter tries to close them, and where that ends likelier the search goes on from there. Every optimum on the way is recorded and the likeliest
+counts: its normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of.
 """
 
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,8 +28,12 @@ from sipe_bayes.inference.smoother import (
     filtered,
     first_noise,
     infer_noise,
+    looseness,
+    needed,
+    outstanding,
     penalty,
     quietest,
+    rarity,
     regress,
     scale,
     sound,
@@ -33,7 +41,7 @@ from sipe_bayes.inference.smoother import (
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Segments
 from sipe_bayes.state_space import Chain
-from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
+from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, energy, restricted
 
 FloatArray = NDArray[np.float64]
 
@@ -44,6 +52,7 @@ _ROUNDS, _FILTERS = 10, 3  # estimates of the noise at most, and after how many 
 _DROPPED = 0.5  # where the process noise dropped by more than this, in logs
 _INNER = (3, 2)  # steps between them: before the first, later
 _AFTER_FILTER = 4
+_UNSETTLED, _REPAIRS = 4, 3  # estimates of the noise after which jumps that stand out are let go; how often
 _SHOT = 1 / 3  # of the budget, for starting points of logs whose first states are known
 _SAME = 0.02  # distance of regressed thetas that is none
 
@@ -56,7 +65,15 @@ def start(search: Search, chain: Chain) -> State:
         points = _shot(search, chain) if chain.settings.starts == "recorded" else _screened(search, chain)
     n, (k, d), c = chain.num_theta, chain.prior_precision.shape, len(chain.channels)
     shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
-    shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "evidence": ()}
+    shapes |= {
+        "sd": (c,),
+        "tau": (c,),
+        "process": (d,),
+        "movement": (d,),
+        "loose": (k - 1,),
+        "settled": (),
+        "evidence": (),
+    }
     return {
         "done": False,
         "part": chain.part,
@@ -75,11 +92,13 @@ def _begin(chain: Chain, theta: FloatArray) -> State:
         "sd": np.ones(len(chain.channels)),
         "process": np.ones(chain.num_start),
         "movement": np.ones(chain.num_start),
+        "loose": np.zeros(len(chain.linked), bool),
         "damping": 1e-4,
         "iteration": 0,
         "round": 0,
         "inner": 0,
         "due": False,
+        "repairs": 0,
         "held": True,  # states as measured
     }
 
@@ -145,7 +164,7 @@ def _stepped(search: Search, chain: Chain, state: State) -> State:
         return _diverged(chain, state)
     if held:
         return _regressed(search, chain, state, found)
-    prior, noise = search.quadratic_prior, ChainNoise(state["sd"], state["process"])
+    prior, noise = search.quadratic_prior, ChainNoise(state["sd"], state["process"], state["movement"], state["loose"])
     here = Point(state["theta"], state["states"], np.inf, state["damping"])
     state = {**state, "iteration": state["iteration"] + 1, "inner": state["inner"] + 1}
     still = False
@@ -155,17 +174,18 @@ def _stepped(search: Search, chain: Chain, state: State) -> State:
             return {**state, **_at(here), "due": state["inner"] >= _INNER[min(state["round"], 1)]}
     noise = sound(found, noise)
     better, gain = infer_noise(chain, found, noise, prior, here.theta, state["movement"])
-    last = state["round"] >= _ROUNDS
-    if state["round"] and ((gain < _SETTLED and still) or last):
-        if last:
-            search.warn(
-                f"the noise had not settled after {_ROUNDS} estimates: compare with mcmc before you trust the intervals"
-            )
-        return _finish(search, chain, state, found, noise)
+    settled, last = bool(gain < _SETTLED and still), state["round"] >= _ROUNDS
+    mend = state["round"] >= _UNSETTLED and state["repairs"] < _REPAIRS and not state["loose"].any()
+    if state["round"] and (settled or last or (mend and outstanding(found, noise).any())):
+        loose = needed(found, noise, prior, here.theta)
+        if not last and not np.array_equal(loose, state["loose"]):
+            return {**state, "loose": loose, "inner": 0, "due": False}
+        return _mended(search, chain, _record(search, state, found, noise, settled), found, noise)
     here, _ = descend(chain, found, better, prior, here, _TOLERANCE)
     dropped = np.log(noise.process / better.process).mean() > _DROPPED
     if state["round"] == 0 or (state["round"] < _FILTERS and dropped):
-        here = _refiltered(chain, found, better, prior, state, here)
+        there = _refiltered(chain, found, better, prior, here.theta, state["states"])
+        here = there if there is not None and there.energy < here.energy else here
     return {
         **state,
         **_at(here),
@@ -211,32 +231,52 @@ def _followed(search: Search, chain: Chain, state: State) -> State:
 
 
 def _refiltered(
-    chain: Chain, found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, state: State, here: Point
-) -> Point:
-    """The lower of ``here`` and where Gauss-Newton comes from the filter's states."""
-    states = filtered(chain, found, noise, here.theta, state["states"])
-    if states is None:
-        return here
-    there = Point(here.theta, states, np.inf, 1e-4)
+    chain: Chain,
+    found: ChainLinearisation,
+    noise: ChainNoise,
+    prior: QuadraticPrior,
+    theta: FloatArray,
+    states: FloatArray,
+) -> Point | None:
+    """Where Gauss-Newton comes from the filter's states; found: at ``states``."""
+    begin = filtered(chain, found, noise, theta, states)
+    if begin is None:
+        return None
+    there = Point(theta, begin, np.inf, 1e-4)
     for _ in range(_AFTER_FILTER):
         taken = chain.linearise(there.theta, there.states)
         if taken is None:
-            return here
+            return None
         there, still = descend(chain, taken, noise, prior, there, _TOLERANCE)
         if still:
             break
-    return there if there.energy < here.energy else here
+    return there
 
 
-def _finish(search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
-    """Record the optimum at its linearisation and turn to the next starting point."""
+def _mended(search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
+    """After an optimum: let go the jumps that stand out, if any; of one where some are loose, close them by the filter, if that
+    ends likelier; else turn to the next starting point."""
+    again = {**state, "round": 1, "inner": 0, "due": False, "repairs": state["repairs"] + 1}
+    if not state["loose"].any():
+        loose = outstanding(found, noise)
+        return {**again, "loose": loose} if loose.any() and state["repairs"] < _REPAIRS else _next(chain, state)
+    prior, tight = search.quadratic_prior, sound(found, replace(noise, loose=np.zeros_like(state["loose"])))
+    there = _refiltered(chain, found, tight, prior, state["theta"], state["states"])
+    if there is None or there.energy >= energy(found, noise) + penalty(prior, state["theta"]) + looseness(noise):
+        return _next(chain, state)
+    return {**again, **_at(there), "loose": np.zeros_like(state["loose"])}
+
+
+def _record(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool) -> State:
+    """The optimum at its linearisation."""
     theta, prior, solved = state["theta"], search.quadratic_prior, eliminate(found, noise)
     mean, covariance = search.normal(theta, solved.precision, solved.gradient)
     evidence = restricted(found, noise, border(prior, theta, solved.gradient))[0] - penalty(prior, theta)
+    evidence -= rarity(noise)
     here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
     here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "evidence": np.array(evidence)}
-    modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in here.items()}
-    return _next(chain, {**state, **modes})
+    here |= {"movement": state["movement"], "loose": noise.loose, "settled": np.array(settled)}
+    return {**state, **{f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in here.items()}}
 
 
 def _diverged(chain: Chain, state: State) -> State:

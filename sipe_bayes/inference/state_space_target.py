@@ -39,7 +39,7 @@ class ChainTarget:
     def __init__(self, prior: Posterior, chain: Chain, state: State) -> None:
         self.prior, self.chain, self.state = prior, chain, state
         self.fit = ChainLinearisation(**{f.name: state[f"fit_{f.name}"] for f in fields(ChainLinearisation)})
-        self.sd = ChainNoise(state["fit_sd"], state["fit_process"])
+        self.sd = ChainNoise(state["fit_sd"], state["fit_process"], state["fit_movement"], state["fit_loose"])
         self.solved = eliminate(self.fit, self.sd)
 
     def noise(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
