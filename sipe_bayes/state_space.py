@@ -83,7 +83,8 @@ class Chain:
     """Recorded trajectories as K unknown states in a row, T + 1 of each log; states of different logs are not linked.
 
     log, sample (K,): where a state belongs. measured, observed (K, C): what the simulation that starts there predicts. reference (K, S): a
-    first guess of the states; placed (D,): which of their coordinates belong to a degree of freedom or an activation that a channel tells.
+    first guess of the states; placed (D,): which of their coordinates belong to a degree of freedom or an activation that a channel tells;
+    idle (D,): positions on which nothing that is measured depends.
     rollouts, budget: as ``likelihood.Windows`` counts them; part: of a rollout, not counted yet;
     prepared: rollouts that placing them took, which a search counts when it starts."""
 
@@ -127,6 +128,7 @@ class Chain:
             self.reference[self.first] = first
         moving = direct[nv : 2 * nv]
         position = direct[:nv] | told | (moving & idle)
+        self.idle = np.concatenate([idle & ~direct[:nv] & ~told, np.zeros(self.num_start - nv, bool)])
         self.placed = np.concatenate([position, position | moving, direct[2 * nv :]])
         self.prepared, self.rollouts, self.part = math.ceil(self.rollouts + self.part), 0, 0.0
 
@@ -187,7 +189,7 @@ class Chain:
     def lacking(self, process: FloatArray, movement: FloatArray, loose: Sequence[int] = ()) -> str:
         """What inferred process noise (D,) says of the model, held against how far states move in a control step (D,): a hint, no test.
         loose: after which samples of the chain a jump was let go."""
-        share = process / movement
+        share = np.where(self.idle, 0.0, process / movement)
         worst = int(share.argmax())
         percent = f"{100 * share[worst]:.0f}" if share[worst] > 0.1 else f"{100 * share[worst]:.2g}"
         found = (

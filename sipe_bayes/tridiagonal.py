@@ -51,8 +51,8 @@ class ChainNoise:
 
     @property
     def tight(self) -> BoolArray:
-        """(K-1,) of the jumps, or of all at once."""
-        return np.array(True) if self.loose is None else ~self.loose
+        """Jumps (K-1, D), or all at once, whose sd is ``process``."""
+        return np.array(True) if self.loose is None else ~self.loose[:, None] | (self.loose_sd <= self.process)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def restricted(found: ChainLinearisation, noise: ChainNoise, border: Border) -> 
     value = log_likelihood(found, noise, solved) + 0.5 * float(step @ pulled) - 0.5 * determinant
     squares, jumps = expected_squares(found, solved, step, covariance, noise.tight)
     by_sd = squares / noise.sd**2 - found.observed.sum(0)
-    return value, by_sd, jumps / noise.process**2 - (found.linked & noise.tight).sum()
+    return value, by_sd, jumps / noise.process**2 - (found.linked[:, None] & noise.tight).sum(0)
 
 
 def expected_squares(
@@ -233,7 +233,7 @@ def expected_squares(
     mixed = np.einsum("kij,kij->ki", transition, cross)
     jumps = jump**2 + _quadratic(transition, own[:-1]) + np.einsum("kii->ki", own[1:]) - 2 * mixed
     jumps = jumps + _quadratic(by_theta, covariance)
-    return (found.observed * squares).sum(0), ((found.linked & tight)[:, None] * jumps).sum(0)
+    return (found.observed * squares).sum(0), ((found.linked[:, None] & tight) * jumps).sum(0)
 
 
 def jump_normal(

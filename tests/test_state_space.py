@@ -9,9 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 import sipe_bayes as sipe
 from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.loose_jumps import rarity, tightening
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.inference.smoother import Point, border, descend, first_noise, infer_noise, sound
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
@@ -26,6 +28,7 @@ from sipe_bayes.tridiagonal import (
     eliminate,
     energy,
     expected_squares,
+    jump_normal,
     log_likelihood,
     neighbours,
     restricted,
@@ -229,9 +232,24 @@ def random_chain(rng: np.random.Generator, some_loose: bool = False) -> tuple[Ch
         transition_theta=links * rng.standard_normal((k - 1, d, n)),
     )
     noise = ChainNoise(rng.uniform(0.3, 1, c), rng.uniform(0.3, 1, d))
-    if some_loose:
-        noise = replace(noise, wide=rng.uniform(2, 3, d), loose=np.array([False, True, False, False, False, True]))
+    if some_loose:  # wider in two coordinates, in the third no wider than all
+        wide = np.array([2.2, 2.9, 0.1])
+        noise = replace(noise, wide=wide, loose=np.array([False, True, False, False, False, True]))
     return found, noise
+
+
+def test_tightening_is_the_difference_of_evidence() -> None:
+    """What `tightening` says of each loose jump against two restricted likelihoods and the price of one more loose jump."""
+    found, noise = random_chain(np.random.default_rng(8), some_loose=True)
+    theta, prior = np.full(2, 0.4), _flat(2)
+    hold = border(prior, theta, np.zeros(2))
+    gains = tightening(found, noise, prior, theta)
+    assert noise.loose is not None
+    for gain, at in zip(gains, np.flatnonzero(noise.loose), strict=True):
+        tighter = replace(noise, loose=noise.loose & (np.arange(6) != at))
+        values = [restricted(found, one, hold)[0] - rarity(one) for one in (tighter, noise)]
+        assert gain == pytest.approx(values[0] - values[1], abs=1e-9)
+        print(gain)
 
 
 @pytest.mark.parametrize("some_loose", [False, True])
@@ -279,15 +297,24 @@ def test_the_chain_is_the_dense_least_squares(some_loose: bool) -> None:
     np.testing.assert_allclose(cross, [blocks[i + 1, :, i] for i in range(k - 1)], rtol=1e-8, atol=1e-12)
     covariance = np.linalg.inv(normal)
     spread = np.square(target - design @ best) + np.einsum("ri,ij,rj->r", design, covariance, design)
-    tight = np.broadcast_to(noise.tight, found.linked.shape)
+    tight = np.broadcast_to(noise.tight, found.jump.shape)
     squares, jumps = expected_squares(found, solved, best[states:], covariance[states:, states:], noise.tight)
     places = np.cumsum([c + d + d * (i < k - 1 and bool(found.linked[i])) for i in range(k)])
     begins = np.concatenate([[0], places[:-1]])
     np.testing.assert_allclose(
         squares, sum(found.observed[i] * spread[b : b + c] * noise.sd**2 for i, b in enumerate(begins)), rtol=1e-8
     )
-    order = [b + c + 2 * np.arange(d) + 1 for i, b in enumerate(begins) if i < k - 1 and found.linked[i] and tight[i]]
-    np.testing.assert_allclose(jumps, sum(spread[o] * noise.process**2 for o in order), rtol=1e-8)
+    rows_of = {i: b + c + 2 * np.arange(d) + 1 for i, b in enumerate(begins) if i < k - 1 and found.linked[i]}
+    expected = sum(spread[o] * noise.process**2 * tight[i] for i, o in rows_of.items())
+    np.testing.assert_allclose(jumps, expected, rtol=1e-8)
+    at = np.array([1, 5])
+    means, spreads = jump_normal(found, solved, best[states:], covariance[states:, states:], at)
+    for i, mean, covered in zip(at, means, spreads, strict=True):
+        o, unit = rows_of[i], jump_sd[i]
+        np.testing.assert_allclose(mean, (target - design @ best)[o] * unit, rtol=1e-8)
+        np.testing.assert_allclose(
+            covered, unit[:, None] * (design[o] @ covariance @ design[o].T) * unit, rtol=1e-7, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("some_loose", [False, True])
@@ -339,24 +366,49 @@ def test_laplace_and_mcmc_find_the_kalman_filters_posterior() -> None:
         assert float(posterior.stddev[0]) == pytest.approx(sd, rel=0.2)
 
 
+def kicked_logs(kick: float = 1.0) -> list[Trajectory]:
+    """Little process noise, but for a kick in each of two logs."""
+    return spring_logs(steps=120, process=PROCESS / 20, kick=kick)
+
+
 def test_a_jump_that_stands_out_is_let_go() -> None:
     """A kick in each of two logs: one step of each is loose, at most 40 ms from it, none of logs without a kick, and the interval is hardly wider
-    than theirs (with one process noise for all steps it is ten times as wide)."""
+    than theirs (with one process noise for all steps it is ten times as wide). mcmc agrees."""
     fits = {}
     for kick in (0.0, 1.0):
         estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
-        posterior = estimator.fit(spring_logs(steps=120, process=PROCESS / 20, kick=kick))
+        posterior = estimator.fit(kicked_logs(kick))
         fits[kick] = estimator.diagnostics["loose"], float(posterior.mean[0]), float(posterior.stddev[0])
-    print(fits)
     (none, _, usual), (loose, mean, sd) = fits[0.0], fits[1.0]
     assert none == []
     assert len(loose) == 2
     assert np.abs(np.array(loose) - [20, 121 + 20]).max() <= 2
     assert sd < 2 * usual
     assert abs(mean - (12.0 - LOW) / (HIGH - LOW)) < 3 * sd
-    said = estimator.windows(Trajectories.stack(spring_logs(steps=120))).lacking(PROCESS, np.ones(2), [20, 141])
+    chains = MCMC(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
+    sampled = chains.fit(kicked_logs())
+    print(fits, float(sampled.mean[0]), float(sampled.stddev[0]), chains.warnings)
+    assert chains.diagnostics["loose"] == loose
+    assert abs(float(sampled.mean[0]) - mean) < 0.5 * sd
+    assert float(sampled.stddev[0]) == pytest.approx(sd, rel=0.3)
+    said = estimator.windows(Trajectories.stack(kicked_logs())).lacking(PROCESS, np.ones(2), [20, 141])
     assert "2 of 233 control steps stand out" in said
     assert "0.4 s of log0, 0.4 s of log1" in said
+
+
+def test_no_budget_loses_what_was_found() -> None:
+    """Kicked logs: with more rollouts the evidence never falls, also where they end while jumps are being let go or closed."""
+    found = []
+    for budget in range(75, 205, 10):
+        estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0, budget=budget)
+        estimator.fit(kicked_logs())
+        assert estimator._state is not None
+        found.append((float(estimator._state["mode_evidence"][0]), len(estimator.diagnostics["loose"])))
+    print(found)
+    evidence = np.array([value for value, _ in found])
+    assert (np.diff(evidence) >= 0).all()
+    assert found[0][1] == 0
+    assert found[-1][1] == 2
 
 
 def test_the_target_with_fresh_jacobians_is_the_kalman_filter() -> None:
@@ -413,6 +465,10 @@ def test_through_contacts_from_positions_and_velocities_alone() -> None:
     print("mean error", error.mean(), "mean sd", float(posterior.stddev.mean()), "z", scores.round(1))
     assert error.mean() < 0.02
     assert np.mean(scores**2) < 4
+    known = (np.array(estimator.diagnostics[key]) for key in ("process_noise", "movement", "loose"))
+    said = estimator.windows(Trajectories.stack(log)).lacking(*known)
+    print(said)
+    assert "closely" in said  # how far it has run is not measured, and its process noise left as the prior has it
 
 
 def cheetah_log(simulator: Simulator, steps: int) -> tuple[np.ndarray, Trajectory]:
@@ -464,18 +520,21 @@ def test_quaternions_stay_of_length_one() -> None:
     assert simulator.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_BALL
 
 
-@pytest.mark.parametrize("starts", ["estimated", "recorded"])
-def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str) -> None:
-    logs = spring_logs() if starts == "estimated" else [hung_log(np.array([0.4]), 0), hung_log(np.array([0.4]), 1, 61)]
+@pytest.mark.parametrize(("starts", "steps"), [("estimated", 2), ("estimated", 9), ("recorded", 2)])
+def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str, steps: int) -> None:
+    """After two steps, and while jumps are let go."""
+    logs = kicked_logs() if starts == "estimated" else [hung_log(np.array([0.4]), 0), hung_log(np.array([0.4]), 1, 61)]
     simulator, likelihood = spring if starts == "estimated" else hung, StateSpace(starts=starts)
     undisturbed = Laplace(simulator(), likelihood=likelihood)
     plain = undisturbed.fit(logs)
     threads = Laplace(simulator(2), likelihood=likelihood).fit(logs)
     interrupted = Laplace(simulator(), likelihood=likelihood, checkpoint=tmp_path / "fit.safetensors")
     interrupted.checkpoint_seconds = 0.0
-    interrupted.progress = _stop_after(2)
+    interrupted.progress = _stop_after(steps)
     with pytest.raises(KeyboardInterrupt):
         interrupted.fit(logs)
+    loose = load_file(tmp_path / "fit.safetensors")["loose"]
+    assert loose.any() == (steps > 2)
     interrupted.progress = None
     for other in (threads, interrupted.fit(logs)):
         assert torch.equal(plain.means, other.means)  # type: ignore[attr-defined]

@@ -82,6 +82,7 @@ def one_fit(simulator: sipe.Simulator, task: str, level: float, seed: int, steps
         "wall_seconds": round(seconds, 2),
         "processor_seconds": round(processor, 2),
         "process_over_measurement": round(_process_share(estimator.diagnostics, task in CHEETAHS), 4),
+        "loose_jumps": len(estimator.diagnostics["loose"]),
         "warnings": estimator.warnings,
         "source": source(),
     }
@@ -118,6 +119,7 @@ def summary(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, Any
         "processor_seconds_median_and_most": [round(float(np.median(processor)), 1), max(processor)],
         "wall_seconds_median": round(float(np.median([r["wall_seconds"] for r in rows])), 1),
         "process_over_measurement_median": float(np.median([r["process_over_measurement"] for r in rows])),
+        "fits_with_loose_jumps": sum(bool(r["loose_jumps"]) for r in rows),
         "fits_with_warnings": sum(bool(r["warnings"]) for r in rows),
     }
 

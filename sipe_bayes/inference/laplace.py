@@ -11,14 +11,15 @@ noise (``noise_spread.sandwich``). Where the model is wrong at low frequencies, 
 noise and may leave the parameters behind it undetermined; plain least squares keeps what predicts best.
 
 Several starting points (the model as given and the best of a few draws from the prior) are followed; optima that are
-not the same become components of a mixture, weighted by their restricted likelihood.
+not the same become components of a mixture, weighted by their restricted likelihood; with ``StateSpace`` also by the prior of the
+process noise and the price of jumps let go.
 
 How the search spares simulations, follows ridges and looks around an optimum is said in ``window_search``. With ``StateSpace`` every
 sample's state is unknown and the search is that of ``state_space_search``.
 
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
-uncertainty of the noise widens the normal by the moments over a handful of weighted noise values. Residuals below what the
+uncertainty of the noise widens the normal by the moments over a handful of weighted noise values (not with ``StateSpace``). Residuals below what the
 simulation's own rounding leaves are no independent evidence: such a channel counts as one sample, not as many.
 """
 
@@ -118,11 +119,10 @@ class Laplace(Estimator):
             "noise_tau": state["mode_tau"][kept[0]].tolist(),
         }
         if "mode_process" in state:
-            self.diagnostics["process_noise"] = state["mode_process"][kept[0]].tolist()
-            self.diagnostics["movement"] = state["mode_movement"][kept[0]].tolist()
-            self.diagnostics["loose"] = np.flatnonzero(state["mode_loose"][kept[0]]).tolist()
+            noise = (state[f"mode_{name}"][kept[0]] for name in ("process", "movement", "loose"))
+            self.diagnostics |= state_space_search.process_diagnostics(*noise)
             if not state["mode_settled"][kept[0]]:
-                self.warn("the noise had not settled: compare with mcmc before you trust the intervals")
+                self.warn("the process noise had not settled: do not rely on the intervals; more restarts may help")
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         weights = torch.tensor(np.array(evidence) - np.max(evidence))

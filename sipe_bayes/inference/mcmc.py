@@ -37,6 +37,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
+from sipe_bayes.inference.state_space_search import process_diagnostics
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.inference.window_noise import free_noise
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
@@ -296,7 +297,10 @@ class MCMC(Estimator):
     def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
         target = self._target(self.windows(trajectories), state)
         sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
-        return {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
+        found = {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
+        if "fit_process" not in state:
+            return found
+        return found | process_diagnostics(*(state[f"fit_{name}"] for name in ("process", "movement", "loose")))
 
     def _linearisation_error(self, windows: Windows, state: State, walkers: FloatArray) -> float:
         """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""

@@ -12,20 +12,18 @@ state is sharper than its measurement, so after each of the first few estimates 
 (B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 1979) runs through the logs and linearises each step where it stands;
 Gauss-Newton goes on from its states where that ends lower.
 
-Where it still settles on a wrong side, a few jumps stand out, and one sd for all jumps would grow with them until the whole log says
-little. So jumps far above the usual one are let go: a loose jump's sd is the coordinate's movement in a control step, at the price of that width and of
-being rare. What is left of the log is then followed closely, and from there the filter mostly finds the way through
-(``state_space_search``).
+Where it still settles on a wrong side, a few jumps stand out and are let go (``inference.loose_jumps``).
 
 It begins with states as measured, and theta by reweighted least squares of the jumps, weights of a Student t with four degrees of
 freedom: contacts amplify the noise of a measurement manyfold. Where some coordinate is not measured, it begins with the filter's states
 about those that the commands lead to.
 
-Deviations: the noise is held at its optimum, the posterior of theta does not widen for it; a coordinate's process noise q has a prior
-q^0.5 exp(-q / movement), movement being how far the coordinate moves in a control step: the likelihood leaves the process noise of an
-unmeasured coordinate open above, and any that is small enough open below, where an estimate of zero would be overconfident (Y. Chung, S. Rabe-Hesketh, V. Dorie,
-A. Gelman, J. Liu, "A nondegenerate penalized likelihood estimator for variance parameters in multilevel models", 2013,
-https://doi.org/10.1007/s11336-013-9328-2, have a whole power); in the filter, channels that are read late are left out and no jump is loose; it only proposes.
+Deviations: the noise is held at its optimum, the posterior of theta does not widen for it. A coordinate's process noise q
+has a prior q^0.5 exp(-q / movement), movement being how far the coordinate moves in a control step: the likelihood leaves the
+process noise of an unmeasured coordinate open above, and any that is small enough open below, where an estimate of zero would
+be overconfident (Y. Chung, S. Rabe-Hesketh, V. Dorie, A. Gelman, J. Liu, "A nondegenerate penalized likelihood estimator for
+variance parameters in multilevel models", 2013, https://doi.org/10.1007/s11336-013-9328-2, have a whole power). In the filter,
+channels that are read late are left out and no jump is loose; it only proposes.
 """
 
 from __future__ import annotations
@@ -44,7 +42,6 @@ from sipe_bayes.tridiagonal import (
     ChainNoise,
     eliminate,
     energy,
-    jump_normal,
     neighbours,
     restricted,
 )
@@ -63,8 +60,6 @@ _STIFFEST = 1e-5  # of a coordinate's movement: process noise at least, for the 
 _LOUDER = 3.0
 _OFF_ZERO = 0.5  # power of a process noise in its prior
 _NEVER = 1e300  # nats
-_STANDS_OUT = 3.5  # times the usual jump
-_MOST_LOOSE = 0.05  # of all jumps, also their probability
 
 
 @dataclass(frozen=True)
@@ -130,6 +125,12 @@ def sound(found: ChainLinearisation, noise: ChainNoise) -> ChainNoise:
             return noise
 
 
+def process_penalty(noise: ChainNoise, movement: FloatArray) -> float:
+    """-log prior of the process noises in their logarithms' place, up to a constant; movement (D,): their scales."""
+    share = noise.process / movement
+    return float((share - _OFF_ZERO * np.log(share)).sum())
+
+
 def infer_noise(
     chain: Chain,
     found: ChainLinearisation,
@@ -159,56 +160,14 @@ def infer_noise(
             value, by_sd, by_process = restricted(found, tried, hold)
         except np.linalg.LinAlgError:  # so far apart that rounding rules
             return _NEVER, np.zeros(len(logs))
-        unlikely = tried.process / movement
-        penalised = float((unlikely - _OFF_ZERO * np.log(unlikely)).sum()) - value
-        return penalised, np.concatenate([-by_sd, unlikely - _OFF_ZERO - by_process])[free]
+        slope = tried.process / movement - _OFF_ZERO
+        return process_penalty(tried, movement) - value, np.concatenate([-by_sd, slope - by_process])[free]
 
     bounds = [(max(low, s - _SPAN), s + _SPAN) for low, s in zip(least[free], start[free], strict=True)]
     before = objective(start[free])[0]
     limits = {"maxiter": _SEARCH, "maxfun": _SEARCH + 4}
     best = scipy.optimize.minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds, options=limits)
     return split(best.x), float(before - best.fun)
-
-
-def outstanding(found: ChainLinearisation, noise: ChainNoise) -> BoolArray:
-    """Jumps (K-1,) that stand out of all: of a size far above the usual one, as where a contact is missed; at most a small share."""
-    size = np.where(found.linked, np.sqrt(((found.jump / noise.process) ** 2).mean(1)), 0.0)
-    most = int(_MOST_LOOSE * found.linked.sum())
-    bar = max(float(np.sort(size)[-most - 1]), _STANDS_OUT * float(np.median(size[found.linked])))
-    return np.asarray(size > bar)
-
-
-def needed(found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray) -> BoolArray:
-    """Of the loose jumps (K-1,) those that have to be: the others are made tight one by one, first the one that gains most evidence,
-    by the Savage-Dickey ratio of what the rest says of it (J. M. Dickey, "The weighted likelihood ratio, linear hypotheses on normal
-    location parameters", 1971, https://doi.org/10.1214/aoms/1177693507), the linearisation as it is."""
-    loose = np.zeros(len(found.linked), bool) if noise.loose is None else noise.loose.copy()
-    price = float(np.log(noise.loose_sd).sum()) - np.log(_MOST_LOOSE)
-    while loose.any():
-        at = np.flatnonzero(loose)
-        solved = eliminate(found, sound(found, replace(noise, loose=loose)))
-        step, covariance, _ = border(prior, theta, solved.gradient).solve(solved)
-        mean, spread = jump_normal(found, solved, step, covariance, at)
-        spread = spread + np.diag(noise.process**2)
-        squares = np.einsum("kd,kd->k", mean, np.linalg.solve(spread, mean[..., None])[..., 0])
-        gains = price - 0.5 * (squares + np.linalg.slogdet(spread)[1])
-        best = int(gains.argmax())
-        if gains[best] <= 0:
-            break
-        loose[at[best]] = False
-    return loose
-
-
-def rarity(noise: ChainNoise) -> float:
-    """Nats that loose jumps cost because they are rare."""
-    return 0.0 if noise.loose is None else float(noise.loose.sum()) * -np.log(_MOST_LOOSE)
-
-
-def looseness(noise: ChainNoise) -> float:
-    """Nats that loose jumps cost beside the energy: how much wider they are, and that they are rare."""
-    if noise.loose is None:
-        return 0.0
-    return float(noise.loose.sum() * np.log(noise.loose_sd / noise.process).sum()) + rarity(noise)
 
 
 def regress(found: ChainLinearisation, prior: QuadraticPrior, theta: FloatArray) -> FloatArray:

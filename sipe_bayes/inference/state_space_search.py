@@ -4,15 +4,17 @@ A search regresses theta on the measured states, or follows the commands where s
 the noise in turn (``inference.smoother``). Where the logs' first states are known, it begins at the optima of whole logs without process
 noise (``window_search``). A later starting point is dropped once its regression ends where an earlier one did.
 
-At an optimum, or where the noise does not settle, jumps that stand out are let go and the search goes on; from the optimum without them the
-filter tries to close them, and where that ends likelier the search goes on from there. Every optimum on the way is recorded and the likeliest
-counts: its normal in theta, with the states integrated out, is what ``laplace`` makes its truncated normal of.
+At an optimum, or where the noise does not settle, jumps that stand out are let go (``loose_jumps``) and the search goes on; from
+the optimum without them the filter tries to close them, and where that is likelier the search goes on from there. It turns to
+the next starting point once it comes to nothing likelier. Of each starting point the likeliest optimum is kept: its normal in
+theta, with the states integrated out, is what ``laplace`` makes its truncated normal of.
 """
 
 from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.inference import window_search
 from sipe_bayes.inference.least_squares import QuadraticPrior
+from sipe_bayes.inference.loose_jumps import needed, outstanding, rarity
 from sipe_bayes.inference.optima import Search, distinct_modes
 from sipe_bayes.inference.smoother import (
     Point,
@@ -28,12 +31,9 @@ from sipe_bayes.inference.smoother import (
     filtered,
     first_noise,
     infer_noise,
-    looseness,
-    needed,
-    outstanding,
     penalty,
+    process_penalty,
     quietest,
-    rarity,
     regress,
     scale,
     sound,
@@ -41,9 +41,10 @@ from sipe_bayes.inference.smoother import (
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Segments
 from sipe_bayes.state_space import Chain
-from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, energy, restricted
+from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _STILL, _REGRESSIONS = 0.01, 6  # a move of theta below which the regression ends, and its steps at most
 _TOLERANCE = 0.5  # nats that a step must promise
@@ -52,7 +53,7 @@ _ROUNDS, _FILTERS = 10, 3  # estimates of the noise at most, and after how many 
 _DROPPED = 0.5  # where the process noise dropped by more than this, in logs
 _INNER = (3, 2)  # steps between them: before the first, later
 _AFTER_FILTER = 4
-_UNSETTLED, _REPAIRS = 4, 3  # estimates of the noise after which jumps that stand out are let go; how often
+_UNSETTLED, _LET_GO = 4, 3  # estimates of the noise after which jumps that stand out are let go; how often they are
 _SHOT = 1 / 3  # of the budget, for starting points of logs whose first states are known
 _SAME = 0.02  # distance of regressed thetas that is none
 
@@ -65,15 +66,9 @@ def start(search: Search, chain: Chain) -> State:
         points = _shot(search, chain) if chain.settings.starts == "recorded" else _screened(search, chain)
     n, (k, d), c = chain.num_theta, chain.prior_precision.shape, len(chain.channels)
     shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
-    shapes |= {
-        "sd": (c,),
-        "tau": (c,),
-        "process": (d,),
-        "movement": (d,),
-        "loose": (k - 1,),
-        "settled": (),
-        "evidence": (),
-    }
+    shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "movement": (d,), "loose": (k - 1,)}
+    shapes |= {"settled": (), "evidence": (), "point": ()}
+    kinds = {"loose": bool, "settled": bool, "point": int}
     return {
         "done": False,
         "part": chain.part,
@@ -81,7 +76,7 @@ def start(search: Search, chain: Chain) -> State:
         "point": 0,
         "regressed": np.empty((0, n)),
         **_begin(chain, points[0]),
-        **{f"mode_{name}": np.empty((0, *shape)) for name, shape in shapes.items()},
+        **{f"mode_{name}": np.empty((0, *shape), kinds.get(name, float)) for name, shape in shapes.items()},
     }
 
 
@@ -98,7 +93,8 @@ def _begin(chain: Chain, theta: FloatArray) -> State:
         "round": 0,
         "inner": 0,
         "due": False,
-        "repairs": 0,
+        "refused": np.zeros(len(chain.linked), bool),
+        "let_go": 0,
         "held": True,  # states as measured
     }
 
@@ -149,6 +145,12 @@ def _shot(search: Search, chain: Chain) -> FloatArray:
     return np.asarray(state["mode_theta"][distinct_modes(state)[: search.restarts]])
 
 
+def process_diagnostics(process: FloatArray, movement: FloatArray, loose: BoolArray) -> dict[str, Any]:
+    """Of a fit: process noise and movement of each coordinate, and after which of the chain's states a jump is loose."""
+    found = {"process_noise": process, "movement": movement, "loose": np.flatnonzero(loose)}
+    return {name: values.tolist() for name, values in found.items()}
+
+
 def step(search: Search, chain: Chain, state: State) -> State:
     """One linearisation and what follows from it: a step of the regression or the smoother, or a new noise."""
     chain.part = float(state["part"])
@@ -175,12 +177,9 @@ def _stepped(search: Search, chain: Chain, state: State) -> State:
     noise = sound(found, noise)
     better, gain = infer_noise(chain, found, noise, prior, here.theta, state["movement"])
     settled, last = bool(gain < _SETTLED and still), state["round"] >= _ROUNDS
-    mend = state["round"] >= _UNSETTLED and state["repairs"] < _REPAIRS and not state["loose"].any()
-    if state["round"] and (settled or last or (mend and outstanding(found, noise).any())):
-        loose = needed(found, noise, prior, here.theta)
-        if not last and not np.array_equal(loose, state["loose"]):
-            return {**state, "loose": loose, "inner": 0, "due": False}
-        return _mended(search, chain, _record(search, state, found, noise, settled), found, noise)
+    struggling = state["round"] >= _UNSETTLED and not state["loose"].any() and _candidates(state, found, noise).any()
+    if state["round"] and (settled or last or struggling):
+        return _ended(search, chain, state, found, noise, settled)
     here, _ = descend(chain, found, better, prior, here, _TOLERANCE)
     dropped = np.log(noise.process / better.process).mean() > _DROPPED
     if state["round"] == 0 or (state["round"] < _FILTERS and dropped):
@@ -253,30 +252,79 @@ def _refiltered(
     return there
 
 
-def _mended(search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
-    """After an optimum: let go the jumps that stand out, if any; of one where some are loose, close them by the filter, if that
-    ends likelier; else turn to the next starting point."""
-    again = {**state, "round": 1, "inner": 0, "due": False, "repairs": state["repairs"] + 1}
-    if not state["loose"].any():
-        loose = outstanding(found, noise)
-        return {**again, "loose": loose} if loose.any() and state["repairs"] < _REPAIRS else _next(chain, state)
-    prior, tight = search.quadratic_prior, sound(found, replace(noise, loose=np.zeros_like(state["loose"])))
-    there = _refiltered(chain, found, tight, prior, state["theta"], state["states"])
-    if there is None or there.energy >= energy(found, noise) + penalty(prior, state["theta"]) + looseness(noise):
+def _ended(
+    search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool
+) -> State:
+    """After an optimum: keep it if it is likelier than those before, and go on from it."""
+    before = float(state["mode_evidence"][state["mode_point"] == state["point"]].max(initial=-np.inf))
+    loose = needed(found, noise, search.quadratic_prior, state["theta"])
+    if not np.array_equal(loose, state["loose"]):
+        state = {**state, "loose": loose, "refused": state["refused"] | (state["loose"] & ~loose)}
+        noise = replace(noise, loose=loose)
+        likelier = loose.any() or _evidence(search, state, found, noise, True) > before + _SETTLED
+        if likelier and state["round"] < _ROUNDS:
+            return {**state, "inner": 0, "due": False}
+    evidence = _evidence(search, state, found, noise, settled)
+    if evidence <= before + _SETTLED:
         return _next(chain, state)
-    return {**again, **_at(there), "loose": np.zeros_like(state["loose"])}
+    state = _record(search, state, found, noise, evidence, settled)
+    again = {**state, "round": 1, "inner": 0, "due": False}
+    if loose.any():
+        closed = _closed(search, chain, state, found, noise)
+        if closed is None or closed[1] <= evidence + _SETTLED:
+            return _next(chain, state)
+        return {**again, **_at(closed[0]), "loose": np.zeros_like(loose)}
+    proposed = _candidates(state, found, noise)
+    if not proposed.any():
+        return _next(chain, state)
+    return {**again, "loose": proposed, "let_go": state["let_go"] + 1}
 
 
-def _record(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool) -> State:
-    """The optimum at its linearisation."""
+def _candidates(state: State, found: ChainLinearisation, noise: ChainNoise) -> BoolArray:
+    """Jumps (K-1,) to let go: none that turned out not to need it, and none after a few times."""
+    return outstanding(found, noise) & ~state["refused"] & (state["let_go"] < _LET_GO)
+
+
+def _closed(
+    search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
+) -> tuple[Point, float] | None:
+    """Where the filter leads with no jump loose, and the evidence there; None where the budget ends or it diverges."""
+    tight, prior = sound(found, replace(noise, loose=np.zeros_like(state["loose"]))), search.quadratic_prior
+    try:
+        there = _refiltered(chain, found, tight, prior, state["theta"], state["states"])
+        taken = None if there is None else chain.linearise(there.theta, there.states)
+    except BudgetExhausted:
+        return None
+    if there is None or taken is None:
+        return None
+    return there, _evidence(search, {**state, **_at(there)}, taken, sound(taken, tight), False)
+
+
+def _evidence(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool) -> float:
+    """log p(noise | y), states and theta integrated out, up to a constant; unless ``settled`` without what the next step would
+    gain, were the model linear."""
     theta, prior, solved = state["theta"], search.quadratic_prior, eliminate(found, noise)
+    hold = border(prior, theta, solved.gradient)
+    value = restricted(found, noise, hold)[0] - penalty(prior, theta) - rarity(noise)
+    value -= process_penalty(noise, state["movement"])
+    if settled:
+        return value
+    step, _, _ = hold.solve(solved)
+    return value - 0.5 * (solved.explained + float(step @ (solved.gradient + hold.pull)))
+
+
+def _record(
+    search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, evidence: float, settled: bool
+) -> State:
+    """The optimum at its linearisation, in place of this starting point's earlier one."""
+    theta, solved = state["theta"], eliminate(found, noise)
     mean, covariance = search.normal(theta, solved.precision, solved.gradient)
-    evidence = restricted(found, noise, border(prior, theta, solved.gradient))[0] - penalty(prior, theta)
-    evidence -= rarity(noise)
     here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
-    here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "evidence": np.array(evidence)}
-    here |= {"movement": state["movement"], "loose": noise.loose, "settled": np.array(settled)}
-    return {**state, **{f"mode_{k}": np.concatenate([state[f"mode_{k}"], v[None]]) for k, v in here.items()}}
+    here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "movement": state["movement"]}
+    here |= {"loose": state["loose"], "settled": np.array(settled), "evidence": np.array(evidence)}
+    here |= {"point": np.array(state["point"])}
+    others = state["mode_point"] != state["point"]
+    return {**state, **{f"mode_{k}": np.concatenate([state[f"mode_{k}"][others], v[None]]) for k, v in here.items()}}
 
 
 def _diverged(chain: Chain, state: State) -> State:
