@@ -298,7 +298,7 @@ class Chain:
             raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost:.0f}")
         self.rollouts, self.part = self.rollouts + int(cost), cost % 1.0
 
-    def _compared(self, theta_states: FloatArray, predicted: FloatArray, ends: FloatArray) -> dict[str, Any]:
+    def compared(self, theta_states: FloatArray, predicted: FloatArray, ends: FloatArray) -> dict[str, Any]:
         """Residual, jump and offset of states (K, S), and the masks."""
         linked = self.linked[:, None]
         return {
@@ -314,12 +314,13 @@ class Chain:
         self, theta: FloatArray, states: FloatArray, slopes: ChainLinearisation | None = None
     ) -> list[ChainLinearisation | None]:
         """What theta (B, N) and states (B, K, S) predict, compared with the log; None where a simulation diverged. The
-        Jacobians are those of ``slopes``, else empty."""
+        Jacobians and their error are those of ``slopes``, else empty and none."""
         predicted, ends, valid = self.simulate(theta, states)
         names = ("measurement", "measurement_theta", "transition", "transition_theta")
         kept: dict[str, Any] = {n: np.empty(0) if slopes is None else getattr(slopes, n) for n in names}
+        kept["error"] = np.zeros((1, 1)) if slopes is None else slopes.error
         return [
-            ChainLinearisation(**self._compared(s, p, e), **kept) if v.all() else None
+            ChainLinearisation(**self.compared(s, p, e), **kept) if v.all() else None
             for s, p, e, v in zip(states, predicted, ends, valid, strict=True)
         ]
 
@@ -349,11 +350,12 @@ class Chain:
         if not with_states:
             by_state = (np.zeros((*seen.shape[:-1], d)), np.zeros((*reached.shape[:-1], d)))
         return ChainLinearisation(
-            **self._compared(states, predicted[0], ends[0]),
+            **self.compared(states, predicted[0], ends[0]),
             measurement=by_state[0],
             measurement_theta=seen[..., :n],
             transition=by_state[1],
             transition_theta=reached[..., :n],
+            error=np.zeros((len(self.linked), d)),
         )
 
 

@@ -17,7 +17,7 @@ The gradient by the log of a noise sd is that of Fisher's identity: the expected
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -61,7 +61,8 @@ class ChainLinearisation:
 
     residual (K, C), zero where not observed; jump (K-1, D), zero where not linked; offset (K, D): a first state from its
     prior's mean; observed (K, C), linked (K-1,); precision (K, D): the prior's, of first states, else zero. measurement
-    (K, C, D), measurement_theta (K, C, N), transition (K-1, D, D), transition_theta (K-1, D, N): Jacobians."""
+    (K, C, D), measurement_theta (K, C, N), transition (K-1, D, D), transition_theta (K-1, D, N): Jacobians. error (K-1, D):
+    variance of a jump that they leave out, besides the process noise's."""
 
     residual: FloatArray
     jump: FloatArray
@@ -73,10 +74,15 @@ class ChainLinearisation:
     measurement_theta: FloatArray
     transition: FloatArray
     transition_theta: FloatArray
+    error: FloatArray
 
     def weights(self, noise: ChainNoise) -> tuple[FloatArray, FloatArray]:
         """Precisions of the residuals (K, C) and jumps (K-1, D)."""
-        return self.observed * noise.sd**-2.0, self.linked[:, None] * noise.jump_sd**-2.0
+        return self.observed * noise.sd**-2.0, self.linked[:, None] / self.jump_variance(noise)
+
+    def jump_variance(self, noise: ChainNoise) -> FloatArray:
+        """(K-1, D)."""
+        return np.asarray(noise.jump_sd**2 + self.error)
 
 
 @dataclass(frozen=True)
@@ -175,7 +181,9 @@ def neighbours(factor: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
 def log_likelihood(found: ChainLinearisation, noise: ChainNoise, solved: Eliminated) -> float:
     """log p(y | theta), the states integrated out; exact where measurement and transition are linear in them."""
     first = found.precision > 0
-    scales = (found.observed * np.log(noise.sd)).sum() + (found.linked[:, None] * np.log(noise.jump_sd)).sum()
+    scales = (found.observed * np.log(noise.sd)).sum() + 0.5 * (
+        found.linked[:, None] * np.log(found.jump_variance(noise))
+    ).sum()
     constants = 0.5 * np.log(found.precision[first]).sum() - 0.5 * np.log(2 * np.pi) * found.observed.sum()
     best = energy(found, noise) - 0.5 * solved.explained
     return float(constants - scales - best - 0.5 * solved.log_determinant)
@@ -206,22 +214,28 @@ def inverse(precision: FloatArray) -> tuple[FloatArray, float]:
     return sd[:, None] * ((axes / kept) @ axes.T) * sd, float(np.log(kept).sum() - 2 * np.log(sd).sum())
 
 
-def restricted(found: ChainLinearisation, noise: ChainNoise, border: Border) -> tuple[float, FloatArray, FloatArray]:
+def restricted(
+    found: ChainLinearisation, noise: ChainNoise, border: Border, held: bool = False
+) -> tuple[float, FloatArray, FloatArray]:
     """Log-likelihood of the noise, states and theta integrated out, up to a constant; its derivatives by log sd (C,) and
-    by log process (D,)."""
+    by log process (D,). held: with states and theta where they are, not after the step that would be best were all linear."""
     solved = eliminate(found, noise)
     step, covariance, determinant = border.solve(solved)
+    if held:
+        solved, step = replace(solved, shift=np.zeros_like(solved.shift), explained=0.0), np.zeros_like(step)
     pulled = solved.gradient + border.pull
     value = log_likelihood(found, noise, solved) + 0.5 * float(step @ pulled) - 0.5 * determinant
-    squares, jumps = expected_squares(found, solved, step, covariance, noise.tight)
-    by_sd = squares / noise.sd**2 - found.observed.sum(0)
-    return value, by_sd, jumps / noise.process**2 - (found.linked[:, None] & noise.tight).sum(0)
+    squares, jumps = expected_squares(found, solved, step, covariance)
+    variance = found.jump_variance(noise)
+    share = (found.linked[:, None] & noise.tight) * noise.process**2 / variance
+    by_sd = squares.sum(0) / noise.sd**2 - found.observed.sum(0)
+    return value, by_sd, (share * (jumps / variance - 1)).sum(0)
 
 
 def expected_squares(
-    found: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray, tight: BoolArray
+    found: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums over the chain of the expected squares of residuals (C,) and of the jumps (D,) that are ``tight``, after the best step."""
+    """Expected squares of residuals (K, C), zero where not observed, and of jumps (K-1, D), after the best step."""
     moved = solved.states(step)
     own, cross = neighbours(solved.factor, moved.shape[1])
     measured, transition = found.measurement, found.transition
@@ -233,7 +247,7 @@ def expected_squares(
     mixed = np.einsum("kij,kij->ki", transition, cross)
     jumps = jump**2 + _quadratic(transition, own[:-1]) + np.einsum("kii->ki", own[1:]) - 2 * mixed
     jumps = jumps + _quadratic(by_theta, covariance)
-    return (found.observed * squares).sum(0), ((found.linked[:, None] & tight) * jumps).sum(0)
+    return found.observed * squares, jumps
 
 
 def jump_normal(

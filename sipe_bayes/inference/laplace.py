@@ -15,7 +15,7 @@ not the same become components of a mixture, weighted by their restricted likeli
 process noise and the price of jumps let go.
 
 How the search spares simulations, follows ridges and looks around an optimum is said in ``window_search``. With ``StateSpace`` every
-sample's state is unknown and the search is that of ``state_space_search``.
+sample's state is unknown and the search is that of ``state_space_search``, or where the first ones are known of ``known_start_search``.
 
 Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
 within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
@@ -25,6 +25,7 @@ simulation's own rounding leaves are no independent evidence: such a channel cou
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,8 +33,9 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
-from sipe_bayes.inference import state_space_search, window_search
+from sipe_bayes.inference import known_start_search, state_space_search, window_search
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.chain_state import process_diagnostics
 from sipe_bayes.inference.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
@@ -88,18 +90,20 @@ class Laplace(Estimator):
 
     def start(self, trajectories: Trajectories) -> State:
         windows = self.windows(trajectories)
-        if isinstance(windows, Chain):
-            return state_space_search.start(self, windows)
-        return window_search.start(self, windows)
+        return self._how(windows).start(self, windows)
 
     def describe(self, state: State) -> str:
         return f"laplace: start {state['point'] + 1} of {len(state['points'])}, step {state['iteration']}"
 
     def step(self, state: State, trajectories: Trajectories) -> State:
         windows = self.windows(trajectories)
-        if isinstance(windows, Chain):
-            return state_space_search.step(self, windows, state)
-        return window_search.step(self, windows, state)
+        return self._how(windows).step(self, windows, state)
+
+    def _how(self, windows: Any) -> ModuleType:
+        """The search that fits the likelihood: its functions ``start`` and ``step``."""
+        if not isinstance(windows, Chain):
+            return window_search
+        return known_start_search if windows.settings.starts == "recorded" else state_space_search
 
     def posterior(self, state: State, trajectories: Trajectories) -> GaussianMixture:
         if not len(state["mode_theta"]):
@@ -120,7 +124,7 @@ class Laplace(Estimator):
         }
         if "mode_process" in state:
             noise = (state[f"mode_{name}"][kept[0]] for name in ("process", "movement", "loose"))
-            self.diagnostics |= state_space_search.process_diagnostics(*noise)
+            self.diagnostics |= process_diagnostics(*noise)
             if not state["mode_settled"][kept[0]]:
                 self.warn("the process noise had not settled: do not rely on the intervals; more restarts may help")
         if len(kept) > 1:

@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.chain_state import process_diagnostics
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
-from sipe_bayes.inference.state_space_search import process_diagnostics
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.inference.window_noise import free_noise
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows

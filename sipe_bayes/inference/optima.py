@@ -11,6 +11,7 @@ from sipe_bayes.inference.least_squares import QuadraticPrior
 from sipe_bayes.inference.state import State
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +31,9 @@ class Search(Protocol):
 
     @property
     def quadratic_prior(self) -> QuadraticPrior: ...
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        """Of the optima in a state."""
 
     def warn(self, sentence: str | None) -> None: ...
 

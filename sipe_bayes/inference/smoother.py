@@ -106,7 +106,7 @@ def descend(
             return replace(here, energy=value), True
         theta = np.clip(here.theta + move, 0.0, 1.0)
         states = chain.moved(here.states, solved.states(move))
-        there = chain.compare(theta[None], states[None])[0]
+        there = chain.compare(theta[None], states[None], found)[0]
         after = np.inf if there is None else energy(there, noise) + penalty(prior, theta)
         if after < value:
             return Point(theta, states, after, max(_DAMPING_MIN, damping * _DAMPING_DOWN)), False
@@ -138,9 +138,10 @@ def infer_noise(
     prior: QuadraticPrior,
     theta: FloatArray,
     movement: FloatArray,
+    held: bool = False,
 ) -> tuple[ChainNoise, float]:
     """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten, and the nats
-    that it gains. movement (D,): scales of the process noises' priors."""
+    that it gains. movement (D,): scales of the process noises' priors. held: as in ``restricted``."""
     channels, fixed = len(noise.sd), chain.fixed_sd
     hold = border(prior, theta, eliminate(found, noise).gradient)
     least_sd, least_process = chain.least
@@ -157,7 +158,7 @@ def infer_noise(
     def objective(logs: FloatArray) -> tuple[float, FloatArray]:
         tried = split(logs)
         try:
-            value, by_sd, by_process = restricted(found, tried, hold)
+            value, by_sd, by_process = restricted(found, tried, hold, held)
         except np.linalg.LinAlgError:  # so far apart that rounding rules
             return _NEVER, np.zeros(len(logs))
         slope = tried.process / movement - _OFF_ZERO
@@ -187,11 +188,11 @@ def scale(found: ChainLinearisation) -> FloatArray:
 
 def first_noise(chain: Chain, found: ChainLinearisation, movement: FloatArray) -> ChainNoise:
     """A guess from the first guess of the states. Measurement noise: what third differences of a channel leave, at most a
-    third of the jumps of the coordinate that it measures. Process noise: as large as the jumps, or where some coordinate is
-    not measured a share of its movement."""
+    third of the jumps of the coordinate that it measures. Process noise: as large as the jumps, or where states are what the commands
+    lead to a share of a coordinate's movement."""
     jumps, fixed = scale(found), chain.fixed_sd
     least_sd, least_process = chain.least
-    whole = chain.placed.all()
+    whole = chain.placed.all() and chain.settings.starts == "estimated"
     direct = np.array([np.inf if c is None or not whole else jumps[c] / 3 for c in chain.coordinates])
     sd = np.where(np.isnan(fixed), np.maximum(np.minimum(_roughness(chain), direct), least_sd), fixed)
     return ChainNoise(sd, np.maximum(jumps if whole else _FREE * movement, least_process))

@@ -1,8 +1,8 @@
-"""What ``laplace`` does step by step with a ``StateSpace``: from starting point to recorded optimum, in a flat state.
+"""What ``laplace`` does step by step with a ``StateSpace``: from starting point to recorded optimum, in a flat state (``chain_state``).
 
 A search regresses theta on the measured states, or follows the commands where some coordinate is not measured, then smooths and infers
-the noise in turn (``inference.smoother``). Where the logs' first states are known, it begins at the optima of whole logs without process
-noise (``window_search``). A later starting point is dropped once its regression ends where an earlier one did.
+the noise in turn (``inference.smoother``). A later starting point is dropped once its regression ends where an earlier one did. Where the
+logs' first states are known another search is made (``known_start_search``).
 
 At an optimum, or where the noise does not settle, jumps that stand out are let go (``loose_jumps``) and the search goes on; from
 the optimum without them the filter tries to close them, and where that is likelier the search goes on from there. It turns to
@@ -12,36 +12,29 @@ theta, with the states integrated out, is what ``laplace`` makes its truncated n
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.inference import window_search
+from sipe_bayes.inference.chain_state import diverged, evidence_of, onward, opening, recorded, screened
 from sipe_bayes.inference.least_squares import QuadraticPrior
-from sipe_bayes.inference.loose_jumps import needed, outstanding, rarity
-from sipe_bayes.inference.optima import Search, distinct_modes
+from sipe_bayes.inference.loose_jumps import needed, outstanding
+from sipe_bayes.inference.optima import Search
 from sipe_bayes.inference.smoother import (
     Point,
-    border,
     descend,
     filtered,
     first_noise,
     infer_noise,
-    penalty,
-    process_penalty,
     quietest,
     regress,
-    scale,
     sound,
 )
 from sipe_bayes.inference.state import State
-from sipe_bayes.likelihood import BudgetExhausted, Segments
+from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.state_space import Chain
-from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
+from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -54,101 +47,13 @@ _DROPPED = 0.5  # where the process noise dropped by more than this, in logs
 _INNER = (3, 2)  # steps between them: before the first, later
 _AFTER_FILTER = 4
 _UNSETTLED, _LET_GO = 4, 3  # estimates of the noise after which jumps that stand out are let go; how often they are
-_SHOT = 1 / 3  # of the budget, for starting points of logs whose first states are known
 _SAME = 0.02  # distance of regressed thetas that is none
 
 
 def start(search: Search, chain: Chain) -> State:
     """The first state of a fit."""
     chain.rollouts += chain.prepared
-    points = search.initial
-    if points is None:
-        points = _shot(search, chain) if chain.settings.starts == "recorded" else _screened(search, chain)
-    n, (k, d), c = chain.num_theta, chain.prior_precision.shape, len(chain.channels)
-    shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
-    shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "movement": (d,), "loose": (k - 1,)}
-    shapes |= {"settled": (), "evidence": (), "point": ()}
-    kinds = {"loose": bool, "settled": bool, "point": int}
-    return {
-        "done": False,
-        "part": chain.part,
-        "points": points,
-        "point": 0,
-        "regressed": np.empty((0, n)),
-        **_begin(chain, points[0]),
-        **{f"mode_{name}": np.empty((0, *shape), kinds.get(name, float)) for name, shape in shapes.items()},
-    }
-
-
-def _begin(chain: Chain, theta: FloatArray) -> State:
-    return {
-        "theta": theta,
-        "states": chain.reference,
-        "sd": np.ones(len(chain.channels)),
-        "process": np.ones(chain.num_start),
-        "movement": np.ones(chain.num_start),
-        "loose": np.zeros(len(chain.linked), bool),
-        "damping": 1e-4,
-        "iteration": 0,
-        "round": 0,
-        "inner": 0,
-        "due": False,
-        "refused": np.zeros(len(chain.linked), bool),
-        "let_go": 0,
-        "held": True,  # states as measured
-    }
-
-
-def _screened(search: Search, chain: Chain) -> FloatArray:
-    """Starting points (R, N): the model as given and the best of a few draws from the prior, by the jumps that they leave
-    between states as measured; raises ValueError where all diverge."""
-    generator = torch.Generator().manual_seed(search.seed)
-    draws = search.prior.sample((search.candidates,), generator=generator).numpy()
-    points = np.concatenate([search.space.default_theta[None], draws])
-    found = chain.compare(points, np.tile(chain.reference, (len(points), 1, 1)))
-    good = [k for k, one in enumerate(found) if one is not None]
-    if not good:
-        raise ValueError(
-            f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
-            "or shorten the model's timestep"
-        )
-    if good[0] != 0:
-        search.warn("the model as given diverges on these logs; the search started elsewhere")
-    sizes = np.array([scale(one) for one in found if one is not None])
-    order = np.argsort(np.log(sizes).sum(1), kind="stable")
-    chosen = [good[k] for k in order if good[k] != 0]
-    return points[([0] if good[0] == 0 else []) + chosen][: search.restarts]
-
-
-def _shot(search: Search, chain: Chain) -> FloatArray:
-    """Starting points (R, N) where the logs' first states are known: the optima of whole logs without process noise, as far as a
-    third of the budget finds them; what is said on the way is not of the fit."""
-    likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
-    windows, quiet = likelihood.bind(chain.simulator, chain.trajectories), copy.copy(search)
-    quiet.warn = lambda sentence: None  # type: ignore[method-assign]
-    windows.rollouts, windows.budget = chain.rollouts, chain.rollouts + _SHOT * (chain.budget - chain.rollouts)
-    points, state, diverged = search.space.default_theta[None], None, False
-    try:
-        state = window_search.start(quiet, windows)
-        while not state["done"]:
-            points = state["theta"][None]
-            state = window_search.step(quiet, windows, state)
-    except BudgetExhausted:
-        pass
-    except ValueError:  # whole logs
-        diverged = True
-    chain.rollouts = windows.rollouts
-    if diverged:
-        return _screened(search, chain)
-    if state is None or not len(state["mode_theta"]):
-        return np.asarray(points)
-    return np.asarray(state["mode_theta"][distinct_modes(state)[: search.restarts]])
-
-
-def process_diagnostics(process: FloatArray, movement: FloatArray, loose: BoolArray) -> dict[str, Any]:
-    """Of a fit: process noise and movement of each coordinate, and after which of the chain's states a jump is loose."""
-    found = {"process_noise": process, "movement": movement, "loose": np.flatnonzero(loose)}
-    return {name: values.tolist() for name, values in found.items()}
+    return opening(chain, screened(search, chain) if search.initial is None else search.initial)
 
 
 def step(search: Search, chain: Chain, state: State) -> State:
@@ -163,7 +68,7 @@ def _stepped(search: Search, chain: Chain, state: State) -> State:
         return _followed(search, chain, state)
     found = chain.linearise(state["theta"], state["states"], with_states=not held)
     if found is None:
-        return _diverged(chain, state)
+        return diverged(chain, state)
     if held:
         return _regressed(search, chain, state, found)
     prior, noise = search.quadratic_prior, ChainNoise(state["sd"], state["process"], state["movement"], state["loose"])
@@ -207,7 +112,7 @@ def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisa
     if not still:
         return state
     if any(np.abs(theta - earlier).max() < _SAME for earlier in state["regressed"]):
-        return _next(chain, state)
+        return onward(chain, state)
     movement = chain.movement(state["states"])
     noise = first_noise(chain, found, movement)
     regressed = np.concatenate([state["regressed"], theta[None]])
@@ -220,7 +125,7 @@ def _followed(search: Search, chain: Chain, state: State) -> State:
     states = state["states"] if states is None else states
     found = chain.linearise(theta, states)
     if found is None:
-        return _diverged(chain, state)
+        return diverged(chain, state)
     movement = chain.movement(states)
     noise = quietest(chain, found, first_noise(chain, found, movement), search.quadratic_prior, theta)
     noise = sound(found, noise)
@@ -261,22 +166,22 @@ def _ended(
     if not np.array_equal(loose, state["loose"]):
         state = {**state, "loose": loose, "refused": state["refused"] | (state["loose"] & ~loose)}
         noise = replace(noise, loose=loose)
-        likelier = loose.any() or _evidence(search, state, found, noise, True) > before + _SETTLED
+        likelier = loose.any() or evidence_of(search, state, found, noise, True) > before + _SETTLED
         if likelier and state["round"] < _ROUNDS:
             return {**state, "inner": 0, "due": False}
-    evidence = _evidence(search, state, found, noise, settled)
+    evidence = evidence_of(search, state, found, noise, settled)
     if evidence <= before + _SETTLED:
-        return _next(chain, state)
-    state = _record(search, state, found, noise, evidence, settled)
+        return onward(chain, state)
+    state = recorded(search, state, found, noise, evidence, settled)
     again = {**state, "round": 1, "inner": 0, "due": False}
     if loose.any():
         closed = _closed(search, chain, state, found, noise)
         if closed is None or closed[1] <= evidence + _SETTLED:
-            return _next(chain, state)
+            return onward(chain, state)
         return {**again, **_at(closed[0]), "loose": np.zeros_like(loose)}
     proposed = _candidates(state, found, noise)
     if not proposed.any():
-        return _next(chain, state)
+        return onward(chain, state)
     return {**again, "loose": proposed, "let_go": state["let_go"] + 1}
 
 
@@ -297,48 +202,4 @@ def _closed(
         return None
     if there is None or taken is None:
         return None
-    return there, _evidence(search, {**state, **_at(there)}, taken, sound(taken, tight), False)
-
-
-def _evidence(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool) -> float:
-    """log p(noise | y), states and theta integrated out, up to a constant; unless ``settled`` without what the next step would
-    gain, were the model linear."""
-    theta, prior, solved = state["theta"], search.quadratic_prior, eliminate(found, noise)
-    hold = border(prior, theta, solved.gradient)
-    value = restricted(found, noise, hold)[0] - penalty(prior, theta) - rarity(noise)
-    value -= process_penalty(noise, state["movement"])
-    if settled:
-        return value
-    step, _, _ = hold.solve(solved)
-    return value - 0.5 * (solved.explained + float(step @ (solved.gradient + hold.pull)))
-
-
-def _record(
-    search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, evidence: float, settled: bool
-) -> State:
-    """The optimum at its linearisation, in place of this starting point's earlier one."""
-    theta, solved = state["theta"], eliminate(found, noise)
-    mean, covariance = search.normal(theta, solved.precision, solved.gradient)
-    here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
-    here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "movement": state["movement"]}
-    here |= {"loose": state["loose"], "settled": np.array(settled), "evidence": np.array(evidence)}
-    here |= {"point": np.array(state["point"])}
-    others = state["mode_point"] != state["point"]
-    return {**state, **{f"mode_{k}": np.concatenate([state[f"mode_{k}"][others], v[None]]) for k, v in here.items()}}
-
-
-def _diverged(chain: Chain, state: State) -> State:
-    if state["point"] + 1 == len(state["points"]) and not len(state["mode_theta"]):
-        raise ValueError(
-            "trajectories: the simulation diverges from the measured states at every starting point; look at the log's "
-            "channels and units, or shorten the model's timestep"
-        )
-    return _next(chain, state)
-
-
-def _next(chain: Chain, state: State) -> State:
-    """Turn to the next starting point, or end."""
-    point = state["point"] + 1
-    if point >= len(state["points"]):
-        return {**state, "done": True}
-    return {**state, "point": point, **_begin(chain, state["points"][point])}
+    return there, evidence_of(search, {**state, **_at(there)}, taken, sound(taken, tight), False)

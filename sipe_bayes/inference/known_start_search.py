@@ -1,0 +1,124 @@
+"""What ``laplace`` does step by step with a ``StateSpace`` whose logs' first states are known, in a flat state (``chain_state``).
+
+The commands lead from there to states near the true ones once theta is roughly right, which ever longer beginnings of the logs make it
+(``growing_horizon``). So no state has to be found from its measurement; what matters is to stay honest through contacts, and the
+smoother's transitions are linearised as widely as states and theta are still open (``posterior_linearisation``).
+
+Three Gauss-Newton steps and an estimate of the noise take turns. The estimate credits a step not yet taken only where next to nothing
+is left to gain: through contact a linearisation promises what the simulation does not keep. Of each starting point the likeliest of
+these estimates is kept, with states and theta where they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.inference.chain_state import diverged, evidence_of, onward, opening, recorded, screened
+from sipe_bayes.inference.growing_horizon import grown
+from sipe_bayes.inference.optima import Search
+from sipe_bayes.inference.posterior_linearisation import linearise
+from sipe_bayes.inference.smoother import Point, border, descend, first_noise, infer_noise, quietest, sound
+from sipe_bayes.inference.state import State
+from sipe_bayes.state_space import Chain
+from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, neighbours, restricted
+
+FloatArray = NDArray[np.float64]
+
+_TOLERANCE = 0.5  # nats that a step must promise
+_INNER, _ROUNDS = 3, 8  # steps between estimates of the noise, and estimates at most
+_SETTLED, _STILL = (
+    2.0,
+    0.1,
+)  # nats that a new noise gains, squared sds that a parameter has moved: below these it has settled
+_SDS = (1.0, 1.0)  # how long the differences are: by theta, by the states
+_LEAST, _MOST = (
+    (1e-4, 1e-6),
+    (0.1, 0.3),
+)  # the same in the unit cube, and in rad or m, and their rates, or as shares of the movement
+
+
+def start(search: Search, chain: Chain) -> State:
+    """The first state of a fit."""
+    chain.rollouts += chain.prepared
+    points = grown(search, chain) if search.initial is None else search.initial
+    return opening(chain, screened(search, chain) if points is None else points)
+
+
+def step(search: Search, chain: Chain, state: State) -> State:
+    """One linearisation and what follows from it: a step of the smoother, or a new noise and a step."""
+    chain.part = float(state["part"])
+    after = _followed(search, chain, state) if state["held"] else _smoothed(search, chain, state)
+    return {**after, "part": chain.part}
+
+
+def _followed(search: Search, chain: Chain, state: State) -> State:
+    """The states that the commands lead to, and a first guess of the noise about them."""
+    theta, states, prior = state["theta"], chain.predicted(state["theta"]), search.quadratic_prior
+    states = state["states"] if states is None else states
+    found = chain.linearise(theta, states)
+    if found is None:
+        return diverged(chain, state)
+    movement, fixed = chain.movement(states), chain.fixed_sd
+    noise = first_noise(chain, found, movement)
+    residual = np.sqrt((found.residual**2).sum(0) / found.observed.sum(0))
+    smaller = np.maximum(np.minimum(noise.sd, residual), chain.least[0])
+    noise = quietest(chain, found, replace(noise, sd=np.where(np.isnan(fixed), smaller, fixed)), prior, theta)
+    noise = sound(found, noise)
+    state = {**state, "held": False, "states": states, "sd": noise.sd, "process": noise.process, "movement": movement}
+    state = recorded(
+        search, state, found, noise, evidence_of(search, state, found, noise, settled=False), settled=False
+    )
+    return {**state, "round_theta": theta, **_steps(search, state, found, noise)}
+
+
+def _smoothed(search: Search, chain: Chain, state: State) -> State:
+    found = linearise(chain, state["theta"], state["states"], state["theta_step"], state["state_step"])
+    if found is None:
+        return diverged(chain, state)
+    noise, done = sound(found, ChainNoise(state["sd"], state["process"])), False
+    if state["inner"] >= _INNER:
+        noise, state, done = _estimated(search, chain, state, found, noise)
+    if done:
+        return onward(chain, state)
+    here = Point(state["theta"], state["states"], np.inf, state["damping"])
+    here, still = descend(chain, found, noise, search.quadratic_prior, here, _TOLERANCE)
+    state = {**state, "theta": here.theta, "states": here.states, "damping": here.damping}
+    state |= {"inner": _INNER if still else state["inner"] + 1, "iteration": state["iteration"] + 1}
+    return {**state, **_steps(search, state, found, noise)}
+
+
+def _estimated(
+    search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
+) -> tuple[ChainNoise, State, bool]:
+    """The noise estimated anew, the state with it and with what is worth recording, and whether the search ends."""
+    theta, prior, movement = state["theta"], search.quadratic_prior, state["movement"]
+    hold = border(prior, theta, eliminate(found, noise).gradient)
+    promised = restricted(found, noise, hold)[0] - restricted(found, noise, hold, held=True)[0]
+    better, gain = infer_noise(chain, found, noise, prior, theta, movement, held=promised > _TOLERANCE)
+    better = sound(found, better)
+    away = theta - state["round_theta"]
+    moved = float(away @ eliminate(found, better).precision @ away) / len(theta)
+    settled = bool(state["round"] > 0 and gain < _SETTLED and moved < _STILL)
+    best = state["mode_evidence"][state["mode_point"] == state["point"]].max(initial=-np.inf)
+    evidence = evidence_of(search, state, found, better, settled=False)
+    if evidence > best or state["round"] == 0:
+        state = recorded(search, state, found, better, evidence, settled)
+    if settled:
+        state = {**state, "mode_settled": state["mode_settled"] | (state["mode_point"] == state["point"])}
+    now = {"sd": better.sd, "process": better.process, "round": state["round"] + 1, "inner": 0, "round_theta": theta}
+    return better, {**state, **now}, settled or state["round"] + 1 >= _ROUNDS
+
+
+def _steps(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
+    """How long the next differences are, by theta (N,) and by the states (K, D)."""
+    solved = eliminate(found, noise)
+    spread = np.einsum("kdd->kd", neighbours(solved.factor, found.jump.shape[1])[0])
+    covariance = border(search.quadratic_prior, state["theta"], solved.gradient).solve(solved)[1]
+    by_theta, by_state = _SDS[0] * np.sqrt(np.diag(covariance)), _SDS[1] * np.sqrt(spread)
+    return {
+        "theta_step": np.clip(by_theta, _LEAST[0], _MOST[0]),
+        "state_step": np.clip(by_state, _LEAST[1], np.maximum(_MOST[1] * state["movement"], _LEAST[1])),
+    }
