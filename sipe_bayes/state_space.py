@@ -5,7 +5,8 @@
 with independent normal process noise w (a sd per state coordinate) and measurement noise v (a sd per channel), both
 inferred, and all states marginalised. f is the simulation of a whole control step; it is linearised by finite
 differences, all of them, of every sample and every log, in one batch (``Chain.linearise``); the algebra is in
-``sipe_bayes.tridiagonal``, the search in ``sipe_bayes.inference.smoother``. This is the weak-constraint formulation of
+``sipe_bayes.tridiagonal``, the searches in ``sipe_bayes.inference.state_space_search`` and, where the first states are known,
+``known_start_search``. This is the weak-constraint formulation of
 data assimilation (Y. Tremolet, "Accounting for an imperfect model in 4D-Var", 2006, https://doi.org/10.1256/qj.05.224)
 and the iterated Kalman smoother (B. M. Bell, "The iterated Kalman smoother as a Gauss-Newton method", 1994,
 https://doi.org/10.1137/0804035).

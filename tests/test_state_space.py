@@ -284,8 +284,10 @@ def test_no_budget_loses_what_was_found() -> None:
     assert found[-1][1] == 2
 
 
-def test_the_target_with_fresh_jacobians_is_the_kalman_filter() -> None:
-    """Refreshed: differences between thetas to 1e-6 nats. As mcmc has it: to 0.2 nats within two sds of the optimum."""
+@pytest.mark.parametrize("lengths", [0.0, 0.01])
+def test_the_target_with_fresh_jacobians_is_the_kalman_filter(lengths: float) -> None:
+    """Refreshed: differences between thetas to 1e-6 nats. As mcmc has it: to 0.2 nats within two sds of the optimum. The model is
+    linear, so longer differences change nothing."""
     chain, logs, firsts = spring_chain()
     noise, theta = MADE_WITH, np.array([0.35])
     found = chain.linearise(theta, chain.reference)
@@ -294,7 +296,14 @@ def test_the_target_with_fresh_jacobians_is_the_kalman_filter() -> None:
     states = chain.moved(chain.reference, solved.states(np.zeros(1)))
     state = {"fit_sd": noise.sd, "fit_process": noise.process, "fit_theta": theta, "fit_states": states}
     state |= {"fit_movement": PROCESS, "fit_loose": np.zeros(len(chain.linked), bool)}
-    state |= {"fit_slope": solved.slope, **at_optimum(chain, theta, states)}
+    mode = {
+        "theta": theta,
+        "states": states,
+        "theta_step": np.full(1, lengths),
+        "state_step": np.full((len(states), 2), lengths),
+    }
+    state |= {"fit_slope": solved.slope, **{f"fit_{name}": mode[name] for name in ("theta_step", "state_step")}}
+    state |= at_optimum(chain, mode)
     target = ChainTarget(sipe.get_estimator(spring(), "laplace").prior, chain, state)
     sd = solved.precision[0, 0] ** -0.5
     points = theta + sd * np.array([[-2.0], [-1.0], [0.0], [1.0], [2.0]])
@@ -393,9 +402,9 @@ def test_quaternions_stay_of_length_one() -> None:
     assert simulator.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_BALL
 
 
-@pytest.mark.parametrize(("starts", "steps"), [("estimated", 2), ("estimated", 9), ("recorded", 2)])
+@pytest.mark.parametrize(("starts", "steps"), [("estimated", 2), ("estimated", 9), ("recorded", 2), ("recorded", 4)])
 def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str, steps: int) -> None:
-    """After two steps, and while jumps are let go."""
+    """After two steps, while jumps are let go, and between estimates of the noise."""
     logs = kicked_logs() if starts == "estimated" else [hung_log(np.array([0.4]), 0), hung_log(np.array([0.4]), 1, 61)]
     simulator, likelihood = spring if starts == "estimated" else hung, StateSpace(starts=starts)
     undisturbed = Laplace(simulator(), likelihood=likelihood)
@@ -407,7 +416,7 @@ def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str, 
     with pytest.raises(KeyboardInterrupt):
         interrupted.fit(logs)
     loose = load_file(tmp_path / "fit.safetensors")["loose"]
-    assert loose.any() == (steps > 2)
+    assert loose.any() == (starts == "estimated" and steps > 2)
     interrupted.progress = None
     for other in (threads, interrupted.fit(logs)):
         assert torch.equal(plain.means, other.means)  # type: ignore[attr-defined]

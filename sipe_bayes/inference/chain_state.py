@@ -24,7 +24,7 @@ def opening(chain: Chain, points: FloatArray) -> State:
     n, (k, d), c = chain.num_theta, chain.prior_precision.shape, len(chain.channels)
     shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
     shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "movement": (d,), "loose": (k - 1,)}
-    shapes |= {"settled": (), "evidence": (), "point": ()}
+    shapes |= {"theta_step": (n,), "state_step": (k, d), "settled": (), "evidence": (), "point": ()}
     kinds = {"loose": bool, "settled": bool, "point": int}
     return {
         "done": False,
@@ -46,6 +46,8 @@ def begin(chain: Chain, theta: FloatArray) -> State:
         "process": np.ones(chain.num_start),
         "movement": np.ones(chain.num_start),
         "loose": np.zeros(len(chain.linked), bool),
+        "theta_step": np.zeros(chain.num_theta),  # of differences, zero: short ones
+        "state_step": np.zeros(chain.prior_precision.shape),
         "damping": 1e-4,
         "iteration": 0,
         "round": 0,
@@ -101,8 +103,8 @@ def recorded(
     mean, covariance = search.normal(theta, solved.precision, solved.gradient)
     here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
     here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "movement": state["movement"]}
-    here |= {"loose": state["loose"], "settled": np.array(settled), "evidence": np.array(evidence)}
-    here |= {"point": np.array(state["point"])}
+    here |= {name: state[name] for name in ("loose", "theta_step", "state_step")}
+    here |= {"settled": np.array(settled), "evidence": np.array(evidence), "point": np.array(state["point"])}
     others = state["mode_point"] != state["point"]
     return {**state, **{f"mode_{k}": np.concatenate([state[f"mode_{k}"][others], v[None]]) for k, v in here.items()}}
 

@@ -3,7 +3,7 @@
 What whole logs say of theta is sharp, but through contact so rough that a search from afar finds nothing: the trouble of every
 initial-value approach to chaotic systems (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear dynamical system identification from
 uncertain and indirect measurements", 2004, https://doi.org/10.1142/S0218127404010345). A few control steps are smooth in theta and
-say little; half as many more say a little more. Each beginning is fitted without process noise (``window_search``) from the
+say little; nearly half as many more say a little more. Each beginning is fitted without process noise (``window_search``) from the
 best of the last optimum and draws from its posterior, which spread where nothing is known yet.
 """
 

@@ -33,11 +33,8 @@ _SETTLED, _STILL = (
     2.0,
     0.1,
 )  # nats that a new noise gains, squared sds that a parameter has moved: below these it has settled
-_SDS = (1.0, 1.0)  # how long the differences are: by theta, by the states
-_LEAST, _MOST = (
-    (1e-4, 1e-6),
-    (0.1, 0.3),
-)  # the same in the unit cube, and in rad or m, and their rates, or as shares of the movement
+_THETA_STEP = (1e-4, 0.1)  # of the cube: a difference is as long as the sd, but within these
+_STATE_STEP = (1e-6, 0.3)  # rad or m, and their rates; share of the coordinate's movement in a control step
 
 
 def start(search: Search, chain: Chain) -> State:
@@ -97,11 +94,12 @@ def _estimated(
     theta, prior, movement = state["theta"], search.quadratic_prior, state["movement"]
     hold = border(prior, theta, eliminate(found, noise).gradient)
     promised = restricted(found, noise, hold)[0] - restricted(found, noise, hold, held=True)[0]
-    better, gain = infer_noise(chain, found, noise, prior, theta, movement, held=promised > _TOLERANCE)
+    better, _ = infer_noise(chain, found, noise, prior, theta, movement, held=promised > _TOLERANCE)
     better = sound(found, better)
     away = theta - state["round_theta"]
     moved = float(away @ eliminate(found, better).precision @ away) / len(theta)
-    settled = bool(state["round"] > 0 and gain < _SETTLED and moved < _STILL)
+    changed = float(np.abs(np.log(better.process / noise.process)).mean())
+    settled = bool(state["round"] > 0 and changed < _SETTLED and moved < _STILL)
     best = state["mode_evidence"][state["mode_point"] == state["point"]].max(initial=-np.inf)
     evidence = evidence_of(search, state, found, better, settled=False)
     if evidence > best or state["round"] == 0:
@@ -116,9 +114,9 @@ def _steps(search: Search, state: State, found: ChainLinearisation, noise: Chain
     """How long the next differences are, by theta (N,) and by the states (K, D)."""
     solved = eliminate(found, noise)
     spread = np.einsum("kdd->kd", neighbours(solved.factor, found.jump.shape[1])[0])
-    covariance = border(search.quadratic_prior, state["theta"], solved.gradient).solve(solved)[1]
-    by_theta, by_state = _SDS[0] * np.sqrt(np.diag(covariance)), _SDS[1] * np.sqrt(spread)
+    _, covariance = search.normal(state["theta"], solved.precision, solved.gradient)
+    longest = np.maximum(_STATE_STEP[1] * state["movement"], _STATE_STEP[0])
     return {
-        "theta_step": np.clip(by_theta, _LEAST[0], _MOST[0]),
-        "state_step": np.clip(by_state, _LEAST[1], np.maximum(_MOST[1] * state["movement"], _LEAST[1])),
+        "theta_step": np.clip(np.sqrt(np.diag(covariance)), *_THETA_STEP),
+        "state_step": np.clip(np.sqrt(spread), _STATE_STEP[0], longest),
     }

@@ -161,9 +161,9 @@ class MCMC(Estimator):
 
     def _on_states(self, chain: Chain, mode: State) -> tuple[State, FloatArray]:
         """The same of a chain of states, whose noise is not free."""
-        names = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose")
+        names = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step")
         picked = {f"fit_{k}": mode[k] for k in names}
-        return {**picked, **at_optimum(chain, mode["theta"], mode["states"])}, np.empty((0, 0))
+        return {**picked, **at_optimum(chain, mode)}, np.empty((0, 0))
 
     def _target(self, windows: Windows | Chain, state: State) -> Any:
         """log p(theta, noise | y) of walkers, of either likelihood."""
@@ -287,10 +287,10 @@ class MCMC(Estimator):
                 "raise the budget before you trust the intervals"
             )
         if mixing["linearisation_error"] > 0.5:
-            self.warn(
-                f"the windows' starts are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): "
-                "use shorter windows"
-            )
+            what, remedy = "windows' starts", "use shorter windows"
+            if isinstance(self.windows(trajectories), Chain):
+                what, remedy = "states", "hold the intervals against those of laplace"
+            self.warn(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
         flat = np.clip(theta.reshape(-1, n), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
 

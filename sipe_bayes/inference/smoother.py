@@ -1,4 +1,4 @@
-"""The search for theta, states and noise of ``StateSpace``: an iterated Kalman smoother with theta on its border.
+"""Steps of the search for theta, states and noise of ``StateSpace``: an iterated Kalman smoother with theta on its border.
 
 Given the noise, theta and all states minimise half the whitened squares of residuals and jumps plus the priors, by damped
 Gauss-Newton steps on the block-tridiagonal normal equations (``sipe_bayes.tridiagonal``), theta within the unit cube. Given
@@ -16,7 +16,8 @@ Where it still settles on a wrong side, a few jumps stand out and are let go (``
 
 It begins with states as measured, and theta by reweighted least squares of the jumps, weights of a Student t with four degrees of
 freedom: contacts amplify the noise of a measurement manyfold. Where some coordinate is not measured, it begins with the filter's states
-about those that the commands lead to.
+about those that the commands lead to. (Of all this, a search from known first states uses the steps and the noise only; it linearises
+over what is still open, ``inference.posterior_linearisation``.)
 
 Deviations: the noise is held at its optimum, the posterior of theta does not widen for it. A coordinate's process noise q
 has a prior q^0.5 exp(-q / movement), movement being how far the coordinate moves in a control step: the likelihood leaves the

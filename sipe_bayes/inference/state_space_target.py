@@ -15,6 +15,7 @@ import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.inference.posterior_linearisation import linearise
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.state_space import Chain
@@ -25,12 +26,21 @@ FloatArray = NDArray[np.float64]
 _STEPS = 2  # of the states, before a fresh linearisation is compared
 
 
-def at_optimum(chain: Chain, theta: FloatArray, states: FloatArray) -> State:
-    """The Jacobians that ``ChainTarget`` needs, under names of a fit's state."""
-    found = chain.linearise(theta, states)
+def at_optimum(chain: Chain, mode: State) -> State:
+    """The Jacobians that ``ChainTarget`` needs, taken as those of the optimum, under names of a fit's state."""
+    found = _linearised(chain, mode["theta"], mode["states"], mode["theta_step"], mode["state_step"])
     if found is None:
         raise ValueError("mcmc: the simulation diverges at the laplace fit; narrow the bounds")
     return {f"fit_{f.name}": getattr(found, f.name) for f in fields(found)}
+
+
+def _linearised(
+    chain: Chain, theta: FloatArray, states: FloatArray, theta_step: FloatArray, state_step: FloatArray
+) -> ChainLinearisation | None:
+    """By differences as long as the fit took them."""
+    if not state_step.any():
+        return chain.linearise(theta, states)
+    return linearise(chain, theta, states, theta_step, state_step)
 
 
 class ChainTarget:
@@ -79,7 +89,7 @@ class ChainTarget:
         states = self.states(point[None])[0]
         value = -np.inf
         for _ in range(_STEPS):
-            found = self.chain.linearise(point, states)
+            found = _linearised(self.chain, point, states, self.state["fit_theta_step"], self.state["fit_state_step"])
             if found is None:
                 return -np.inf
             solved = eliminate(found, self.sd)
