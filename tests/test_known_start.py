@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
+from sipe_bayes.inference import known_start_search
+from sipe_bayes.inference.growing_horizon import grown
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.parameters import Parameter
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.trajectory import Trajectories, Trajectory
 
 KNOWN = StateSpace(starts="recorded")
 
@@ -46,8 +48,8 @@ def bouncing_log(theta: np.ndarray, seed: int, steps: int = 100) -> Trajectory:
 
 def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
     """Of 20 intervals of 90 % for what bounces at least 14 hold the truth (right ones fail with probability 0.2 %, were they
-    independent); what nothing moves keeps its prior."""
-    rng, covered, errors = np.random.default_rng(4), 0, []
+    independent), and their squared z-scores average 3 at most (0.0001 %; with short differences 4); what nothing moves keeps its prior."""
+    rng, covered, errors, scores = np.random.default_rng(4), 0, [], []
     for seed in range(10):
         theta = rng.uniform(0.1, 0.9, 3)
         estimator = Laplace(bouncing(), likelihood=KNOWN, restarts=1, seed=seed)
@@ -55,17 +57,78 @@ def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
         low, high = posterior.quantile([0.05, 0.95]).numpy()
         covered += int(((low <= theta) & (theta <= high))[:2].sum())
         errors.append(np.abs(posterior.mean.numpy() - theta)[:2])
+        scores.append(errors[-1] / posterior.stddev.numpy()[:2])
         print(
             seed, theta.round(3), posterior.mean.numpy().round(3), posterior.stddev.numpy().round(4), estimator.warnings
         )
         assert float(posterior.stddev[2]) == pytest.approx(1 / np.sqrt(12), rel=0.02)
-    print("covered", covered, "of 20, median error", np.median(errors))
+    square = float(np.mean(np.square(scores)))
+    print("covered", covered, "of 20, median error", np.median(errors), "mean squared z", square)
     assert covered >= 14
     assert np.median(errors) < 0.02
+    assert square < 3
+
+
+def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray | None, Laplace]:
+    estimator = Laplace(bouncing(), likelihood=KNOWN, **settings)  # type: ignore[arg-type]
+    return grown(estimator, estimator.windows(Trajectories.stack(logs))), estimator
+
+
+def test_many_logs_and_late_samples_grow_as_well() -> None:
+    """A dozen logs, one of them alone, and one whose first samples are missing: each comes near the truth (the prior's mean is .37
+    and .12 off)."""
+    theta = np.array([0.87, 0.38, 0.5])
+    logs = [bouncing_log(theta, seed, 60) for seed in range(12)]
+    late = logs[0].observations.copy()
+    late[:13] = np.nan
+    for name, given in (("many", logs), ("one", logs[:1]), ("late", [replace(logs[0], observations=late)])):
+        points, estimator = grown_from(given, restarts=1)
+        assert points is not None
+        print(name, points, estimator.warnings)
+        assert np.abs(points[0] - theta)[:2].max() < 0.1
+
+
+def test_a_model_that_diverges_as_given_is_said_to() -> None:
+    theta = np.array([0.87, 0.38, 0.5])
+    estimator = Laplace(bouncing(), likelihood=KNOWN, restarts=1)
+    windows = estimator.windows(Trajectories.stack([bouncing_log(theta, 0, 30)]))
+    simulator, rollout = windows.simulator, windows.simulator.rollout
+
+    def broken(thetas, *rest, **more):  # type: ignore[no-untyped-def]
+        result = rollout(thetas, *rest, **more)
+        default = np.abs(np.atleast_2d(thetas) - simulator.space.default_theta).max(1) == 0
+        result.valid[default, 1:] = False
+        return result
+
+    simulator.rollout = broken
+    points = grown(estimator, windows)
+    assert points is not None
+    assert estimator.warnings == ["the model as given diverges on these logs; the search started elsewhere"]
+
+
+def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
+    """With every budget around the one at which the first estimate of the noise is done, nothing likelier is known than what is kept."""
+    log, start, seen = bouncing_log(np.array([0.4, 0.6, 0.5]), 5, 60), np.array([[0.5, 0.5, 0.5]]), []
+
+    def noted(*given):  # type: ignore[no-untyped-def]
+        found = known_start_search_estimated(*given)
+        seen.append((given[1].rollouts, float(found[1]["mode_evidence"].max())))
+        return found
+
+    known_start_search_estimated = known_start_search._estimated
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(known_start_search, "_estimated", noted)
+        Laplace(bouncing(), likelihood=KNOWN, initial=start).fit(log)
+        (first, evidence), *_ = seen
+        for budget in range(first, first + 4):
+            estimator = Laplace(bouncing(), likelihood=KNOWN, initial=start, budget=budget)
+            estimator.fit(log)
+            assert estimator._state is not None
+            assert estimator._state["mode_evidence"].max() >= evidence - 1e-9
 
 
 def test_mcmc_agrees_with_laplace() -> None:
-    """Means to half an sd and sds to half of each other, of what bounces, with the same Jacobians over wide differences."""
+    """Means to one sd and sds to a factor of 1.5, of what bounces, with the same Jacobians over wide differences."""
     theta = np.array([0.4, 0.6, 0.5])
     log = bouncing_log(theta, 5)
     fitted = {}
@@ -75,5 +138,5 @@ def test_mcmc_agrees_with_laplace() -> None:
         fitted[name] = (posterior.mean.numpy()[:2], posterior.stddev.numpy()[:2])
         print(name, *fitted[name], estimator.rollouts, estimator.warnings)
     (mean, sd), (other, other_sd) = fitted.values()
-    assert (np.abs(mean - other) < 0.5 * sd).all()
+    assert (np.abs(mean - other) < sd).all()
     assert (np.abs(np.log(other_sd / sd)) < np.log(1.5)).all()

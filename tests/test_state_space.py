@@ -184,6 +184,8 @@ def test_a_known_start_costs_two_fifths_of_the_budget_at_most() -> None:
         print(budget, points)
         assert points.shape[1] == 1
         assert chain.rollouts <= 0.4 * budget + 2
+        posterior = Laplace(hung(), likelihood=likelihood, budget=budget).fit(logs)
+        assert 0 < float(posterior.stddev[0]) < 0.35
     with pytest.raises(ValueError, match="budget"):
         Laplace(hung(), likelihood=likelihood, budget=2).fit(logs)
 

@@ -41,8 +41,9 @@ def logs(simulator: sipe.Simulator, count: int) -> tuple[Trajectories, Trajector
     """A recorded log and ``count`` held-out ones, the truths of those (count, N), and the noise's sd of each channel."""
     task = simulator.environment
     excited = task.name == TASKS[0]
-    behaviour = None if excited else behaviour_of(task, "expert")
-    behaviour = behaviour or acting.excitation(task, simulator.dt)
+    behaviour = acting.excitation(task, simulator.dt) if excited else behaviour_of(task, "expert")
+    if behaviour is None:
+        raise SystemExit(f"{task.name}: its expert is not installed")
     steps = STEPS.get(task.name, 100)
     recorded, _ = acting.simulate(simulator, task.theta("default"), behaviour, "reference", 1, 0, steps)
     spread = recorded.observations[0].std(0)

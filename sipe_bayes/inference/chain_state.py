@@ -55,7 +55,8 @@ def begin(chain: Chain, theta: FloatArray) -> State:
         "due": False,
         "refused": np.zeros(len(chain.linked), bool),
         "let_go": 0,
-        "held": True,  # states as measured
+        "held": True,  # the states as a first guess has them
+        "round_theta": theta,  # of the last estimate of the noise
     }
 
 
@@ -96,11 +97,21 @@ def evidence_of(search: Search, state: State, found: ChainLinearisation, noise: 
 
 
 def recorded(
-    search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, evidence: float, settled: bool
+    search: Search,
+    state: State,
+    found: ChainLinearisation,
+    noise: ChainNoise,
+    evidence: float,
+    settled: bool,
+    centred: bool = False,
 ) -> State:
-    """The optimum at its linearisation, in place of this starting point's earlier one."""
+    """The optimum at its linearisation, in place of this starting point's earlier one: the normal about the best step from here or,
+    centred, about where theta is, but for parameters pressed against a bound."""
     theta, solved = state["theta"], eliminate(found, noise)
     mean, covariance = search.normal(theta, solved.precision, solved.gradient)
+    if centred:
+        hold = border(search.quadratic_prior, theta, solved.gradient)
+        mean = theta + covariance @ np.where(hold.free, 0.0, solved.gradient + hold.pull)
     here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
     here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "movement": state["movement"]}
     here |= {name: state[name] for name in ("loose", "theta_step", "state_step")}

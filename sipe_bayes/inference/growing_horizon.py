@@ -26,27 +26,29 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_FIRST, _LONGER = 8, 1.45  # control steps of the first beginning; how much longer the next is
+_FIRST, _LONGER = 8, 1.45  # control steps of the first beginning at least; how much longer the next is
 _SHARE = 0.4  # of the budget in all
-_MOST = 600  # rollouts of one beginning
+_MOST, _GUESSING = 600, 0.3  # rollouts of one beginning of each log, and the share of them that guesses take at most
 _DRAWS, _FOLLOWED = 60, 2  # guesses for a beginning, and how many of them are followed
 
 
 def grown(search: Search, chain: Chain) -> FloatArray | None:
-    """Starting points (R, N); None where even the shortest beginnings diverge. What is said on the way is not of the fit."""
+    """Starting points (R, N), perhaps fewer than asked for; None where even the shortest beginnings diverge, or the budget is too small
+    for them. What is said on the way is not of the fit, but that the model as given diverges."""
     likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
     limit = chain.rollouts + _SHARE * (chain.budget - chain.rollouts)
     generator = torch.Generator().manual_seed(search.seed)
     points, posterior = search.space.default_theta[None], search.prior
     fitted = False
-    for steps in _horizons(int(chain.trajectories.length.max())):
+    for steps in _horizons(chain):
         logs = Trajectories.stack([t.slice(0, min(steps, len(t))) for t in chain.trajectories])
         share = float(logs.length.sum() / chain.trajectories.length.sum())
         windows = likelihood.bind(chain.simulator, logs)
-        windows.budget = min(_MOST, (limit - chain.rollouts) / share)
-        draws = np.concatenate([points, posterior.sample((_DRAWS,), generator=generator).numpy()])
+        windows.budget = min(_MOST * len(logs), (limit - chain.rollouts) / share)
+        draws = max(0, min(_DRAWS, int(_GUESSING * windows.budget / len(logs))))
+        guesses = np.concatenate([points, posterior.sample((draws,), generator=generator).numpy()])
         try:
-            found = _fitted(search, windows, draws)
+            found = _fitted(search, windows, guesses, first=not fitted)
         except BudgetExhausted:
             break
         finally:
@@ -62,19 +64,26 @@ def grown(search: Search, chain: Chain) -> FloatArray | None:
     return points if fitted else None
 
 
-def _horizons(longest: int) -> Iterator[int]:
-    steps = float(_FIRST)
+def _horizons(chain: Chain) -> Iterator[int]:
+    """Control steps of the beginnings: in the shortest one every fitted channel has a sample after its start."""
+    sampled = chain.observed & ~chain.first[:, None]
+    seen = [int(chain.sample[rows].min()) if rows.any() else 0 for rows in sampled.T]
+    longest = int(chain.trajectories.length.max())
+    steps = float(max(_FIRST, *seen))
     while steps < longest:
         yield round(steps)
         steps *= _LONGER
     yield longest
 
 
-def _fitted(search: Search, windows: Windows, guesses: FloatArray) -> State | None:
-    """The search's state where it or its budget ends; None where all guesses (B, N) diverge. Raises BudgetExhausted before any step."""
+def _fitted(search: Search, windows: Windows, guesses: FloatArray, first: bool) -> State | None:
+    """The search's state where it or its budget ends; None where all guesses (B, N) diverge. first: whether the first of them is the model
+    as given. Raises BudgetExhausted before any step."""
     residual, valid = windows.residuals(guesses, np.tile(windows.no_starts(), (len(guesses), 1, 1, 1)))
     if not valid.any():
         return None
+    if first and not valid[0]:
+        search.warn("the model as given diverges on these logs; the search started elsewhere")
     squares = np.maximum((residual**2).sum((1, 2)), 1e-300)
     order = np.argsort(np.where(valid, np.log(squares).sum(1), np.inf), kind="stable")
     quiet = _quiet(search)

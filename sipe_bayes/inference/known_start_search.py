@@ -5,8 +5,9 @@ The commands lead from there to states near the true ones once theta is roughly 
 smoother's transitions are linearised as widely as states and theta are still open (``posterior_linearisation``).
 
 Three Gauss-Newton steps and an estimate of the noise take turns. The estimate credits a step not yet taken only where next to nothing
-is left to gain: through contact a linearisation promises what the simulation does not keep. Of each starting point the likeliest of
-these estimates is kept, with states and theta where they are.
+is left to gain: through contact a linearisation promises what the simulation does not keep. It has settled where theta has hardly moved
+since the last one, and a new noise gains next to nothing. Of each starting point the estimate that has settled is kept, or the likeliest one if none
+has, or if it is far likelier. Its normal lies about the best step from there, which the slopes foretell better than the simulation grants.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from sipe_bayes.inference.optima import Search
 from sipe_bayes.inference.posterior_linearisation import linearise
 from sipe_bayes.inference.smoother import Point, border, descend, first_noise, infer_noise, quietest, sound
 from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.state_space import Chain
 from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, neighbours, restricted
 
@@ -29,10 +31,12 @@ FloatArray = NDArray[np.float64]
 
 _TOLERANCE = 0.5  # nats that a step must promise
 _INNER, _ROUNDS = 3, 8  # steps between estimates of the noise, and estimates at most
-_SETTLED, _STILL = (
+_SETTLED, _ROUGH, _STILL = (
     2.0,
+    0.01,
     0.1,
-)  # nats that a new noise gains, squared sds that a parameter has moved: below these it has settled
+)  # nats that a new noise gains, or a measurement, squared sds that a parameter has moved
+_AS_GOOD = 10.0  # nats
 _THETA_STEP = (1e-4, 0.1)  # of the cube: a difference is as long as the sd, but within these
 _STATE_STEP = (1e-6, 0.3)  # rad or m, and their rates; share of the coordinate's movement in a control step
 
@@ -65,23 +69,27 @@ def _followed(search: Search, chain: Chain, state: State) -> State:
     noise = quietest(chain, found, replace(noise, sd=np.where(np.isnan(fixed), smaller, fixed)), prior, theta)
     noise = sound(found, noise)
     state = {**state, "held": False, "states": states, "sd": noise.sd, "process": noise.process, "movement": movement}
-    state = recorded(
-        search, state, found, noise, evidence_of(search, state, found, noise, settled=False), settled=False
-    )
-    return {**state, "round_theta": theta, **_steps(search, state, found, noise)}
+    evidence = evidence_of(search, state, found, noise, settled=False)
+    state = recorded(search, state, found, noise, evidence, settled=False, centred=True)
+    return {**state, **_steps(search, state, found, noise)}
 
 
 def _smoothed(search: Search, chain: Chain, state: State) -> State:
     found = linearise(chain, state["theta"], state["states"], state["theta_step"], state["state_step"])
     if found is None:
         return diverged(chain, state)
-    noise, done = sound(found, ChainNoise(state["sd"], state["process"])), False
-    if state["inner"] >= _INNER:
+    noise, due = sound(found, ChainNoise(state["sd"], state["process"])), state["inner"] >= _INNER
+    if due:
         noise, state, done = _estimated(search, chain, state, found, noise)
-    if done:
-        return onward(chain, state)
+        if done:
+            return onward(chain, state)
     here = Point(state["theta"], state["states"], np.inf, state["damping"])
-    here, still = descend(chain, found, noise, search.quadratic_prior, here, _TOLERANCE)
+    try:
+        here, still = descend(chain, found, noise, search.quadratic_prior, here, _TOLERANCE)
+    except BudgetExhausted:
+        if not due:
+            raise
+        return state  # what was recorded is kept, and the next step ends the search
     state = {**state, "theta": here.theta, "states": here.states, "damping": here.damping}
     state |= {"inner": _INNER if still else state["inner"] + 1, "iteration": state["iteration"] + 1}
     return {**state, **_steps(search, state, found, noise)}
@@ -94,18 +102,16 @@ def _estimated(
     theta, prior, movement = state["theta"], search.quadratic_prior, state["movement"]
     hold = border(prior, theta, eliminate(found, noise).gradient)
     promised = restricted(found, noise, hold)[0] - restricted(found, noise, hold, held=True)[0]
-    better, _ = infer_noise(chain, found, noise, prior, theta, movement, held=promised > _TOLERANCE)
+    better, gain = infer_noise(chain, found, noise, prior, theta, movement, held=promised > _TOLERANCE)
     better = sound(found, better)
     away = theta - state["round_theta"]
     moved = float(away @ eliminate(found, better).precision @ away) / len(theta)
-    changed = float(np.abs(np.log(better.process / noise.process)).mean())
-    settled = bool(state["round"] > 0 and changed < _SETTLED and moved < _STILL)
+    enough = max(_SETTLED, _ROUGH * float(found.observed.sum()))
+    settled = bool(state["round"] > 0 and gain < enough and moved < _STILL)
     best = state["mode_evidence"][state["mode_point"] == state["point"]].max(initial=-np.inf)
     evidence = evidence_of(search, state, found, better, settled=False)
-    if evidence > best or state["round"] == 0:
+    if evidence > best - settled * _AS_GOOD or state["round"] == 0:
         state = recorded(search, state, found, better, evidence, settled)
-    if settled:
-        state = {**state, "mode_settled": state["mode_settled"] | (state["mode_point"] == state["point"])}
     now = {"sd": better.sd, "process": better.process, "round": state["round"] + 1, "inner": 0, "round_theta": theta}
     return better, {**state, **now}, settled or state["round"] + 1 >= _ROUNDS
 

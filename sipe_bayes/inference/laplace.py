@@ -52,8 +52,8 @@ _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 class Laplace(Estimator):
     """Mixture of truncated normals at the optima of the windowed likelihood; see the module's docstring.
 
-    restarts: starting points followed. candidates: points among which they are chosen: draws from the prior and, of 40 or more,
-    later ones around the best. initial (R, N): the starting points themselves instead.
+    restarts: starting points followed, at most. candidates: points among which they are chosen: draws from the prior and, of 40 or more,
+    later ones around the best; without effect where ``known_start_search`` finds them. initial (R, N): the starting points themselves instead.
     """
 
     name: ClassVar[str] = "laplace"
@@ -153,7 +153,8 @@ class Laplace(Estimator):
 
     def _cost(self, trajectories: Trajectories) -> int:
         windows = self.windows(trajectories)
-        return (windows.num_theta + windows.num_start + 2) * len(trajectories)
+        sides = 2 if self._how(windows) is known_start_search else 1
+        return (sides * (windows.num_theta + windows.num_start) + 2) * len(trajectories)
 
 
 def _inverse(precision: FloatArray) -> FloatArray:

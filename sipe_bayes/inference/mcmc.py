@@ -306,11 +306,11 @@ class MCMC(Estimator):
         """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""
         if not windows.num_start:
             return 0.0
-        cost = len(windows.trajectories) * (2 * windows.num_start + 3)
+        target = self._target(windows, state)
+        cost = len(windows.trajectories) * target.check_cost
         count = min(_CHECKED, int(_CHECKS_SHARE * self.budget) // cost)
         if count < 4 or windows.rollouts + count * cost > self.budget:
             return float("nan")
-        target = self._target(windows, state)
         points = walkers[np.linspace(0, len(walkers) - 1, count).astype(int)]
         return float(np.std([float(target(p[None])[0]) - target.refreshed(p) for p in points]))
 
@@ -383,6 +383,11 @@ class _Target:
         value = prior + self.marginal(residual, starts, sd, tau)
         out[inside] = np.where(valid & np.isfinite(value), value, -np.inf)
         return out
+
+    @property
+    def check_cost(self) -> int:
+        """Rollouts of a log to hold ``refreshed`` against the target."""
+        return 2 * self.windows.num_start + 3
 
     def refreshed(self, point: FloatArray) -> float:
         """The target at one point with the starts' Jacobian taken there, after one step of the starts."""

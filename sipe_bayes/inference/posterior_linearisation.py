@@ -7,9 +7,10 @@ opposite each other, the jump gets a variance for what no line can follow. Both 
 iterated posterior linearisation smoother (A. F. Garcia-Fernandez, L. Svensson, S. Sarkka, "Iterated posterior linearization
 smoother", IEEE Transactions on Automatic Control 62(4), 2017).
 
-Deviations: one coordinate at a time instead of sigma points along the covariance's axes, and expectations stay those at the mean. The
-variance is half the squared deviation of the line between both ends, summed over coordinates and theta: for a kink at the mean
-0.36 of it would be right, for a parabola 2.
+Deviations: one coordinate at a time instead of sigma points along the covariance's axes, a state's sd being that for a given theta, and
+expectations stay those at the mean. The variance is half the squared deviation of the line between both ends, summed over coordinates and
+theta: for a kink at the mean 0.36 of it would be right, for a parabola 2. What theta does to all jumps alike counts as independent
+from jump to jump. Measurements get no such variance.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def linearise(
     chain: Chain, theta: FloatArray, states: FloatArray, theta_step: FloatArray, state_step: FloatArray
 ) -> ChainLinearisation | None:
     """Everything at theta (N,), states (K, S), by steps (N,) and (K, D) to both sides, in one batch of 1 + 2 (N + D) control steps a
-    state; None where it diverged. A difference of which one side diverges counts as zero."""
+    state; None where it diverged. A difference of which one side diverges counts as zero, and as straight."""
     n, d = chain.num_theta, chain.num_start
     count = n + d
     thetas, lanes = np.tile(theta, (1 + 2 * count, 1)), np.tile(states, (1 + 2 * count, 1, 1))
@@ -51,9 +52,8 @@ def linearise(
     turned, back = chain.difference(ends[ahead], ends[0]), chain.difference(ends[behind], ends[0])
     linked = sound[:, :-1] & chain.linked[:, None]
     reached = np.where(linked, ((turned - back) / length)[:, :-1], 0.0)
-    bent = np.where(
-        linked, (share * turned + (1 - share) * back)[:, :-1], 0.0
-    )  # of the line between both ends from here
+    straight = (share * turned + (1 - share) * back)[:, :-1]  # from here to the line between both ends
+    bent = np.where(linked, straight, 0.0)
     seen, reached = np.moveaxis(seen, 0, -1), np.moveaxis(reached, 0, -1)
     return ChainLinearisation(
         **chain.compared(states, predicted[0], ends[0]),

@@ -84,6 +84,12 @@ class ChainTarget:
         solved = [replace(self.solved, explained=float(g)) for g in gains]
         return np.array([log_likelihood(one, self.sd, s) for one, s in zip(found, solved, strict=True)])
 
+    @property
+    def check_cost(self) -> int:
+        """Rollouts of a log to hold ``refreshed`` against the target."""
+        sides = 2 if self.state["fit_state_step"].any() else 1
+        return 1 + _STEPS * (1 + sides * (self.chain.num_theta + self.chain.num_start))
+
     def refreshed(self, point: FloatArray) -> float:
         """The target at one point (N,) with the Jacobians taken there, after steps of the states alone."""
         states = self.states(point[None])[0]
