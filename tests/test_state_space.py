@@ -9,12 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import sipe_bayes as sipe
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.inference.smoother import Point, descend, first_noise, infer_noise, sound
+from sipe_bayes.inference.state import CheckpointError, load_state, save_state
 from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.likelihood import START_SD
 from sipe_bayes.parameters import Parameter
@@ -424,6 +426,23 @@ def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str, 
         assert torch.equal(plain.means, other.means)  # type: ignore[attr-defined]
         assert torch.equal(plain.covariances, other.covariances)  # type: ignore[attr-defined]
     assert interrupted.rollouts == undisturbed.rollouts
+
+
+def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
+    """One that lacks what the search needs; it is neither a KeyError nor begun anew."""
+    path = tmp_path / "fit.safetensors"
+    estimator = Laplace(hung(), likelihood=StateSpace(starts="recorded"), checkpoint=path, progress=_stop_after(2))
+    estimator.checkpoint_seconds = 0.0
+    logs = [hung_log(np.array([0.4]), 0)]
+    with pytest.raises(KeyboardInterrupt):
+        estimator.fit(logs)
+    with safe_open(path, framework="numpy") as file:
+        fingerprint = file.metadata()["fingerprint"]
+    state = load_state(path, fingerprint)
+    del state["state_step"]
+    save_state(path, state, fingerprint)
+    with pytest.raises(CheckpointError, match=r"has no 'state_step', as one of another version.*delete it"):
+        Laplace(hung(), likelihood=StateSpace(starts="recorded"), checkpoint=path).fit(logs)
 
 
 def _stop_after(steps: int):  # type: ignore[no-untyped-def]

@@ -20,7 +20,7 @@ import torch
 from sipe_bayes.callable_simulator import CallableSimulator
 from sipe_bayes.checks import path, whole
 from sipe_bayes.demonstration import Given
-from sipe_bayes.inference.state import State, load_state, save_state
+from sipe_bayes.inference.state import CheckpointError, State, load_state, save_state
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Segments, Windows
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
@@ -172,7 +172,7 @@ class Estimator(ABC):
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)
             self._recall(state)
-        saved = time.monotonic()
+        saved, resumed = time.monotonic(), state is not None
         try:
             if state is None:
                 state = self._counted(self.start(batch), batch)
@@ -189,6 +189,12 @@ class Estimator(ABC):
             if state is None:
                 raise BudgetTooSmall(f"budget: {error}; raise it") from None
             self.warn(self._spent())
+        except KeyError as error:
+            if not resumed or error.args[0] in (state or {}):
+                raise
+            raise CheckpointError(
+                f"checkpoint {self.checkpoint}: has no {error}, as one of another version of sipe_bayes; delete it to start again"
+            ) from error
         self._state = state
         return self._finished(state, batch)
 
