@@ -4,7 +4,8 @@ What whole logs say of theta is sharp, but through contact so rough that a searc
 initial-value approach to chaotic systems (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear dynamical system identification from
 uncertain and indirect measurements", 2004, https://doi.org/10.1142/S0218127404010345). A few control steps are smooth in theta and
 say little; nearly half as many more say a little more. Each beginning is fitted without process noise (``window_search``) from the
-best of the last optimum and draws from its posterior, which spread where nothing is known yet.
+best of the last optimum and draws from its posterior, which spread where nothing is known yet. Where what comes of it leaves residuals
+far above the noise, the beginnings grow once more, in smaller steps.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.inference import window_search
 from sipe_bayes.inference.optima import Search, distinct_modes
+from sipe_bayes.inference.smoother import roughness
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Segments, Windows
 from sipe_bayes.state_space import Chain
@@ -26,7 +28,11 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_FIRST, _LONGER = 8, 1.45  # control steps of the first beginning at least; how much longer the next is
+_FIRST, _LONGER = (
+    8,
+    (1.45, 1.2),
+)  # control steps of the first beginning at least; how much longer the next is, at each attempt
+_FITS = 3.0  # noise sds: residuals below which no other attempt is made
 _SHARE = 0.4  # of the budget in all
 _MOST, _GUESSING = 600, 0.3  # rollouts of one beginning of each log, and the share of them that guesses take at most
 _DRAWS, _FOLLOWED = 60, 2  # guesses for a beginning, and how many of them are followed
@@ -35,12 +41,31 @@ _DRAWS, _FOLLOWED = 60, 2  # guesses for a beginning, and how many of them are f
 def grown(search: Search, chain: Chain) -> FloatArray | None:
     """Starting points (R, N), perhaps fewer than asked for; None where even the shortest beginnings diverge, or the budget is too small
     for them. What is said on the way is not of the fit, but that the model as given diverges."""
-    likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
     limit = chain.rollouts + _SHARE * (chain.budget - chain.rollouts)
     generator = torch.Generator().manual_seed(search.seed)
+    best, least = None, np.inf
+    for longer in _LONGER:
+        points = _attempt(search, chain, limit, longer, generator)
+        if points is None:
+            break
+        try:
+            left = _misfit(chain, points[0])
+        except BudgetExhausted:
+            left = np.inf
+        if best is None or left < least:
+            best, least = points, left
+        if least < _FITS:
+            break
+    return best
+
+
+def _attempt(
+    search: Search, chain: Chain, limit: float, longer: float, generator: torch.Generator
+) -> FloatArray | None:
+    likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
     points, posterior = search.space.default_theta[None], search.prior
     fitted = False
-    for steps in _horizons(chain):
+    for steps in _horizons(chain, longer):
         logs = Trajectories.stack([t.slice(0, min(steps, len(t))) for t in chain.trajectories])
         share = float(logs.length.sum() / chain.trajectories.length.sum())
         windows = likelihood.bind(chain.simulator, logs)
@@ -64,7 +89,18 @@ def grown(search: Search, chain: Chain) -> FloatArray | None:
     return points if fitted else None
 
 
-def _horizons(chain: Chain) -> Iterator[int]:
+def _misfit(chain: Chain, theta: FloatArray) -> float:
+    """The largest of the channels' residuals (root mean squares) where the commands lead, in sds of a channel's noise as its roughness
+    shows it at most; infinite where that diverges."""
+    states = chain.predicted(theta)
+    found = None if states is None else chain.compare(theta[None], states[None])[0]
+    if found is None:
+        return np.inf
+    size = np.sqrt((found.residual**2).sum(0) / found.observed.sum(0))
+    return float((size / np.maximum(roughness(chain), chain.least[0])).max())
+
+
+def _horizons(chain: Chain, longer: float) -> Iterator[int]:
     """Control steps of the beginnings: in the shortest one every fitted channel has a sample after its start."""
     sampled = chain.observed & ~chain.first[:, None]
     seen = [int(chain.sample[rows].min()) if rows.any() else 0 for rows in sampled.T]
@@ -72,7 +108,7 @@ def _horizons(chain: Chain) -> Iterator[int]:
     steps = float(max(_FIRST, *seen))
     while steps < longest:
         yield round(steps)
-        steps *= _LONGER
+        steps *= longer
     yield longest
 
 

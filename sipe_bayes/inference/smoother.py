@@ -195,7 +195,7 @@ def first_noise(chain: Chain, found: ChainLinearisation, movement: FloatArray) -
     least_sd, least_process = chain.least
     whole = chain.placed.all() and chain.settings.starts == "estimated"
     direct = np.array([np.inf if c is None or not whole else jumps[c] / 3 for c in chain.coordinates])
-    sd = np.where(np.isnan(fixed), np.maximum(np.minimum(_roughness(chain), direct), least_sd), fixed)
+    sd = np.where(np.isnan(fixed), np.maximum(np.minimum(roughness(chain), direct), least_sd), fixed)
     return ChainNoise(sd, np.maximum(jumps if whole else _FREE * movement, least_process))
 
 
@@ -214,7 +214,7 @@ def quietest(
     return max(tried, key=value)
 
 
-def _roughness(chain: Chain) -> FloatArray:
+def roughness(chain: Chain) -> FloatArray:
     """Robust sd (C,) of what third differences of each channel leave of a smooth motion; their spread where too few
     samples follow each other."""
     series = np.where(chain.observed, chain.measured, np.nan)
