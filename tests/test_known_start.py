@@ -48,7 +48,7 @@ def bouncing_log(theta: np.ndarray, seed: int, steps: int = 100) -> Trajectory:
 
 def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
     """Of 20 intervals of 90 % for what bounces at least 14 hold the truth (right ones fail with probability 0.2 %, were they
-    independent), and their squared z-scores average 3 at most (0.0001 %; with short differences 4); what nothing moves keeps its prior."""
+    independent), and their squared z-scores average 3 at most (0.0007 %; short differences have 4); what nothing moves keeps its prior."""
     rng, covered, errors, scores = np.random.default_rng(4), 0, [], []
     for seed in range(10):
         theta = rng.uniform(0.1, 0.9, 3)
@@ -111,11 +111,11 @@ def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
     log, start, seen = bouncing_log(np.array([0.4, 0.6, 0.5]), 5, 60), np.array([[0.5, 0.5, 0.5]]), []
 
     def noted(*given):  # type: ignore[no-untyped-def]
-        found = known_start_search_estimated(*given)
+        found = estimated(*given)
         seen.append((given[1].rollouts, float(found[1]["mode_evidence"].max())))
         return found
 
-    known_start_search_estimated = known_start_search._estimated
+    estimated = known_start_search._estimated
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(known_start_search, "_estimated", noted)
         Laplace(bouncing(), likelihood=KNOWN, initial=start).fit(log)

@@ -28,10 +28,8 @@ from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 
-_FIRST, _LONGER = (
-    8,
-    (1.45, 1.2),
-)  # control steps of the first beginning at least; how much longer the next is, at each attempt
+_FIRST = 8  # control steps of the first beginning at least
+_LONGER = (1.45, 1.2)  # how much longer the next is, at each attempt
 _FITS = 3.0  # noise sds: residuals below which no other attempt is made
 _SHARE = 0.4  # of the budget in all
 _MOST, _GUESSING = 600, 0.3  # rollouts of one beginning of each log, and the share of them that guesses take at most

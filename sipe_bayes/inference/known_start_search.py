@@ -31,11 +31,8 @@ FloatArray = NDArray[np.float64]
 
 _TOLERANCE = 0.5  # nats that a step must promise
 _INNER, _ROUNDS = 3, 8  # steps between estimates of the noise, and estimates at most
-_SETTLED, _ROUGH, _STILL = (
-    2.0,
-    0.01,
-    0.1,
-)  # nats that a new noise gains, or a measurement, squared sds that a parameter has moved
+_SETTLED, _ROUGH = 2.0, 0.01  # nats that a new noise gains, in all or for each measurement, below which it has settled
+_STILL = 0.1  # squared sds that a parameter has moved, below which it has
 _AS_GOOD = 10.0  # nats
 _THETA_STEP = (1e-4, 0.1)  # of the cube: a difference is as long as the sd, but within these
 _STATE_STEP = (1e-6, 0.3)  # rad or m, and their rates; share of the coordinate's movement in a control step
