@@ -103,15 +103,14 @@ def recorded(
     noise: ChainNoise,
     evidence: float,
     settled: bool,
-    centred: bool = False,
+    untried: bool = False,
 ) -> State:
-    """The optimum at its linearisation, in place of this starting point's earlier one: the normal about the best step from here or,
-    centred, about where theta is, but for parameters pressed against a bound."""
+    """The optimum at its linearisation, in place of this starting point's earlier one: the normal about the best step from here, and where
+    no step has been tried yet, also as wide as that step is long."""
     theta, solved = state["theta"], eliminate(found, noise)
     mean, covariance = search.normal(theta, solved.precision, solved.gradient)
-    if centred:
-        hold = border(search.quadratic_prior, theta, solved.gradient)
-        mean = theta + covariance @ np.where(hold.free, 0.0, solved.gradient + hold.pull)
+    if untried:
+        covariance = covariance + np.outer(mean - theta, mean - theta)
     here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
     here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "movement": state["movement"]}
     here |= {name: state[name] for name in ("loose", "theta_step", "state_step")}

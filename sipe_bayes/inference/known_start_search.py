@@ -7,7 +7,8 @@ smoother's transitions are linearised as widely as states and theta are still op
 Three Gauss-Newton steps and an estimate of the noise take turns. The estimate credits a step not yet taken only where next to nothing
 is left to gain: through contact a linearisation promises what the simulation does not keep. It has settled where theta has hardly moved
 since the last one, and a new noise gains next to nothing. Of each starting point the estimate that has settled is kept, or the likeliest one if none
-has, or if it is far likelier. Its normal lies about the best step from there, which the slopes foretell better than the simulation grants.
+has, or if it is far likelier. Its normal lies about the best step from there, which the slopes foretell better than the simulation grants. What a budget
+that ends before any step leaves is as wide as that step is long.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def _followed(search: Search, chain: Chain, state: State) -> State:
     noise = sound(found, noise)
     state = {**state, "held": False, "states": states, "sd": noise.sd, "process": noise.process, "movement": movement}
     evidence = evidence_of(search, state, found, noise, settled=False)
-    state = recorded(search, state, found, noise, evidence, settled=False, centred=True)
+    state = recorded(search, state, found, noise, evidence, settled=False, untried=True)
     return {**state, **_steps(search, state, found, noise)}
 
 
