@@ -28,24 +28,25 @@ def bars(found: Sequence[Row]) -> Figure:
     names = [n for n in in_order({row.name for row in found}) if n != TRUTH]
     figure = _figure(3.6 + 0.15 * (len(names) // 4), max(4.8, 1.6 + 0.17 * (len(names) + 1) * len(groups)))
     axes = figure.add_subplot()
-    width, drawn = 0.8 / max(1, len(names)), set[str]()
+    width, drawn = 0.8 / max(1, len(names)), dict[str, Any]()
     for row in found:
         if row.percent is None or row.name == TRUTH:
             continue
-        g, k, (height, interval) = groups.index(row.group), names.index(row.name), row.percent
-        at, look = g + (k - (len(names) - 1) / 2) * width, _look(row.name, names)
-        text = None if row.name in drawn else WORDS.get(row.name, row.name)
-        axes.bar(at, height, 0.9 * width, color=look.colour, hatch=look.hatch, edgecolor="white", lw=0, label=text)
-        drawn.add(row.name)
+        mine = [n for n in names if any(r.group == row.group and r.name == n and r.percent is not None for r in found)]
+        g, k, (height, interval) = groups.index(row.group), mine.index(row.name), row.percent
+        at, look = g + (k - (len(mine) - 1) / 2) * width, _look(row.name, names)
+        drawn[row.name] = axes.bar(
+            at, height, 0.9 * width, color=look.colour, hatch=look.hatch, edgecolor="white", lw=0
+        )
         if interval is not None:
             axes.errorbar(at, height, np.abs(np.array(interval) - height)[:, None], color=MEASURED, lw=1, capsize=1.5)
         if row.name == "prior":
             axes.hlines(height, g - 0.45, g + 0.45, color=PRIOR, ls=(0, (3, 2)), lw=1.2)
-    axes.axhline(100, color=MEASURED, lw=1.2, label=WORDS[TRUTH])
+    drawn[TRUTH] = axes.axhline(100, color=MEASURED, lw=1.2)
     axes.axhline(0, color=MEASURED, lw=0.6)
     axes.set_xticks(range(len(groups)), [f"{task}\n{variant.replace('_', ' ')}" for task, variant in groups])
     axes.set_ylabel("return in the target, % of the oracle\n(0: a random policy)")
-    figure.legend(loc="outside lower center", ncols=4, frameon=False)
+    _legend(figure, drawn, [TRUTH, *names])
     return figure
 
 
@@ -56,7 +57,7 @@ def curves(records: Sequence[TransferRecord]) -> Figure:
     groups = [
         (t, v) for t in order_tasks({r.task for r in done}) for v in sorted({r.variant for r in done if r.task == t})
     ]
-    names = [n for n in ordered(done) if n != TRUTH]
+    names, drawn = [n for n in ordered(done) if n != TRUTH], dict[str, Any]()
     across = min(2, len(groups))
     figure = _figure(0.6 + 2.8 * -(-len(groups) // across), 4.8 * across)
     for k, group in enumerate(groups):
@@ -64,21 +65,27 @@ def curves(records: Sequence[TransferRecord]) -> Figure:
         for name in [TRUTH, *names]:
             mine = [r.curve for r in done if (r.task, r.variant) == group and label(r) == name]
             if mine:
-                _curve(axes, mine, _look(name, names), WORDS.get(name, name))
+                drawn[name] = _curve(axes, mine, _look(name, names))
         axes.set_title(f"{group[0]}, {group[1].replace('_', ' ')}")
         axes.set_xlabel("control steps")
         axes.set_ylabel("return in the target")
-    lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
-    figure.legend(list(lines.values()), [str(x) for x in lines], loc="outside lower center", ncols=4, frameon=False)
+    _legend(figure, drawn, [TRUTH, *names])
     return figure
 
 
-def _curve(axes: Any, mine: Sequence[Sequence[dict[str, Any]]], look: _Look, text: str) -> None:
+def _legend(figure: Figure, drawn: dict[str, Any], names: Sequence[str]) -> None:
+    """What is drawn of the randomisations, in their order."""
+    there = [n for n in names if n in drawn]
+    words = [WORDS.get(n, n) for n in there]
+    figure.legend([drawn[n] for n in there], words, loc="outside lower center", ncols=4, frameon=False)
+
+
+def _curve(axes: Any, mine: Sequence[Sequence[dict[str, Any]]], look: _Look) -> Any:
     points = min(len(curve) for curve in mine)
     steps = [row["step"] for row in mine[0][:points]]
     earned = np.array([[row["target_return"] for row in curve[:points]] for curve in mine])
-    axes.plot(steps, earned.mean(0), color=look.colour, lw=1.4, ls=look.line, label=text)
     axes.fill_between(steps, earned.min(0), earned.max(0), color=look.colour, alpha=0.08, lw=0)
+    return axes.plot(steps, earned.mean(0), color=look.colour, lw=1.4, ls=look.line)[0]
 
 
 @dataclass(frozen=True)
