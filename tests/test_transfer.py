@@ -34,7 +34,7 @@ from sipe_bayes.benchmark.transfer import (
 )
 from sipe_bayes.benchmark.transfer_figures import bars, curves
 from sipe_bayes.benchmark.transfer_report import table
-from sipe_bayes.benchmark.transfer_rows import WORDS, contrasts, label, relative, rows
+from sipe_bayes.benchmark.transfer_rows import WORDS, contrasts, in_order, label, relative, rows
 from sipe_bayes.benchmark.transfer_run import load, summary
 from sipe_bayes.cli import app
 from sipe_bayes.envs.registry import TASKS, make_task
@@ -450,23 +450,15 @@ def test_the_studys_figures_tell_every_randomisation_apart() -> None:
     given = [replace(record(c.estimator, c.seed, 400.0 + 100 * c.seed + len(c.estimator), c.task), variant=c.variant, id=c.id, setting=c.id.split("/")[2])
              for c in select("study")]  # fmt: skip
     found = rows(given)
-    names = [n for n in dict.fromkeys(row.name for row in found) if n != "truth"]
+    names = [n for n in in_order({row.name for row in found}) if n != "truth"]
     assert len(names) == 12
-    drawn = {
-        **{
-            p.get_label(): p.patches[0].get_facecolor()[:3]
-            for p in bars(found).axes[0].containers
-            if hasattr(p, "patches") and not str(p.get_label()).startswith("_")
-        },
-    }
-    lines = {line.get_label(): to_rgb(line.get_color()) for axes in curves(given).axes for line in axes.get_lines()}
-    assert len(drawn) == 12
-    assert drawn == {name: lines[name] for name in drawn}
+    left, right = bars(found).legends[0], curves(given).legends[0]
+    said, again = ([text.get_text() for text in legend.get_texts()] for legend in (left, right))
+    assert said == again == ["truth (oracle)", *(WORDS.get(n, n) for n in names)]
+    filled = [patch.get_facecolor()[:3] for patch in left.legend_handles[1:]]
+    assert filled == [to_rgb(line.get_color()) for line in right.legend_handles[1:]]
     looks = [transfer_figures._look(name, names) for name in ["truth", *names]]
     assert len({(look.colour, look.line) for look in looks}) == len({(look.colour, look.hatch) for look in looks}) == 13
-    for figure in (bars(found), curves(given)):
-        said = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert sorted(said) == sorted({*(WORDS.get(n, n) for n in names), "truth (oracle)"})
 
 
 def test_the_example_runs(tmp_path: Path) -> None:
