@@ -5,8 +5,8 @@
     python examples/stable_baselines3_randomized.py 20000    # control steps: long enough to swing up
 
 The posterior is of a pendulum whose parameters are hidden. Every episode of the training runs under a draw of it, with up to one control
-step of delay on the torque and a little noise on what is seen; the agent is then tested where the log came from. CleanRL and RLlib take the same
-environment: hand them ``make_env``.
+step of delay on the torque and a little noise on what is seen; the agent is then tested where the log came from. Other code that makes its
+own environments calls ``make_env(posterior)`` in place of ``gymnasium.make``.
 """
 
 import sys

@@ -1,12 +1,14 @@
 """A Gymnasium wrapper that gives every episode parameters drawn from a posterior: domain randomisation for anyone's own training code.
 
-Stable-Baselines3, CleanRL and RLlib take it as any other environment; ``sipe_bayes.rl.randomization`` says what is drawn, and what
-happens to draws that no model can have.
+Code that takes Gymnasium's environments takes it (tested: Stable-Baselines3, and Gymnasium's vector environments, as CleanRL uses them; RLlib's
+``register_env(name, lambda config: ...)`` is not tried). ``sipe_bayes.rl.randomization`` says what is drawn, and what happens to draws
+that no model can have.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -29,7 +31,8 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
     env: of ``sipe.make`` or ``gymnasium.make("sipe/...")``, wrapped or not; any other one needs ``write(env, values)``, which gives it the
     values by name before each reset. ``reset(seed=...)`` seeds environment and draws, and the first reset without a seed takes a random
     one. ``info["theta"]`` (N,) is the episode's; ``redrawn`` counts draws that no model can have, ``diverged`` the simulations that did.
-    ``reset(options={"theta": ...})`` overrules the draw of one episode.
+    ``reset(options={"theta": ...})`` overrules the draw of one episode. Noise makes the observation space unbounded; it needs a flat
+    Box there, a delay flat and bounded actions.
 
     Raises ValueError, which names them, for a posterior over other parameters than the environment's."""
 
@@ -49,7 +52,8 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
             assert isinstance(simulator, Simulator)
             self._draws = Draws(simulator, self.randomization.posterior)
         self._generator = np.random.default_rng()
-        self._disturbances = self._disturbed() if self.randomization.disturbs else None
+        self._noisy = bool(np.any(np.asarray(self.randomization.observation_noise, float)))
+        self._disturbances: Any = self._disturbed() if self.randomization.disturbs else None
 
     @property
     def redrawn(self) -> int:
@@ -64,12 +68,16 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
                 self._disturbances.generator = np.random.default_rng([seed, 2])
         options = dict(options or {})
         given = options.get("theta")
-        theta = self._drawn() if given is None else np.asarray(given, float)
+        space = self.randomization.posterior.space
+        theta = self._drawn() if given is None else np.array(space.check_shape(given))
         if self._write is None:
             options["theta"] = theta
         else:
             options.pop("theta", None)
-            space = self.randomization.posterior.space
+            if not ((theta >= 0) & (theta <= 1)).all() and not options.pop("allow_outside", False):
+                raise ValueError(
+                    f'theta: expected numbers in [0, 1], got {theta.tolist()}; options={{"allow_outside": True}} takes others'
+                )
             self._write(self.env, dict(zip(space.names, space.values(theta).tolist(), strict=True)))
         observation, info = self.env.reset(seed=seed, options=options or None)
         self._theta = theta.copy()
@@ -78,7 +86,7 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
         return self._seen(observation), {**info, "theta": theta.copy()}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, Any, bool, bool, dict[str, Any]]:
-        if self._disturbances is not None:
+        if self.randomization.action_delay:
             action = self._disturbances.delayed(np.asarray(action, float)[None], np.zeros(1, bool))[0]
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.diverged += info.get("valid", True) is False
@@ -93,20 +101,30 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
         return np.asarray(self.randomization.posterior.sample(generator=generator).numpy())
 
     def _seen(self, observation: FloatArray) -> FloatArray:
-        return observation if self._disturbances is None else self._disturbances.noisy(np.asarray(observation)[None])[0]
+        if not self._noisy:
+            return observation
+        noisy = self._disturbances.noisy(np.asarray(observation, float)[None])[0]
+        return np.asarray(noisy, self.observation_space.dtype)
 
     def _disturbed(self) -> Any:
         observations, actions = self.env.observation_space, self.env.action_space
-        for name, space in (("observation_space", observations), ("action_space", actions)):
-            if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-                raise ValueError(f"env: noise and delay need a flat Box as its {name}, got {space}")
-        assert isinstance(actions, gymnasium.spaces.Box)
-        assert observations.shape is not None
-        low, high = np.asarray(actions.low, float), np.asarray(actions.high, float)
-        if not (np.isfinite(low) & np.isfinite(high)).all():
-            raise ValueError(
-                "env: noise and delay need bounds on the actions, got infinite ones; clip the actions first"
-            )
-        middle = (low + high) / 2
-        goal_size = int(getattr(getattr(self.env.unwrapped, "task", None), "goal_size", 0))
-        return self.randomization.disturbances(1, observations.shape[0], goal_size, middle, self._generator)
+        channels, goal_size, middle = 0, 0, np.zeros(0)
+        if self._noisy:
+            channels = _flat(observations, "noise needs a flat Box as its observation_space").shape[0]
+            goal_size = int(getattr(getattr(self.env.unwrapped, "task", None), "goal_size", 0))
+            unbounded: Any = gymnasium.spaces.Box(-np.inf, np.inf, (channels,), observations.dtype)  # type: ignore[arg-type]
+            self.observation_space = unbounded
+        if self.randomization.action_delay:
+            box = _flat(actions, "a delay needs a flat Box as its action_space")
+            low, high = np.asarray(box.low, float), np.asarray(box.high, float)
+            if not (np.isfinite(low) & np.isfinite(high)).all():
+                raise ValueError("env: a delay needs bounds on the actions, got infinite ones; clip the actions first")
+            middle = (low + high) / 2
+        noise = self.randomization if self._noisy else replace(self.randomization, observation_noise=0.0)
+        return noise.disturbances(1, channels, goal_size, middle, self._generator)
+
+
+def _flat(space: gymnasium.Space[Any], needed: str) -> gymnasium.spaces.Box:
+    if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+        raise ValueError(f"env: {needed}, got {space}")
+    return space

@@ -282,6 +282,13 @@ def test_wider_has_the_spread_it_says() -> None:
     np.testing.assert_allclose(narrow.wider(1).stddev, narrow.stddev, rtol=0.04)
 
 
+@pytest.mark.parametrize("sd", [2e-9, 1e-6])
+def test_wider_takes_very_narrow_posteriors(sd: float) -> None:
+    """As narrow as a transfer's ``--wider`` still widens."""
+    points = 0.5 + sd * np.random.default_rng(0).standard_normal((2000, len(SPACE)))
+    np.testing.assert_allclose(Particles(points, SPACE).wider(2).stddev.numpy(), 2 * points.std(0), rtol=0.1)
+
+
 def test_wider_stays_in_the_cube_without_piling_up_on_its_faces() -> None:
     wide = normal().wider(20)
     assert isinstance(wide, Particles)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import runpy
 from pathlib import Path
 from typing import Any
@@ -113,8 +114,88 @@ def test_a_delay_needs_bounded_actions() -> None:
     env = gymnasium.wrappers.TransformAction(
         sipe.make("Pendulum"), lambda a: a, gymnasium.spaces.Box(-np.inf, np.inf, (1,))
     )
-    with pytest.raises(ValueError, match="noise and delay need bounds"):
+    with pytest.raises(ValueError, match="a delay needs bounds"):
         randomized(sipe.Randomization(prior(SPACE), action_delay=1), env)
+
+
+def swing(noise: float = 0.0, delay: int = 0, name: str = "Pendulum-v1") -> sipe.RandomizedEnv:
+    """Of Gymnasium's own environments."""
+    under = sipe.Randomization(prior(SPACE), noise, delay)
+    return sipe.RandomizedEnv(gymnasium.make(name), under, write=_set_mass)
+
+
+def _set_mass(env: Any, values: dict[str, float]) -> None:
+    env.unwrapped.m = values["mass"]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_own_environments_keep_to_their_spaces() -> None:
+    """Observations of 32 bits within bounds, which noise does away with."""
+    for noise, delay in ((0.0, 0), (0.5, 0), (0.0, 2), (0.5, 2)):
+        env = swing(noise, delay)
+        check_env(env, skip_render_check=True)
+        seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(50))]
+        assert all(one in env.observation_space for one in seen)
+        assert np.isfinite(env.observation_space.high).all() == (noise == 0)  # type: ignore[attr-defined]
+
+
+def test_noise_asks_nothing_of_the_actions_nor_a_delay_of_the_observations() -> None:
+    env = swing(0.1, name="CartPole-v1")
+    env.reset(seed=0)
+    assert env.step(1)[0] in env.observation_space  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"a delay needs a flat Box as its action_space, got Discrete\(2\)"):
+        swing(0.0, 1, "CartPole-v1")
+    with pytest.raises(ValueError, match="noise needs a flat Box as its observation_space"):
+        sipe.RandomizedEnv(_Counted(), sipe.Randomization(prior(SPACE), 0.1), write=_set_mass)
+    late = sipe.RandomizedEnv(_Counted(), sipe.Randomization(prior(SPACE), 0.0, 1), write=_set_mass)
+    assert late.reset(seed=0)[0] == 0
+
+
+class _Counted(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
+    """An observation that is no Box."""
+
+    def __init__(self) -> None:
+        super().__init__(gymnasium.make("Pendulum-v1"))
+        self.observation_space = gymnasium.spaces.Discrete(1)
+
+    def observation(self, observation: Any) -> int:
+        return 0
+
+
+def test_a_given_theta_is_checked_for_own_environments() -> None:
+    env = swing()
+    with pytest.raises(ValueError, match=r"theta: expected numbers in \[0, 1\], got \[2\.0, 0\.5, 0\.5\]"):
+        env.reset(options={"theta": [2.0, 0.5, 0.5]})
+    with pytest.raises(ValueError, match="expected 3 parameters on the last axis"):
+        env.reset(options={"theta": [0.5]})
+    env.reset(options={"theta": [2.0, 0.5, 0.5], "allow_outside": True})
+    mass = SPACE[0]
+    assert env.unwrapped.m == pytest.approx(mass.low + 2 * (mass.high - mass.low))  # type: ignore[attr-defined]
+
+
+def test_vector_environments_take_it_as_cleanrl_does() -> None:
+    """Lanes of one seed each, episode statistics, and a copy draw the same."""
+
+    def make(seed: int) -> Any:
+        env = gymnasium.wrappers.RecordEpisodeStatistics(randomized())
+        env.action_space.seed(seed)
+        return env
+
+    lanes = gymnasium.vector.SyncVectorEnv([lambda k=k: make(k) for k in range(3)])
+    _, info = lanes.reset(seed=5)
+    assert len(np.unique(info["theta"], axis=0)) == 3
+    for k in range(3):
+        np.testing.assert_array_equal(info["theta"][k], randomized().reset(seed=5 + k)[1]["theta"])
+    for _ in range(200):
+        *_, truncated, info = lanes.step(lanes.action_space.sample())
+        if truncated.any():
+            break
+    assert (info["episode"]["l"] == 200).all()
+    copied = copy.deepcopy(swing(0.1, 1))  # by the protocol of pickle, which processes of vector environments use
+    seen, told = copied.reset(seed=3)
+    same, info = swing(0.1, 1).reset(seed=3)
+    np.testing.assert_array_equal(seen, same)
+    np.testing.assert_array_equal(told["theta"], info["theta"])
 
 
 def test_diverging_simulations_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,9 +16,9 @@ is kept which earns most in episodes of its own randomisation, ten theta of it, 
 looked at for it, but that the oracle's own randomisation is the target. The curve in the target is made afterwards. Where two cells ask for
 the same training, as the prior does on both variants, it is made once, so that their results are not independent.
 
-Variations of a randomisation, the truth's excepted: ``wider`` (``Posterior.wider``), ``observation_noise`` and ``action_delay``; and, to
-tell what of a posterior it is that helps, ``point`` ("mean": its mean alone) and ``particles`` (so many of its draws). The study has both
-of one estimator whose posteriors are wide.
+Variations of a randomisation, the truth's excepted: ``observation_noise`` and ``action_delay``; and of an estimator's ``wider``
+(``Posterior.wider``) and, to tell what of a posterior it is that helps, ``point`` ("mean": its mean alone) and ``particles`` (so many of its
+draws). The study has both of one estimator whose posteriors are wide.
 
 Deviations. The paper trains on the default model's variants, which it does not name; here the target is the default or the
 in-distribution variant, whose theta no prior mean guesses. It has neither the prior nor the default model in its figure. The agents are
@@ -62,7 +62,8 @@ _DEMONSTRATED = ("FetchPush", "FetchPickAndPlace")
 _SMALL = ("Pendulum", "CartPole")
 _STUDY = ("HalfCheetahLinks", "HalfCheetahJoints", "FetchPush")
 _REDUCED = "bayessim"  # also by its mean, and by
-_REDUCING, _DISTURBING = {"point", "particles"}, {"observation_noise", "action_delay"}  # variations
+_REDUCING = {"point", "particles"}  # variations
+DISTURBING = {"observation_noise", "action_delay"}  # variations that leave the parameters alone
 _FEW = 10  # particles
 _SMALL_AGENT: dict[str, Any] = {
     "hidden": (64, 64),
@@ -182,7 +183,7 @@ def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
 
 
 def varied(chosen: Sequence[Cell], **variations: float | str | None) -> list[Cell]:
-    """The cells with variations of their randomisation, each once. The truth has none, and what is a point already only noise and delay."""
+    """The cells with variations of their randomisation, each once. The truth has none, default model and prior only noise and delay."""
     given = {name: value for name, value in variations.items() if value is not None}
     return list(dict.fromkeys(replace(cell, values=_values(cell, given)) for cell in chosen))
 
@@ -190,8 +191,8 @@ def varied(chosen: Sequence[Cell], **variations: float | str | None) -> list[Cel
 def _values(cell: Cell, given: dict[str, Any]) -> tuple[tuple[str, Any], ...]:
     if cell.estimator == TRUTH:
         return ()
-    if cell.estimator == DEFAULT:
-        given = {name: value for name, value in given.items() if name in _DISTURBING}
+    if cell.estimator in REFERENCES:
+        given = {name: value for name, value in given.items() if name in DISTURBING}
     before = dict(cell.values)
     if _REDUCING & given.keys():
         before = {name: value for name, value in before.items() if name not in _REDUCING}

@@ -22,15 +22,19 @@ _COLOURS = {"truth": MEASURED, "prior": PRIOR, "default": DEFAULT}
 
 @_styled
 def bars(found: Sequence[Row]) -> Figure:
-    """The paper's Figure 6: a group of bars for each task and variant, the oracle as the line at 100 %, the uniform prior as a dashed line
-    in each group. A bar without a whisker has one seed."""
+    """The paper's Figure 6: a group of bars for each task and variant, the oracle as the line at 100 % and its seeds
+    as a shade, the uniform prior as a dashed line in each group. A bar without a whisker has one seed."""
     groups = list(dict.fromkeys(row.group for row in found if row.percent is not None))
     names = [n for n in in_order({row.name for row in found}) if n != TRUTH]
     figure = _figure(3.6 + 0.15 * (len(names) // 4), max(4.8, 1.6 + 0.17 * (len(names) + 1) * len(groups)))
     axes = figure.add_subplot()
     width, drawn = 0.8 / max(1, len(names)), dict[str, Any]()
     for row in found:
-        if row.percent is None or row.name == TRUTH:
+        if row.percent is None:
+            continue
+        if row.name == TRUTH:
+            g, seeds = groups.index(row.group), list(row.by_seed.values())
+            axes.fill_between([g - 0.45, g + 0.45], min(seeds), max(seeds), color=MEASURED, alpha=0.12, lw=0)
             continue
         mine = [n for n in names if any(r.group == row.group and r.name == n and r.percent is not None for r in found)]
         g, k, (height, interval) = groups.index(row.group), mine.index(row.name), row.percent
@@ -44,6 +48,8 @@ def bars(found: Sequence[Row]) -> Figure:
             axes.hlines(height, g - 0.45, g + 0.45, color=PRIOR, ls=(0, (3, 2)), lw=1.2)
     drawn[TRUTH] = axes.axhline(100, color=MEASURED, lw=1.2)
     axes.axhline(0, color=MEASURED, lw=0.6)
+    if not groups:
+        axes.text(0.5, 50, "no target has an oracle to compare with", ha="center")
     axes.set_xticks(range(len(groups)), [f"{task}\n{variant.replace('_', ' ')}" for task, variant in groups])
     axes.set_ylabel("return in the target, % of the oracle\n(0: a random policy)")
     _legend(figure, drawn, [TRUTH, *names])

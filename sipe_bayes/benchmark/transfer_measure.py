@@ -36,6 +36,7 @@ from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.simulator import Simulator
 
 _ROUNDING = 1e-6  # in theta, of the values that a record keeps
+_DIGITS = 12  # of a mean, whose last ones depend on the number of threads
 _TARGET_SEED = 4_000_000  # of the target's episodes: other ones than those that a policy is kept by
 
 
@@ -75,7 +76,7 @@ def randomization(cell: Cell, folder: Path) -> Randomization:
     else:
         posterior = _estimated(cell, folder, task.space)
     if "point" in values:
-        posterior = Dirac(posterior.mean, task.space)
+        posterior = Dirac(posterior.mean.round(decimals=_DIGITS), task.space)
     if "particles" in values:
         drawn = posterior.sample((int(values["particles"]),), generator=torch.Generator().manual_seed(cell.seed))
         posterior = Particles(drawn, task.space)

@@ -4,60 +4,122 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sipe_bayes.atomic import write_bytes, write_text
-from sipe_bayes.benchmark.tables import against
-from sipe_bayes.benchmark.transfer import TransferRecord
+from sipe_bayes.benchmark.tables import LEVEL, against
+from sipe_bayes.benchmark.transfer import TRUTH, TransferRecord
 from sipe_bayes.benchmark.transfer_figures import bars, curves
-from sipe_bayes.benchmark.transfer_rows import WORDS, Percent, Row, contrasts, label, rows
-from sipe_bayes.benchmark.transfer_run import load
+from sipe_bayes.benchmark.transfer_rows import WORDS, Percent, Row, Target, by_quality, contrasts, label, rows
+from sipe_bayes.benchmark.transfer_run import believed, load, qualities, stale
 from sipe_bayes.diagnostics.drawing import png
 
 _EXPLAINED = """Every agent trains with the same settings, steps and seed, and acts in the target as it is. ± is the standard error over seeds. The
 percentage is 100 (R - Z) / (O - Z), R the return, O that of the oracle, Z of a policy that acts at random; the paper's is 100 R / O, left out
-where returns may be negative. In brackets the 95 % bootstrap interval over seeds, which with three seeds ends at the best and the worst one.
-Spread is the mean sd of what was drawn from, in theta (the prior's is 0.29); where it is 0.00 the posterior was as good as a point. Where the
-same training serves two targets, as the prior's does, their rows are not independent."""
+where an oracle earns hardly more than 0. The oracle is an agent like the others, no upper bound: its own training has its luck, which every
+percentage shares. In brackets the 95 % bootstrap interval over seeds. With three seeds it ends at the best and the worst one and covers less than it says.
+Spread is the mean sd of what was drawn from, in theta (the prior's is 0.29); where it is 0.00 the posterior was as good as a point. CRPS is how far
+what was drawn from is from the truth, in theta, 0 the truth itself. Where the same training serves two targets, as the prior's does, their
+rows are not independent."""
 
 
-def table(found: Sequence[Row], records: Sequence[TransferRecord]) -> str:
-    """Markdown."""
+def table(found: Sequence[Row], records: Sequence[TransferRecord], remarks: Sequence[str] = ()) -> str:
+    """Markdown. remarks: what else a reader must know."""
     said = ["# Sim2sim transfer", "", _EXPLAINED, ""]
+    for remark in [*remarks, *_same_targets(records)]:
+        said += [f"**Mind**: {remark}.", ""]
     for group in dict.fromkeys(row.group for row in found):
-        of = [r for r in records if r.done and (r.task, r.variant) == group]
+        of, mine = (
+            [r for r in records if r.done and (r.task, r.variant) == group],
+            [r for r in found if r.group == group],
+        )
         steps = sorted({r.training for r in of})
         said += [
-            f"## {group[0]}, target: {group[1].replace('_', ' ')}",
+            f"## {_words(group)}",
             "",
             f"{', '.join(f'{n:,}' for n in steps)} control steps of training; {of[0].evaluation['episodes']} episodes in the target; "
-            f"a random policy earns {np.mean([r.random['mean'] for r in of]):.1f} there.",
+            f"a random policy earns {np.mean([r.random['mean'] for r in of]):.1f} there. {_no_percentage(mine)}".strip(),
             "",
-            "| trained under | spread | seeds | return in the target | % of the oracle (random = 0) | % of the oracle (paper) | success | solve it | redrawn | diverged | s a training |",
-            "|---|---|---|---|---|---|---|---|---|---|---|",
+            "| trained under | spread | CRPS | seeds | return in the target | % of the oracle (random = 0) | % of the oracle (paper) | success | solve it | redrawn | diverged | s a training |",
+            "|---|---|---|---|---|---|---|---|---|---|---|---|",
         ]
-        said += [_line(row) for row in found if row.group == group] + [""]
+        said += [_line(row) for row in mine] + [""]
+    return "\n".join([*said, *_compared(found), *_correlated(by_quality(found))])
+
+
+def _words(target: Target) -> str:
+    return f"{target[0]}, target: {target[1].replace('_', ' ')}"
+
+
+def _no_percentage(mine: Sequence[Row]) -> str:
+    """Why a target has no percentages, empty where it has."""
+    if any(row.percent is not None for row in mine):
+        return ""
+    if not any(row.name == TRUTH for row in mine):
+        return f"No percentages, for the oracle is lacking: run also `--select {mine[0].task}/{TRUTH}`."
+    return "No percentages, for an oracle fails: it earns less than a tenth of what they earn on average above random."
+
+
+def _same_targets(records: Sequence[TransferRecord]) -> list[str]:
+    """Targets that are the same model, which their oracles' returns show."""
+    oracles: dict[Target, list[tuple[int, float]]] = {}
+    for r in sorted((r for r in records if r.done and r.estimator == TRUTH), key=lambda r: r.seed):
+        oracles.setdefault((r.task, r.variant), []).append((r.seed, r.evaluation["mean"]))
+    return [
+        f"{_words(one)}, and {_words(other)}, are the same model, with the same oracles"
+        for one, other in itertools.combinations(oracles, 2)
+        if oracles[one] == oracles[other]
+    ]
+
+
+def _compared(found: Sequence[Row]) -> list[str]:
     compared = contrasts(found)
-    if compared:
-        said += [
-            "## What a randomisation is worth",
-            "",
-            "Differences in % of the oracle, seed by seed, means over the targets that have both; outside noise by a t-test over seeds at 5 %.",
-            "",
-            "| trained under | against | targets | difference | outside noise |",
-            "|---|---|---|---|---|",
-        ]
-        said += [_contrast(*row) for row in compared] + [""]
-    return "\n".join(said)
+    if not compared:
+        return []
+    targets = [g for g in dict.fromkeys(row.group for row in found) if any(g in c.by_target for c in compared)]
+    seeds = sorted({len(c.gains) for c in compared})
+    tests = sum(len(c.by_target) + (len(c.by_target) > 1) for c in compared)
+    head = [*("trained under", "against", "mean of its targets"), *(_words(t).replace(" target:", "") for t in targets)]
+    lines = [
+        "## What a randomisation is worth",
+        "",
+        f"Differences in % of the oracle, seed by seed ({' or '.join(map(str, seeds))} of them). better, worse: outside noise by a t-test over seeds at "
+        f"5 %; the other differences are not told apart from none, which with few seeds says little. The {tests} tests are not corrected for their "
+        f"number: chance alone would call {LEVEL * tests:.1f} of them better or worse.",
+        "",
+        f"| {' | '.join(head)} |",
+        "|---" * len(head) + "|",
+    ]
+    for c in compared:
+        entries = [WORDS.get(c.name, c.name), WORDS.get(c.other, c.other), _told(c.gains)]
+        entries += [_told(c.by_target[t]) if t in c.by_target else "" for t in targets]
+        lines.append(f"| {' | '.join(entries)} |")
+    return [*lines, ""]
 
 
-def _contrast(name: str, other: str, gains: list[float], targets: int) -> str:
-    verdict = {1: "better", -1: "worse", 0: "no"}[against(gains, 0.0)]
-    words = [WORDS.get(name, name), WORDS.get(other, other), str(targets), _spread(gains), verdict]
-    return f"| {' | '.join(words)} |"
+def _told(gains: list[float]) -> str:
+    return _spread(gains) + {1: " better", -1: " worse", 0: ""}[against(gains, 0.0)]
+
+
+def _correlated(found: tuple[dict[Target, float], float] | None) -> list[str]:
+    if found is None:
+        return []
+    by_target, p = found
+    return [
+        "## Does a better posterior train a better policy?",
+        "",
+        "Spearman's rank correlation of the percentage with minus the CRPS, over a target's rows without noise and delay: 1 where the better posterior "
+        "always earns more, 0 where it makes no difference.",
+        "",
+        *("| target | rank correlation |", "|---|---|"),
+        *(f"| {_words(target).replace(' target:', '')} | {value:.2f} |" for target, value in by_target.items()),
+        f"| mean (p = {p:.2g}, by permutations within the targets) | {np.mean(list(by_target.values())):.2f} |",
+        "",
+    ]
 
 
 def _spread(values: Sequence[float], digits: int = 1) -> str:
@@ -71,6 +133,7 @@ def _line(row: Row) -> str:
         *(
             WORDS.get(row.name, row.name),
             f"{row.spread:.2f}",
+            "" if row.crps is None else f"{row.crps:.3f}",
             str(len(row.returns)),
             _spread(list(row.returns.values())),
         ),
@@ -96,8 +159,16 @@ def write(folder: Path, into: Path | None = None) -> list[Path]:
     records, target = load(folder), folder / TransferRecord.FOLDER if into is None else into
     if not any(r.done for r in records):
         raise RecordError(f"{folder}: every cell of the transfer failed; `sipe transfer status {folder}` shows why")
-    found = rows(records)
-    text = {"transfer.md": table(found, records), "transfer.csv": _csv(records)}
+    drawn_from = believed(records, folder)
+    crps, remarks = (
+        qualities(records, drawn_from),
+        [f"{cell} is stale, {why}" for cell, why in stale(drawn_from).items()],
+    )
+    versions = {r.checksums.get("source", "") for r in records if r.done}
+    if len(versions) > 1:
+        remarks.append(f"these trainings were made with {len(versions)} versions of the code, which the records name")
+    found = rows(records, crps)
+    text = {"transfer.md": table(found, records, remarks), "transfer.csv": _csv(records, crps)}
     drawn = {"bars.png": png(bars(found)), "curves.png": png(curves(records))}
     for name, content in text.items():
         write_text(target / name, content)
@@ -106,7 +177,7 @@ def write(folder: Path, into: Path | None = None) -> list[Path]:
     return [target / name for name in (*text, *drawn)]
 
 
-def _csv(records: Sequence[TransferRecord]) -> str:
+def _csv(records: Sequence[TransferRecord], crps: Mapping[str, float]) -> str:
     """A row for each record; percent: of the mean oracle of the same target, random being zero."""
     percent = {(*row.group, row.name, seed): value for row in rows(records) for seed, value in row.by_seed.items()}
     text = io.StringIO()
@@ -116,6 +187,7 @@ def _csv(records: Sequence[TransferRecord]) -> str:
         "status",
         "training",
         "spread",
+        "crps",
         "return",
         "return_sd",
         "percent_of_oracle",
@@ -129,6 +201,19 @@ def _csv(records: Sequence[TransferRecord]) -> str:
         spread = float(np.mean(r.sd)) if r.sd else ""
         rates = [r.evaluation.get("success_rate", ""), r.random.get("mean", "")]
         writer.writerow(
-            [r.id, r.status, r.training, spread, *earned, of_oracle, *rates, r.kept, r.redrawn, r.diverged, r.seconds]
+            [
+                r.id,
+                r.status,
+                r.training,
+                spread,
+                crps.get(r.id, ""),
+                *earned,
+                of_oracle,
+                *rates,
+                r.kept,
+                r.redrawn,
+                r.diverged,
+                r.seconds,
+            ]
         )
     return text.getvalue()

@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sipe_bayes.benchmark import run as runs
 from sipe_bayes.benchmark import transfer_measure
 from sipe_bayes.benchmark.cells import Cell
@@ -17,6 +19,10 @@ from sipe_bayes.benchmark.records import plan, posterior_path, record_path
 from sipe_bayes.benchmark.status import headline
 from sipe_bayes.benchmark.transfer import TransferRecord, cell_of, estimate_of, trained_as
 from sipe_bayes.benchmark.work import Executor, Unit
+from sipe_bayes.diagnostics.scores import crps
+from sipe_bayes.posterior import Posterior
+
+_ROUNDING = 1e-9  # in theta
 
 
 def run(
@@ -60,21 +66,36 @@ def load(folder: Path) -> list[TransferRecord]:
     return TransferRecord.all_in(folder)
 
 
-def stale(records: Sequence[TransferRecord], folder: Path) -> dict[str, str]:
-    """Agents that were trained under another posterior than their estimate's record has now, as far as that is there, and why."""
-    found = {}
+def believed(records: Sequence[TransferRecord], folder: Path) -> dict[str, Posterior | str]:
+    """What each finished agent's episodes drew from, by record, as far as its estimate is there; or why that is another one now."""
+    found: dict[str, Posterior | str] = {}
     for record in (r for r in records if r.done):
         cell = cell_of(record)
         estimate = estimate_of(cell)
-        there = estimate is not None and (record_path(folder, estimate.id), posterior_path(folder, estimate.id))
-        if not there or not all(path.is_file() for path in there):
+        paths = [] if estimate is None else [record_path(folder, estimate.id), posterior_path(folder, estimate.id)]
+        if not all(path.is_file() for path in paths):
             continue
         try:
-            if transfer_measure.randomization(cell, folder).fingerprint != record.checksums["randomization"]:
-                found[record.id] = "its estimate was measured anew"
+            posterior = transfer_measure.randomization(cell, folder).posterior
         except ValueError as error:
             found[record.id] = str(error)
+            continue
+        now, then = [posterior.mean.numpy(), posterior.stddev.numpy()], [record.mean, record.sd]
+        found[record.id] = (
+            posterior if np.allclose(now, then, rtol=0, atol=_ROUNDING) else "its estimate was measured anew"
+        )
     return found
+
+
+def stale(found: dict[str, Posterior | str]) -> dict[str, str]:
+    """Agents that were trained under another posterior than their estimate's record has now, and why."""
+    return {cell: why for cell, why in found.items() if isinstance(why, str)}
+
+
+def qualities(records: Sequence[TransferRecord], found: dict[str, Posterior | str]) -> dict[str, float]:
+    """Mean CRPS, in theta, of what each agent's episodes drew from, by record."""
+    there = ((r, found.get(r.id)) for r in records)
+    return {r.id: float(crps(drawn, np.array(r.truth)).mean()) for r, drawn in there if isinstance(drawn, Posterior)}
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -85,7 +106,7 @@ def summary(folder: Path) -> dict[str, Any]:
     returns = {r.id: r.evaluation["mean"] for r in done}
     return {
         **found,
-        "stale": stale(records, folder),
+        "stale": stale(believed(records, folder)),
         "returns": returns,
         "training_seconds": sum(seconds.values()),
     }

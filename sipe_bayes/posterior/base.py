@@ -23,6 +23,7 @@ from sipe_bayes.posterior.storage import write_pair
 REFERENCE_DRAWS = 20_000
 MARGINAL_DRAWS = 8_000
 _ROUNDING = 1e-6
+_POINT = 1e-12  # range of draws below which they are one point
 
 
 class NoDensityError(RuntimeError):
@@ -269,7 +270,7 @@ class Posterior(TorchDistribution):
         factor = at_least("factor", factor, 1.0)
         with torch.no_grad():
             draws = self._sample(MARGINAL_DRAWS, Generator().manual_seed(0))
-        if float(np.ptp(draws.numpy(), axis=0).max()) < _ROUNDING:
+        if float(np.ptp(draws.numpy(), axis=0).max()) < _POINT:
             raise ValueError("wider: expected a posterior with spread, got a point; take .smoothed(bandwidth)")
         centre = draws.mean(0)
         return Particles(1 - (1 - (centre + factor * (draws - centre)) % 2).abs(), self.space)
