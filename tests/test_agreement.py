@@ -62,6 +62,68 @@ def test_cochrans_q_against_a_plain_reference() -> None:
     assert 8 <= alarmed <= 33  # 20 expected at the 1 % level, sd 4.5
 
 
+def agreeing(informations: list[np.ndarray], rng: np.random.Generator, shift: float = 0.0) -> list[LogEstimate]:
+    """Exact estimates of logs that agree, but for the first one's a, which is ``shift`` off; what a log does not determine is anywhere."""
+    found = []
+    for k, information in enumerate(informations):
+        eigenvalues, axes = np.linalg.eigh(information)
+        away = np.where(eigenvalues > 0, rng.standard_normal(2) / np.sqrt(np.maximum(eigenvalues, 1e-300)), 3.0)
+        found.append(LogEstimate(str(k), np.array([0.5 + shift * (k == 0), 0.5]) + axes @ away, information))
+    return found
+
+
+TURNED = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+
+
+@pytest.mark.parametrize(
+    "informations",
+    [
+        [np.diag([1e4, 5.0])] * 2,
+        [np.diag([1e4, 11.0])] * 5,
+        [np.diag([1e4, 1e3]), np.diag([1e4, 0.0]), np.diag([0.0, 1e3])],
+        [TURNED @ np.diag([1e4, 11.0]) @ TURNED.T, np.diag([1e4, 11.0]), np.diag([1e4, 1e4])],
+        [np.diag([1e4, 0.0]), TURNED @ np.diag([1e4, 0.0]) @ TURNED.T, np.diag([1e4, 0.0])],
+    ],
+)
+def test_logs_of_different_ranks_that_agree_raise_no_more_alarms_than_stated(informations: list[np.ndarray]) -> None:
+    """Of 2,000 at the 1 % level: more than 33 have a probability of 0.3 %."""
+    space, rng = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(3)
+    alarms = [disagreement(space, agreeing(informations, rng)) is not None for _ in range(2000)]
+    print(sum(alarms))
+    assert sum(alarms) <= 33
+
+
+def test_a_parameter_that_few_logs_determine_is_named_alone() -> None:
+    """a differs between the two logs that determine it; b, which three more determine as well, is the same."""
+    space, rng, single = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(4), 0
+    informations = [np.diag([1e4, 1e4])] * 2 + [np.diag([0.0, 1e4])] * 3
+    for _ in range(300):
+        found = disagreement(space, agreeing(informations, rng, shift=0.2))
+        assert found is not None
+        assert found.parameter == "a"
+        assert [log for log, _, _ in found.per_log] == ["0", "1"]
+        single += "no single parameter" not in found.text("")
+    assert single >= 290  # 297 expected at the 1 % level, sd 1.7
+
+
+def test_the_odd_log_is_named() -> None:
+    """One of four differs: without it the others agree, at the 1 % level. Where two pairs differ nobody is odd."""
+    space, rng = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(5)
+    informations = [np.diag([1e4, 1e3])] * 4
+    named = [
+        found.odd for _ in range(200) if (found := disagreement(space, agreeing(informations, rng, 0.2))) is not None
+    ]
+    assert len(named) == 200
+    assert named.count("0") >= 192  # 198 expected, sd 1.4
+    pairs = [LogEstimate(str(k), np.array([0.4 + 0.2 * (k % 2), 0.5]), np.diag([1e4, 1e3])) for k in range(4)]
+    found = disagreement(space, pairs)
+    assert found is not None
+    assert found.odd is None
+    odd = disagreement(space, agreeing(informations, rng, 0.2))
+    assert odd is not None
+    assert "; without 0 the others agree (p = " in odd.text("")
+
+
 def test_the_most_economical_parameter_is_named() -> None:
     """Both marginals shift when a alone differs and b is free to follow; a is the one that explains it."""
     space = ParameterSpace([Parameter("a", unit="kg"), Parameter("b")])

@@ -1,10 +1,12 @@
 """Do the logs agree? Each is fitted by itself; estimates that differ by more than their uncertainty are an alarm.
 
-With m_k and L_k the optimum and information of log k (starts and its own nuisance parameters marginalised) and mu the
-combined estimate, Q = sum_k (m_k - mu)' L_k (m_k - mu) is chi-square with (K - 1) x (determined directions) degrees of
-freedom when the logs agree (Cochran's test). The parameter named is the one whose freedom to differ between logs lowers
-Q most: the most economical explanation, not merely the largest shift. Where even that leaves the logs in disagreement, the
-text says that no single parameter explains it.
+With m_k the optimum of log k and L_k its information (starts and its own nuisance parameters marginalised, directions of which it says less
+than a uniform prior left out), Q is the least of sum_k (m_k - mu)' L_k (m_k - mu) over a common mu: chi-square, when the logs agree,
+with as many degrees of freedom as the logs determine directions, each by itself, less those that they determine together (Cochran's
+test). Along directions that even together they leave open mu keeps within the cube, which makes Q smaller than that at most. The
+parameter named is the one whose freedom to differ between logs lowers Q most: the most economical explanation, not merely the largest
+shift. Where even that leaves the logs in disagreement, the text says that no single parameter explains it. And each log is left out in
+turn: where the others agree without one, that one is named.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
 import scipy.stats
 from numpy.typing import NDArray
 
@@ -28,6 +31,7 @@ FloatArray = NDArray[np.float64]
 LEVEL = 0.01  # false alarms where logs agree
 _BUDGET = 5000  # rollouts for each log
 _DETERMINED = 12.0  # information of a uniform prior: directions with less are not tested
+_KNOWN = 0.5 / np.sqrt(12)  # sd in theta: half of the prior's
 
 
 @dataclass(frozen=True)
@@ -41,25 +45,29 @@ class LogEstimate:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """p: of Cochran's Q under agreement; parameter: its most economical explanation; p_left: the same with that parameter
-    free in every log; per_log: (log, value, sd) in the parameter's unit."""
+    """p: of Cochran's Q under agreement; parameter: its most economical explanation; p_left: the same with that parameter free in every
+    log; per_log: (log, value, sd) in the parameter's unit, of logs that determine it; odd: the log without which the others agree best, and
+    p_without: how well, where they do at the same level."""
 
     p: float
     parameter: str
     p_left: float
     per_log: tuple[tuple[str, float, float], ...]
+    odd: str | None = None
+    p_without: float = 0.0
 
     def text(self, unit: str) -> str:
         """In words."""
         parts = ", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log)
+        without = "" if self.odd is None else f"; without {self.odd} the others agree (p = {self.p_without:.1g})"
         if self.p_left < LEVEL:
             return (
                 f"the logs disagree (p = {self.p:.1g}) and no single parameter explains it: the model lacks something that "
-                f"differs between them; {self.parameter} explains most ({parts} {unit})"
+                f"differs between them; {self.parameter} explains most ({parts} {unit}){without}"
             )
         return (
             f"the logs disagree about {self.parameter} (p = {self.p:.1g}): {parts} {unit}; "
-            "give it per_log = true, model what changed, or leave a log out"
+            f"give it per_log = true, model what changed, or leave a log out{without}"
         )
 
 
@@ -91,27 +99,23 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
     shared = [j for j, p in enumerate(space) if p.log is None]
     if len(logs) < 2 or not shared:
         return None
-    means = [log.mean[shared] for log in logs]
-    informations = [_marginal(log.information, shared) for log in logs]
-    q, _ = _scatter(means, informations, None)
-    total = sum(informations)
-    directions = [int((np.linalg.eigvalsh(i) > _DETERMINED).sum()) for i in [*informations, total]]
-    freedom = sum(directions[:-1]) - directions[-1]
-    if freedom < 1:
+    roots = [_root(_marginal(log.information, shared)) for log in logs]
+    sought = [root @ log.mean[shared] for root, log in zip(roots, logs, strict=True)]
+    together = _scatter(roots, sought)
+    if together.freedom < 1 or together.p > LEVEL:
         return None
-    p = float(scipy.stats.chi2.sf(q, freedom))
-    if p > LEVEL:
-        return None
-    gains = [q - _scatter(means, informations, j)[0] for j in range(len(shared))]
-    worst = int(np.argmax(gains))
-    left, values = _scatter(means, informations, worst)
-    p_left = float(scipy.stats.chi2.sf(left, max(1, freedom - len(logs) + 1)))
-    parameter = space[shared[worst]]
-    per_log = []
-    for log, (theta, sd) in zip(logs, values, strict=True):
-        slope = float(parameter.value(theta + 1e-6) - parameter.value(theta - 1e-6)) / 2e-6
-        per_log.append((log.name, float(parameter.value(theta)), sd * slope))
-    return Disagreement(p, parameter.name, p_left, tuple(per_log))
+    apart = [_scatter(roots, sought, own=j) for j in range(len(shared))]
+    worst = int(np.argmin([found.q for found in apart]))
+    parameter, per_log = space[shared[worst]], []
+    for log, theta, sd in zip(logs, *apart[worst].own, strict=True):
+        if sd < _KNOWN:
+            slope = float(parameter.value(theta + 1e-6) - parameter.value(theta - 1e-6)) / 2e-6
+            per_log.append((log.name, float(parameter.value(theta)), float(sd) * slope))
+    left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
+    best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
+    agree = left_out[best].freedom > 0 and left_out[best].p > LEVEL
+    odd = (logs[best].name, left_out[best].p) if agree else (None, 0.0)
+    return Disagreement(together.p, parameter.name, apart[worst].p, tuple(per_log), *odd)
 
 
 def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
@@ -125,28 +129,45 @@ def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
     return block - cross @ np.linalg.solve(information[np.ix_(other, other)] + ridge, cross.T)
 
 
-def _scatter(
-    means: list[FloatArray], informations: list[FloatArray], own: int | None
-) -> tuple[float, list[tuple[float, float]]]:
-    """Smallest Q with all parameters common but ``own``, and (estimate, sd) of ``own`` in each log."""
-    n, k = len(means[0]), len(means)
+def _root(information: FloatArray) -> FloatArray:
+    """Rows r (R, N) with r' r the information in the R directions of which it says more than a uniform prior."""
+    eigenvalues, axes = np.linalg.eigh(information)
+    told = eigenvalues > _DETERMINED
+    return np.asarray(np.sqrt(eigenvalues[told])[:, None] * axes[:, told].T)
+
+
+@dataclass(frozen=True)
+class _Scatter:
+    """Q, its degrees of freedom, and estimates (K,) and sds (K,) of what each log has by itself."""
+
+    q: float
+    freedom: int
+    own: tuple[FloatArray, FloatArray]
+
+    @property
+    def p(self) -> float:
+        """1 where there is nothing to compare."""
+        return float(scipy.stats.chi2.sf(self.q, self.freedom)) if self.freedom > 0 else 1.0
+
+
+def _scatter(roots: list[FloatArray], sought: list[FloatArray], own: int | None = None) -> _Scatter:
+    """With all parameters common, but ``own``."""
+    n, k = roots[0].shape[1], len(roots)
     common = [j for j in range(n) if j != own]
-    size = len(common) + (k if own is not None else 0)
-    matrix, right, square = 1e-9 * np.eye(size), np.zeros(size), 0.0
-    for i, (mean, information) in enumerate(zip(means, informations, strict=True)):
-        design = np.zeros((n, size))
-        design[common, np.arange(len(common))] = 1.0
+    mine = k if own is not None else 0
+    rows = np.zeros((sum(map(len, roots)), len(common) + mine))
+    at = 0
+    for i, root in enumerate(roots):
+        rows[at : at + len(root), : len(common)] = root[:, common]
         if own is not None:
-            design[own, len(common) + i] = 1.0
-        matrix += design.T @ information @ design
-        right += design.T @ information @ mean
-        square += float(mean @ information @ mean)
-    covariance = np.linalg.inv(matrix)
-    solution = covariance @ right
-    q = square - float(right @ solution)
-    if own is None:
-        return q, []
-    return q, [
-        (float(solution[len(common) + i]), float(np.sqrt(covariance[len(common) + i, len(common) + i])))
-        for i in range(k)
-    ]
+            rows[at : at + len(root), len(common) + i] = root[:, own]
+        at += len(root)
+    target = np.concatenate(sought)
+    eigenvalues, axes = np.linalg.eigh(rows.T @ rows)
+    weak = eigenvalues <= _DETERMINED
+    low = np.where(weak, np.minimum(axes, 0).sum(0), -np.inf)
+    high = np.where(weak, np.maximum(axes, 0).sum(0), np.inf)
+    solution = axes @ scipy.optimize.lsq_linear(rows @ axes, target, (low, high), tol=1e-12).x
+    sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + _DETERMINED * np.eye(rows.shape[1]))))
+    q = float(((rows @ solution - target) ** 2).sum())
+    return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], sd[len(common) :]))
