@@ -31,6 +31,7 @@ from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, Progress
+from sipe_bayes.inference.least_squares import QuadraticPrior
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.logs import LogReport, load_log
@@ -320,7 +321,8 @@ def _residuals(
         return None, []
     starts = best_starts(fitted, theta, noise)
     try:
-        found = misfit(fitted, theta, noise, starts=starts, sd=sd, seed=method.seed)
+        prior = QuadraticPrior.of(problem.prior)
+        found = misfit(fitted, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed)
     except ValueError as error:  # LinAlgError is one
         method.warn(f"whether the residuals are noise is unknown: {error}")
         found = None

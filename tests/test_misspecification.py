@@ -11,14 +11,17 @@ import pytest
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misspecification import Misfit, _Residuals, misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.least_squares import QuadraticPrior
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.noise import Moments, Noise
 from sipe_bayes.parameters import Parameter
-from sipe_bayes.posterior import prior
+from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.replicas import Replicas
+from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
-from tests.pendulums import log, pendulum
+from tests.pendulums import XML, log, pendulum
 
 FRICTION = Parameter("coulomb", 0.0, 0.1, targets=("joint:hinge.frictionloss",))
 DELAY = Parameter("delay", 0.0, 0.06, targets=("actuator:motor.delay",))
@@ -98,7 +101,8 @@ def residuals(rho: float) -> _Residuals:
     windows = Segments(0.5).bind(simulator, logs)
     theta = simulator.space.normalise(np.array([0.6, 0.08]))
     noise = Noise(np.array([0.01]), np.array([0.0 if rho == 0 else -0.01 / np.log(rho)]))
-    return _Residuals(windows, theta, noise, best_starts(windows, theta, noise))
+    flat = QuadraticPrior(theta, np.zeros((2, 2)))
+    return _Residuals(windows, theta, noise, best_starts(windows, theta, noise), flat)
 
 
 def test_products_formed_together_are_those_formed_one_by_one() -> None:
@@ -139,6 +143,43 @@ def test_replicas_in_one_batch_are_those_one_by_one() -> None:
         assert single is not None
         assert other is not None
         np.testing.assert_array_equal(single.observations, other.observations)
+
+
+def of_mass_and_damping(recorded: Trajectory, high: float = 1.0, believed: float | None = None) -> Misfit:
+    """Of a fit with white noise whose mass may be ``high`` at most, or is believed to be a share of its range."""
+    parameters = [
+        Parameter("rod_mass", 0.3, high, targets=("body:rod.mass",), default=None),
+        Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",)),
+    ]
+    environment = MjcfEnvironment.build(
+        XML.replace('mass="0.6"', 'mass="0.45"'), parameters, ["motor"], ["joint:hinge.position"]
+    )
+    simulator = Simulator(environment, num_threads=1)
+    belief = None
+    if believed is not None:
+        belief = GaussianMixture([0.0], [[believed, 0.4]], [np.diag([1e-6, 0.1])], simulator.space)
+    method = get_estimator(
+        simulator, "laplace", likelihood=Segments(0.5, noise="white"), restarts=1, candidates=0, prior=belief
+    )
+    posterior = method.fit(recorded)
+    windows = method.likelihood.bind(simulator, Trajectories.stack(recorded))
+    noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
+    print(posterior.mode, noise)
+    return misfit(windows, posterior.mode.numpy(), noise, prior=QuadraticPrior.of(method.prior), simulated=39)
+
+
+def test_an_optimum_at_a_bound_is_no_excuse() -> None:
+    """With a mass of .6 kg where at most .5 is allowed, or .72 is firmly believed, the residuals are not noise; where 1 is allowed, and
+    also where the truth is believed, they are."""
+    recorded = log(pendulum(), [0.6, 0.08], 3)
+    for right in (of_mass_and_damping(recorded), of_mass_and_damping(recorded, believed=3 / 7)):
+        assert right.p > 0.05
+    bound, believed = of_mass_and_damping(recorded, high=0.5), of_mass_and_damping(recorded, believed=0.6)
+    for wrong in (bound, believed):
+        print(wrong.text)
+        assert wrong.p == 1 / 40
+    assert "widen the bounds of rod_mass first" in bound.remedy
+    assert "widen the bounds" not in believed.remedy
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])

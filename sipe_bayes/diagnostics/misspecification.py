@@ -1,7 +1,7 @@
 """Can the model explain the log? Residuals that are not noise.
 
-At the estimate, with parameters and windows' starts free to follow (linearised) and autoregressive noise, two kinds of
-statistics are looked at. *Probes*: a force that the model may lack, as a change u + b phi(t) of an actuator's command with
+At the estimate, with parameters and windows' starts free to follow (linearised, but for parameters that the log presses against a
+bound) and autoregressive noise, two kinds of statistics are looked at. *Probes*: a force that the model may lack, as a change u + b phi(t) of an actuator's command with
 phi = dry friction tanh(v / v0), friction under load |u| tanh(v / v0), drag v |v|, delay u(t - 1) - u(t), a spring q, a stiffening
 spring q^3, an offset 1 and a gain that is not constant u |u|; v and q are the velocity and position of the joint that it drives. The
 score statistic of b, all else projected out, is chi-square with one degree of freedom (C. R. Rao 1948,
@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.evaluate import best_starts
+from sipe_bayes.inference.least_squares import QuadraticPrior
 from sipe_bayes.likelihood import Windows
 from sipe_bayes.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
 from sipe_bayes.trajectory import Trajectories
@@ -50,6 +51,7 @@ _SOFT = 0.05  # of a velocity's size, where friction turns round
 _PIECES = 10
 _LAGS = (1, 2, 3, 5, 8, 13, 21, 34)
 _FLAT_PRECISION = 1e-6
+_AT_BOUND = 1e-6  # of the range
 _AT_ONCE = 16  # draws of the null whose products are formed together
 
 
@@ -115,15 +117,17 @@ def misfit(
     *,
     starts: FloatArray | None = None,
     sd: FloatArray | None = None,
+    prior: QuadraticPrior | None = None,
     seed: int = 0,
     simulated: int = SIMULATED,
 ) -> Misfit:
     """How odd the residuals of fitted ``windows`` are at theta (N,) with the ``noise`` (C) found there.
 
-    starts (W, D): of the windows, default the best. sd (N,): of the posterior in theta, default that of the linearisation. Costs a
-    linearisation and a rollout for each probe. Raises ValueError where the simulation diverges at theta."""
+    starts (W, D): of the windows, default the best. sd (N,): of the posterior in theta, default that of the linearisation. prior: of the
+    fit, default flat. Costs a linearisation and a rollout for each probe. Raises ValueError where the simulation diverges at theta."""
     starts = best_starts(windows, theta, noise) if starts is None else starts
-    return _Residuals(windows, theta, noise, starts).misfit(np.random.default_rng(seed), simulated, sd)
+    prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
+    return _Residuals(windows, theta, noise, starts, prior).misfit(np.random.default_rng(seed), simulated, sd)
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,9 @@ class _Solved:
 class _Residuals:
     """The log linearised at the estimate, with K probes beside the N parameters."""
 
-    def __init__(self, windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray) -> None:
+    def __init__(
+        self, windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray, prior: QuadraticPrior
+    ) -> None:
         self.windows, self.theta, self.noise = windows, theta, noise
         found = windows.linearise(theta, starts)
         if not found.valid:
@@ -155,9 +161,14 @@ class _Residuals:
         self.residual, self.jacobian = found.residual, np.concatenate(parts, axis=-1)
         self.count = n + len(self.probes)
         self.coloured = bool((noise.tau > 0).any())
+        self.inner = prior.precision + _FLAT_PRECISION * np.eye(n)
+        self.free, self.pull = np.ones(n, bool), prior.pull(theta)
+        arrow = self._arrow(self.moments(self.residual[..., None])[0][1], noise)
+        total = arrow.gradient[:n] + self.pull
+        self.free = ~(((theta <= _AT_BOUND) & (total < 0)) | ((theta >= 1 - _AT_BOUND) & (total > 0)))
 
     def misfit(self, rng: np.random.Generator, simulated: int, sd: FloatArray | None) -> Misfit:
-        seen = self.solved(self.residual, self.moments(self.residual[..., None])[0][1], self.noise)
+        seen = self.solved(self.residual, self.moments(self.residual[..., None])[0][1], self.noise, self.pull)
         null = self.null(rng, simulated)
         middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
         odd, largest = (seen.statistics - middle) / spread, ((null - middle) / spread).max(1)
@@ -213,21 +224,26 @@ class _Residuals:
     def _estimated(self, moments: Moments) -> Noise:
         """The noise that a fit would have found in a draw of it."""
         n = moments.num_theta
-        flat_prior, none = _FLAT_PRECISION * np.eye(n), self.windows.no_starts()
-        pulls = Pulls(flat_prior, np.zeros(n), self.windows.start_precision, none, np.full(n, True))
+        none = self.windows.no_starts()
+        pulls = Pulls(self.inner, np.zeros(n), self.windows.start_precision, none, self.free)
         windows, shortest = self.windows, float(self.windows.dt.min())
         return estimate_noise(
             moments, self.noise, pulls, windows.fixed_sd, self.coloured, shortest, windows.trajectories.longest
         )
 
-    def solved(self, residual: FloatArray, moments: Moments, noise: Noise) -> _Solved:
+    def _arrow(self, moments: Moments, noise: Noise) -> Arrow:
+        return eliminate(moments.normal(noise), self.count, self.windows.start_precision, self.windows.no_starts())
+
+    def solved(self, residual: FloatArray, moments: Moments, noise: Noise, pull: FloatArray | None = None) -> _Solved:
         """Cube roots of K score statistics, C sums of squared autocorrelations and C largest mean squares of a piece, with what
-        they are made of; residual (W, L, C) and its products with the probes."""
+        they are made of; residual (W, L, C), its products with the probes, and the prior's pull (N,), default none."""
         n = self.windows.num_theta
-        arrow = eliminate(moments.normal(noise), self.count, self.windows.start_precision, self.windows.no_starts())
-        inner = arrow.precision + _FLAT_PRECISION * np.eye(self.count)
-        inverse = np.linalg.inv(inner[:n, :n])
-        base, cross = inverse @ arrow.gradient[:n], inverse @ inner[:n, n:]
+        arrow = self._arrow(moments, noise)
+        inner, inverse = arrow.precision + _FLAT_PRECISION * np.eye(self.count), np.zeros((n, n))
+        inner[:n, :n] = arrow.precision[:n, :n] + self.inner
+        among = np.ix_(self.free, self.free)
+        inverse[among] = np.linalg.inv(inner[:n, :n][among])
+        base, cross = inverse @ (arrow.gradient[:n] + (0.0 if pull is None else pull)), inverse @ inner[:n, n:]
         gradient = arrow.gradient[n:] - inner[n:, :n] @ base
         information = np.diag(inner)[n:] - np.einsum("ik,ik->k", inner[:n, n:], cross)
         usable = information > 1e-6 * np.diag(inner)[n:] + 2 * _FLAT_PRECISION
@@ -308,6 +324,9 @@ class _Residuals:
         name = windows.trajectories.names[int(log[where[0]])]
         span = float(seconds[where[0]]), float(seconds[where[-1]])
         shares = dict(zip(windows.fitted, share.tolist(), strict=True))
+        held = [name for name, free in zip(windows.simulator.space.names, self.free, strict=True) if not free]
+        if held:
+            remedy = f"widen the bounds of {', '.join(held)} first, which the log presses against, or {remedy}"
         return Misfit(p, cause, remedy, name, windows.fitted[channel], *span, shares, shift)
 
 

@@ -85,8 +85,7 @@ class Laplace(Estimator):
     @property
     def quadratic_prior(self) -> QuadraticPrior:
         """The prior's normal, before truncation."""
-        mean, covariance = self.prior.gaussian_moments()
-        return QuadraticPrior(mean.numpy(), np.linalg.inv(covariance.numpy()))
+        return QuadraticPrior.of(self.prior)
 
     def start(self, trajectories: Trajectories) -> State:
         windows = self.windows(trajectories)

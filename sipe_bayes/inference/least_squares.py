@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.likelihood import Windows
 from sipe_bayes.noise import Moments, Noise, eliminate
+from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]
 
@@ -29,6 +30,12 @@ class QuadraticPrior:
 
     mean: FloatArray
     precision: FloatArray
+
+    @classmethod
+    def of(cls, prior: Posterior) -> QuadraticPrior:
+        """The normal of a prior, before truncation."""
+        mean, covariance = prior.gaussian_moments()
+        return cls(mean.numpy(), np.linalg.inv(covariance.numpy()))
 
     def energy(self, theta: FloatArray) -> float:
         """-log density at theta, up to a constant."""
