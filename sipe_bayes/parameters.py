@@ -187,6 +187,16 @@ class ParameterSpace(Sequence[Parameter]):
             raise ValueError(f"expected {len(self)} parameters on the last axis, got shape {array.shape}")
         return array
 
+    def difference(self, other: ParameterSpace) -> str:
+        """In words what makes a theta of this space another one of ``other``, empty where nothing does."""
+        if self.names != other.names:
+            return f"is over {', '.join(self.names)}, and over {', '.join(other.names)}"
+        for mine, theirs in zip(self, other, strict=True):
+            if (mine.low, mine.high, mine.scale) != (theirs.low, theirs.high, theirs.scale):
+                ours, others = (f"from {p.low:g} to {p.high:g} ({p.scale})" for p in (mine, theirs))
+                return f"has {mine.name} {ours}, and {others}"
+        return ""
+
     def to_dict(self) -> list[dict[str, Any]]:
         """Plain data, for JSON."""
         return [{**p.__dict__, "targets": list(p.targets)} for p in self._parameters]

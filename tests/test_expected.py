@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sipe_bayes.diagnostics.expected import Plan, expect
+from sipe_bayes.diagnostics.expected import Plan, contraction, expect, informations
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.noise import Noise
 from sipe_bayes.parameters import Parameter
-from sipe_bayes.posterior import prior
+from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.simulator import Simulator
 from tests.pendulums import DT, log, pendulum
 
@@ -60,6 +60,36 @@ def test_what_is_expected_is_what_a_fit_finds() -> None:
     print(found.contraction)
     np.testing.assert_allclose(found.contraction, 1 - np.sqrt(0.5), atol=0.03)
     assert found.idle == ()
+    assert (found.remaining > 0.9).all()
+    assert found.sentences() == []  # what is known now stays determined
+
+
+def test_what_is_known_now_is_not_called_open() -> None:
+    """Gear and mass are known to half a percent of their ranges; only their quotient would show."""
+    simulator = cart("log")
+    known = GaussianMixture([0.0], [[0.6, 0.5, 0.5]], [np.diag([0.005**2, 0.005**2, 0.1])], simulator.space)
+    found = expect(simulator, SEGMENTS, Plan(2 * np.sin(0.07 * np.arange(300))[:, None], 0.01), NOISE, known, draws=2)
+    assert found.sentences() == ["wind is never excited: its posterior will be what is known now"]
+
+
+def test_a_new_log_has_nuisances_of_its_own() -> None:
+    """Zero errors of two old logs: the plan says nothing of them, and of the rest what it says where its own zero error is unknown. A
+    mass at one place and a zero of 0.3 rad do much the same to a pendulum that hardly moves, so that this is not what it
+    says with a known zero."""
+    bias = ("sensor:joint:hinge.position.bias",)
+    old = [Parameter(f"zero[{log}]", -0.3, 0.3, targets=bias, log=log) for log in ("a", "b")]
+    plan = Plan(0.5 * np.sin(0.05 * np.arange(300))[:, None], DT)
+    gains = []
+    for more in ((), (Parameter("zero", -0.3, 0.3, targets=bias),), old):
+        simulator = pendulum(*more)
+        at = np.full((1, len(simulator.space)), 0.5)
+        (told,) = informations(simulator, SEGMENTS, plan, NOISE, at)
+        gains.append(contraction(12 * np.eye(len(told)), [told]))
+    without, own, logs = gains
+    print(without, own, logs)
+    np.testing.assert_allclose(logs[:2], own[:2], rtol=1e-4)
+    np.testing.assert_allclose(logs[2:], 0, atol=1e-9)
+    assert (without > own[:2] + 1e-6).any()
 
 
 def test_a_good_plan_has_nothing_to_be_said_of() -> None:

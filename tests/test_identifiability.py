@@ -42,6 +42,28 @@ def test_what_is_determined_is_not_called_a_ridge() -> None:
     assert named(rng.uniform(0.1, 1, (4000, 3))) == []
 
 
+def test_a_member_that_is_determined_is_not_said_to_be_open() -> None:
+    """Mass within 1 % of its range follows a gear that is open."""
+    rng = np.random.default_rng(0)
+    space = ParameterSpace([Parameter("mass", 0.0, 100.0, unit="kg"), Parameter("gear", 0.0, 10.0)])
+    gear = rng.uniform(4, 8, 4000)
+    draws = np.stack([50 + 0.5 * (gear - 6) + 0.002 * rng.standard_normal(4000), gear], 1)
+    contraction = 1 - draws.std(0) / np.array([100, 10]) * np.sqrt(12)
+    (ridge,) = ridges(space, draws, contraction.tolist())
+    assert ridge.text.endswith("; gear alone is not")
+    assert set(ridge.parameters) == {"mass", "gear"}
+
+
+def test_a_sum_of_many_is_found() -> None:
+    """Thirty masses whose sum is known, none of them by itself."""
+    rng = np.random.default_rng(0)
+    draws = rng.uniform(1, 2, (4000, 30))
+    draws += (45 - draws.sum(1, keepdims=True)) / 30 + 0.003 * rng.standard_normal((4000, 30))
+    space = ParameterSpace([Parameter(f"p{k}", 0.0, 3.0) for k in range(30)])
+    contraction = 1 - draws.std(0) / 3 * np.sqrt(12)
+    assert [len(r.parameters) for r in ridges(space, draws, contraction.tolist())] == [30]
+
+
 @pytest.mark.parametrize("estimator", ["laplace", "mcmc"])
 def test_the_mass_length_ridge_of_a_pendulum_is_named(estimator: str) -> None:
     """Mass, its distance and the remaining inertia free: only first moment and inertia about the axis show."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,21 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from sipe_bayes.calibration import prepare
 from sipe_bayes.cli import app
 from sipe_bayes.diagnostics.expected import Plan
 from sipe_bayes.diagnostics.suggest import KINDS, generate, limits, rank
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.noise import Noise
+from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectory
 from tests.pendulums import DT, pendulum
 from tests.test_check import config  # noqa: F401
+from tests.test_expected import CART
 
 BOUNDS = np.array([[-1.0, 1.0]])
 NOISE = Noise(np.array([0.01]), np.zeros(1))
@@ -92,9 +97,39 @@ def test_candidates_keep_limits_band_and_rest() -> None:
 
 def test_limits_come_from_the_model_or_the_logs() -> None:
     simulator = pendulum()
-    with pytest.raises(ValueError, match="limits: the model states no control range"):
-        limits(simulator)
-    np.testing.assert_allclose(limits(simulator, np.array([[[0.3], [-0.7]]])), [[-0.7, 0.7]])
+    for nothing in (None, np.full((5, 1), 0.3)):
+        with pytest.raises(ValueError, match="limits: the model states no control range"):
+            limits(simulator, nothing)
+    np.testing.assert_allclose(limits(simulator, np.array([[0.3], [-0.7]])), [[-0.7, 0.3]])
+    np.testing.assert_allclose(limits(simulator, np.array([[0.0], [3.0]])), [[0.0, 3.0]])  # never the other way
+    ranged = CART.replace('gear="3"', 'gear="3" ctrllimited="true" ctrlrange="-2 1"')
+    parameters = [Parameter("gear", 1.0, 6.0, targets=("actuator:motor.gear",))]
+    model = Simulator(MjcfEnvironment.build(ranged, parameters, ["motor"], ["joint:slide.position"]), num_threads=1)
+    np.testing.assert_allclose(limits(model, np.array([[0.0], [3.0]])), [[-2, 1]])
+
+
+def test_a_parameter_of_one_log_is_not_asked_for() -> None:
+    zero = Parameter("zero[a]", -0.3, 0.3, targets=("sensor:joint:hinge.position.bias",), log="a")
+    simulator = pendulum(zero)
+    plans = generate(1, 2.0, DT, BOUNDS, (0.5, 5.0))
+    with pytest.raises(ValueError, match=r"names: 'zero\[a\]' is of a log that is there already"):
+        rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), ["zero[a]"])
+    (found,) = rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), draws=2)
+    assert found.score == pytest.approx(found.contraction[:2].mean())
+    assert found.contraction[2] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_posterior_with_other_bounds_is_refused(config: Path, tmp_path: Path) -> None:  # noqa: F811
+    """It would be taken for other values."""
+    space = prepare(config, 1).simulator.space
+    other = ParameterSpace([replace(space[0], high=2 * space[0].high), *list(space)[1:]])
+    prior(other).save(tmp_path / "posterior")
+    result = call(config, "--posterior", tmp_path / "posterior")
+    assert result.exit_code == 2
+    assert "has mass from" in result.stderr
+    assert "in the configuration; give that of a run of it" in result.stderr
+    with pytest.raises(ValueError, match=r"prior: has mass from .* in the simulator; use the same bounds"):
+        get_estimator(prepare(config, 1).simulator, "laplace", prior=prior(other))
 
 
 def call(*arguments: object) -> Any:

@@ -6,6 +6,9 @@ knowledge, a normal of precision P, the experiment leaves the covariance (P + I)
 provided by an experiment" (https://doi.org/10.1214/aoms/1177728069); K. Chaloner, I. Verdinelli 1995, "Bayesian experimental design: a
 review" (https://doi.org/10.1214/ss/1177009939), whose A-criterion, averaged over draws of theta, this is, in sds.
 
+A parameter of one log (a zero error) says nothing of the planned one, which has a value of its own: that is marginalised, with a
+uniform prior, and the old ones learn nothing. What is determined is judged by the sd that is left, beside a uniform prior's.
+
 Deviations: the noise's own uncertainty is left out; the expectation is linear in theta at each draw, so that contacts that are made or
 missed between draws show only in their average.
 """
@@ -23,6 +26,7 @@ from sipe_bayes.diagnostics.identifiability import ridges
 from sipe_bayes.diagnostics.result import Ridge
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.noise import Noise, eliminate
+from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectories, Trajectory
@@ -30,8 +34,9 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 FloatArray = NDArray[np.float64]
 
 NOT_DETERMINED = 0.5  # contraction below which a parameter is not determined
-_IDLE = 1e-6  # contraction below which the experiment does not touch a parameter
+_IDLE = 1e-6  # contraction of a uniform prior below which the experiment does not touch a parameter
 _FLAT_PRECISION = 0.01  # sd 10 in units of the cube
+_UNIFORM = 12.0  # precision of a uniform prior
 _DRAWS = 4000
 
 
@@ -47,11 +52,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a plan is expected to leave. contraction (N,): of each parameter's sd; covariance (N, N) in theta; ridges in words; idle:
-    parameters that it never excites."""
+    """What a plan is expected to leave. contraction (N,): of each parameter's sd, from what it is now; remaining (N,): of a uniform
+    prior's, with what is known now; covariance (N, N) in theta; ridges in words; idle: parameters that it never excites."""
 
     names: tuple[str, ...]
     contraction: FloatArray
+    remaining: FloatArray
     covariance: FloatArray
     ridges: list[Ridge]
     idle: tuple[str, ...]
@@ -63,7 +69,7 @@ class Expectation:
         told = {*self.idle, *(name for ridge in self.ridges for name in ridge.parameters)}
         words += [
             f"{name} would not be determined (expected contraction {c:.2f})"
-            for name, c in zip(self.names, self.contraction, strict=True)
+            for name, c in zip(self.names, self.remaining, strict=True)
             if c < NOT_DETERMINED and name not in told
         ]
         return words
@@ -72,7 +78,8 @@ class Expectation:
 def information(
     simulator: Simulator, likelihood: Segments, plan: Plan, noise: Noise, theta: FloatArray
 ) -> FloatArray | None:
-    """Fisher information (N, N) of a plan at theta (N,), under ``noise`` of the fitted channels; None where the simulation diverges."""
+    """Fisher information (N, N) of a plan at theta (N,), under ``noise`` of the fitted channels, the plan's own nuisances marginalised; None
+    where the simulation diverges."""
     start = simulator.default_state() if plan.start is None else plan.start
     motion = simulator.rollout(theta[None], plan.actions[None], start[None], plan.dt, [plan.name])
     if motion.states is None or not motion.valid.all():
@@ -86,7 +93,27 @@ def information(
         return None
     normal = windows.moments(found).normal(noise)
     arrow = eliminate(normal, windows.num_theta, windows.start_precision, windows.no_starts())
-    return arrow.precision
+    return _of_shared(arrow.precision, simulator.space)
+
+
+def _of_shared(found: FloatArray, space: ParameterSpace) -> FloatArray:
+    """Information (N, N) with a new value in place of the logs' own of each nuisance, which the simulation takes as their mean."""
+    own: dict[tuple[str, ...], list[int]] = {}
+    for j, parameter in enumerate(space):
+        if parameter.log is not None:
+            own.setdefault(parameter.targets, []).append(j)
+    if not own:
+        return found
+    shared = [j for j, p in enumerate(space) if p.log is None]
+    design = np.zeros((len(space), len(shared) + len(own)))
+    design[shared, np.arange(len(shared))] = 1.0
+    for k, members in enumerate(own.values()):
+        design[members, len(shared) + k] = 1.0
+    joint, count = design.T @ found @ design, len(shared)
+    cross, inner = joint[:count, count:], joint[count:, count:] + _UNIFORM * np.eye(len(own))
+    told = np.zeros_like(found)
+    told[np.ix_(shared, shared)] = joint[:count, :count] - cross @ np.linalg.solve(inner, cross.T)
+    return told
 
 
 def informations(
@@ -105,9 +132,12 @@ def knowledge(known: Posterior) -> FloatArray:
 
 def contraction(precision: FloatArray, found: Sequence[FloatArray]) -> FloatArray:
     """Expected 1 - sd afterwards / sd now (N,), averaged over the informations ``found`` (M of (N, N))."""
-    now = np.sqrt(np.diag(np.linalg.inv(precision)))
-    after = [np.sqrt(np.diag(np.linalg.inv(precision + one))) for one in found]
-    return np.asarray(np.mean([1 - sd / now for sd in after], axis=0))
+    return np.asarray(1 - _afterwards(precision, found) / np.sqrt(np.diag(np.linalg.inv(precision))))
+
+
+def _afterwards(precision: FloatArray, found: Sequence[FloatArray]) -> FloatArray:
+    """Expected sds (N,)."""
+    return np.asarray(np.mean([np.sqrt(np.diag(np.linalg.inv(precision + one))) for one in found], axis=0))
 
 
 def expect(
@@ -129,18 +159,19 @@ def expect(
             f"plan: {plan.name!r} diverges at all {draws} draws; make its commands smaller, or narrow the bounds"
         )
     precision, middle = knowledge(known), np.median(thetas, axis=0)
-    gain = contraction(precision, found)
+    gain, remaining = contraction(precision, found), 1 - _afterwards(precision, found) * np.sqrt(_UNIFORM)
     centre = information(simulator, likelihood, plan, noise, middle)
     centre = found[0] if centre is None else centre
     covariance = np.asarray(np.linalg.inv(precision + centre), np.float64)
     open_covariance = np.linalg.inv(centre + _FLAT_PRECISION * np.eye(len(middle)))
     normal = GaussianMixture([0.0], middle[None], open_covariance[None], known.space)
     values = normal.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
-    names = known.space.names
+    names, excited = known.space.names, np.mean([np.diag(one) for one in found], axis=0) / (2 * _UNIFORM)
     return Expectation(
         names,
         gain,
+        remaining,
         covariance,
-        ridges(known.space, values, gain.tolist()),
-        tuple(name for name, c in zip(names, gain, strict=True) if c < _IDLE),
+        ridges(known.space, values, remaining.tolist()),
+        tuple(name for name, c in zip(names, excited, strict=True) if c < _IDLE),
     )

@@ -21,8 +21,8 @@ FloatArray = NDArray[np.float64]
 GRID = (0.0, 0.25, 0.5, 0.75, 1.0)
 _NO_EFFECT = 1e-7  # of the signal's own spread
 _NARROW = 0.03  # eigenvalue of the correlation matrix below which a combination is far better known than its members
-_MEMBER = 0.2  # loading from which a parameter belongs to a ridge
-_DETERMINED = 0.8  # contraction from which all members are well known anyway
+_MEMBER = 0.25  # of the largest loading, from which a parameter belongs to a ridge
+_DETERMINED = 0.8  # contraction from which a member is well known by itself
 
 
 def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
@@ -69,20 +69,28 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
     for view in (logarithms[:, moving], draws[:, moving]):
         eigenvalues, vectors = np.linalg.eigh(np.corrcoef(view.T))
         for value, vector in zip(eigenvalues, vectors.T, strict=True):
-            members = [int(moving[i]) for i in np.flatnonzero(np.abs(vector) > _MEMBER)]
+            members = [int(moving[i]) for i in _members(vector)]
             if value > 3 * _NARROW or len(members) < 2:
                 continue
             if all(contraction[j] > _DETERMINED for j in members):
                 continue
-            ridge = _describe(space, draws, members)
+            ridge = _describe(space, draws, members, contraction)
             if ridge is not None and not any(set(ridge.parameters) <= seen for seen in used):
                 used.append(set(ridge.parameters))
                 found.append(ridge)
     return found
 
 
-def _describe(space: ParameterSpace, draws: FloatArray, members: list[int]) -> Ridge | None:
-    """The best determined combination of the members, in words; None when it is not far better known than they."""
+def _members(loadings: FloatArray) -> NDArray[np.int64]:
+    size = np.abs(loadings)
+    return np.flatnonzero(size > _MEMBER * size.max())
+
+
+def _describe(
+    space: ParameterSpace, draws: FloatArray, members: list[int], contraction: Sequence[float]
+) -> Ridge | None:
+    """The best determined combination of the members, in words; None when it is not far better known than they, or each of them
+    is well known by itself."""
     chosen = draws[:, members]
     spaces = [("sum", chosen)]
     if (np.abs(np.sign(chosen).sum(0)) == len(chosen)).all():  # nobody changes sign: products have logarithms
@@ -91,7 +99,7 @@ def _describe(space: ParameterSpace, draws: FloatArray, members: list[int]) -> R
     eigenvalue, weights, loadings, kind, x = best[0], np.array(best[1]), np.array(best[2]), best[3], best[4]
     if eigenvalue > _NARROW:
         return None
-    kept = np.flatnonzero(loadings > _MEMBER)
+    kept = _members(loadings)
     names, units = ([getattr(space[members[k]], what) for k in kept] for what in ("name", "unit"))
     combined = x[:, kept] @ weights[kept]
     if kind == "product":
@@ -103,8 +111,11 @@ def _describe(space: ParameterSpace, draws: FloatArray, members: list[int]) -> R
         unit = units[int(np.argmax(loadings[kept]))]
         value, width, text = float(combined.mean()), float(combined.std()), _sum(names, weights[kept], units, unit)
     unit = f" {unit}" if unit not in ("", "1") else ""
-    alone = " and ".join(names) if len(names) == 2 else ", ".join(names[:-1]) + " and " + names[-1]
-    return Ridge(f"{text} = {value:.4g} ± {width:.1g}{unit} is determined; {alone} alone are not", tuple(names))
+    unknown = [name for name, k in zip(names, kept, strict=True) if contraction[members[k]] <= _DETERMINED]
+    if not unknown:
+        return None
+    alone = f"{', '.join(unknown[:-1])} and {unknown[-1]} alone are" if len(unknown) > 1 else f"{unknown[0]} alone is"
+    return Ridge(f"{text} = {value:.4g} ± {width:.1g}{unit} is determined; {alone} not", tuple(names))
 
 
 def _narrowest(x: FloatArray) -> tuple[float, tuple[float, ...], tuple[float, ...]]:

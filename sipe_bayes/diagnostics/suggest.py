@@ -62,13 +62,16 @@ def rank(
     seed: int = 0,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Suggestion]:
-    """Plans, the most telling first, of the parameters ``names``, default all. noise: of the fitted channels; known: the prior, or the
-    posterior so far, of which ``draws`` are drawn. Raises ValueError for unknown names."""
+    """Plans, the most telling first, of the parameters ``names``, default all that are not of one log. noise: of the fitted channels; known: the prior, or the
+    posterior so far, of which ``draws`` are drawn. Raises ValueError for unknown names, and for those of one log."""
     space = known.space
     unknown = [name for name in names if name not in space.names]
     if unknown:
         raise ValueError(f"names: no parameter {unknown[0]!r}; there are {', '.join(space.names)}")
-    wanted = [space.index(name) for name in names or space.names]
+    old = [name for name in names if space[space.index(name)].log is not None]
+    if old:
+        raise ValueError(f"names: {old[0]!r} is of a log that is there already; a new one tells nothing of it")
+    wanted = [j for j, p in enumerate(space) if (p.name in names if names else p.log is None)]
     thetas = known.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
     precision, found = knowledge(known), []
     nothing = np.zeros((len(space), len(space)))
@@ -89,7 +92,7 @@ def _reach(simulator: Simulator, plan: Plan, thetas: FloatArray) -> FloatArray:
 
 
 def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArray:
-    """Lowest and highest command (A, 2): the model's control ranges, else what was commanded before, (..., A); raises ValueError where
+    """Lowest and highest command (A, 2): the model's control ranges, else of what was commanded before, (T, A); raises ValueError where
     neither tells."""
     environment, model = simulator.environment, simulator.model
     found = np.full((environment.num_actions, 2), np.nan)
@@ -99,11 +102,10 @@ def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArr
         if actuator is not None and model.actuator_ctrllimited[actuator]:
             found[j] = model.actuator_ctrlrange[actuator]
         elif recorded is not None:
-            most = float(np.abs(recorded[..., j]).max())
-            found[j] = -most, most
+            found[j] = recorded[:, j].min(), recorded[:, j].max()
     if not (found[:, 0] < found[:, 1]).all():
         raise ValueError(
-            "limits: the model states no control range and no log has commands; give low and high for each actuator"
+            "limits: the model states no control range and in no log the command changes; give the actuators ctrlrange"
         )
     return found
 

@@ -45,6 +45,8 @@ def suggest(
 ) -> None:
     """Which experiment next: command sequences ranked by the expected contraction of the parameters' sds."""
     with refusing():
+        import numpy as np
+
         from sipe_bayes.calibration import prepare
         from sipe_bayes.diagnostics import suggest as suggestions
         from sipe_bayes.output import to_json
@@ -54,7 +56,7 @@ def suggest(
         positive("--duration", duration)
         problem = prepare(config, threads)
         dt = float(problem.train.dt[0])
-        bounds = suggestions.limits(problem.simulator, problem.train.actions)
+        bounds = suggestions.limits(problem.simulator, np.concatenate([log.actions for log in problem.train]))
         band = (low or 1 / duration, high or min(5.0, 0.2 / dt))
         plans = suggestions.generate(candidates, duration, dt, bounds, band, seed) + _read(problem, given or [], dt)
         if not plans:
@@ -89,11 +91,9 @@ def _known(problem: Problem, path: Path | None) -> Posterior:
     if path is None:
         return problem.prior
     found = load_posterior(path)
-    if found.space.names != problem.simulator.space.names:
-        raise ValueError(
-            f"--posterior {path}: is of {list(found.space.names)}, the configuration of {list(problem.simulator.space.names)}; "
-            "give that of the same configuration"
-        )
+    difference = found.space.difference(problem.simulator.space)
+    if difference:
+        raise ValueError(f"--posterior {path}: {difference} in the configuration; give that of a run of it")
     return found
 
 

@@ -120,6 +120,9 @@ class Estimator(ABC):
         self.prior = default_prior(self.space) if prior is None else prior
         if self.prior.space.names != self.space.names or not self.prior.has_density:
             raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
+        difference = self.prior.space.difference(self.space)
+        if difference:
+            raise ValueError(f"prior: {difference} in the simulator; use the same bounds and scale")
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
         if likelihood is not None and not isinstance(likelihood, Segments | StateSpace):
             raise ValueError(
