@@ -1,7 +1,8 @@
 """Replicas of recorded trajectories: the same experiment simulated at a known theta, with the noise that the recording has.
 
 Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white or
-first-order autoregressive in each channel. The commands are replayed open loop: where a feedback law kept the machine on its
+first-order autoregressive in each channel, and where the recording has process noise, each state after a control step is moved by some. The
+commands are replayed open loop: where a feedback law kept the machine on its
 course, a replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta only.
 """
 
@@ -18,7 +19,7 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.likelihood import Segments, estimate_states, first_states
+from sipe_bayes.likelihood import Segments, estimate_states, first_states, moved
 from sipe_bayes.noise import Noise
 from sipe_bayes.noise_level import noise_level
 from sipe_bayes.simulator import Simulator
@@ -46,10 +47,18 @@ def observation_noise(
 
 
 class Replicas:
-    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels)."""
+    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels), and process noise of sd ``process`` (D,), default none, in the
+    tangent coordinates of ``StateSpace``, whose loose jumps are not repeated."""
 
-    def __init__(self, simulator: Simulator | CallableSimulator, trajectories: Trajectories, noise: Noise) -> None:
+    def __init__(
+        self,
+        simulator: Simulator | CallableSimulator,
+        trajectories: Trajectories,
+        noise: Noise,
+        process: FloatArray | None = None,
+    ) -> None:
         self.simulator, self.trajectories, self.noise = simulator, trajectories, noise
+        self.process = process if process is not None and process.any() else None
         self.starts = _starts(simulator, trajectories)
 
     def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
@@ -64,12 +73,42 @@ class Replicas:
         noises = [self._noise(rng) for _ in theta]
         starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
         motion, count = self.simulator.replay(theta, self.trajectories, starts), len(self.trajectories)
+        if self.process is not None:
+            motion = self._shaken(motion, theta, rng)
         found = []
         for b, noise in enumerate(noises):
             rows = slice(b * count, (b + 1) * count)
             states = None if motion.states is None else motion.states[rows]
             found.append(self._measured(motion.observations[rows] + noise, motion.valid[rows], states))
         return found
+
+    def _shaken(self, motion: Trajectories, theta: FloatArray, rng: np.random.Generator) -> Trajectories:
+        """The replayed ``motion`` again, control step by control step, with process noise after each."""
+        simulator, log = self.simulator, self.trajectories
+        assert isinstance(simulator, Simulator)
+        assert self.process is not None
+        assert motion.states is not None
+        environment, batch = simulator.environment, len(theta)
+        late = np.array([environment.derived_late and c is None for c in environment.state_columns(simulator.model)])
+        lanes, dt = np.repeat(theta, len(log), axis=0), np.tile(log.dt, batch)
+        names, goals = list(log.names or [None] * len(log)) * batch, environment.recorded_goals(log.observations[:, 0])
+        goals = None if goals is None else np.tile(goals, (batch, 1))
+        seen, states, valid = motion.observations.copy(), motion.states.copy(), motion.valid.copy()
+        steps = states.shape[1] - 1
+        for k in range(steps + 1):
+            actions = np.tile(log.actions[:, min(k, steps - 1)], (batch, 1))[:, None]
+            step = simulator.rollout(lanes, actions, states[:, k], dt, names, goals=goals)
+            assert step.states is not None
+            seen[:, k, ~late] = step.observations[:, 0, ~late]
+            valid[:, k] &= step.valid[:, 0]
+            if k < steps:
+                white = rng.standard_normal((len(lanes), len(self.process)))
+                ends = np.where(step.valid[:, 1, None], step.states[:, 1], states[:, 0])
+                states[:, k + 1] = moved(simulator.model, ends, self.process * white)
+                seen[:, k + 1, late] = step.observations[:, 1, late]
+                valid[:, k + 1 :] &= step.valid[:, 1, None]
+        inside = np.arange(steps + 1) <= motion.length[:, None]
+        return replace(motion, observations=np.where(inside[..., None], seen, np.nan), states=states, valid=valid)
 
     def _measured(
         self, observations: FloatArray, valid: NDArray[np.bool_], states: FloatArray | None

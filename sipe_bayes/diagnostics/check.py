@@ -43,8 +43,8 @@ _LEVEL = 0.9
 
 @dataclass(frozen=True)
 class Study:
-    """What is checked: ``estimator``, of which only settings count, on the experiment of ``trajectories`` with ``noise`` (O).
-    name: of the model. refits: those of Recalibrated(estimator), or 0 for the estimator itself."""
+    """What is checked: ``estimator``, of which only settings count, on the experiment of ``trajectories`` with ``noise`` (O) and process noise
+    of sd ``process`` (D,), none or empty without. name: of the model. refits: those of Recalibrated(estimator), or 0 for the estimator itself."""
 
     name: str
     estimator: Estimator
@@ -52,6 +52,7 @@ class Study:
     noise: Noise
     refits: int = 0
     seed: int = 0
+    process: FloatArray | None = None
 
     @property
     def method(self) -> str:
@@ -61,7 +62,8 @@ class Study:
 
     def identity(self) -> dict[str, Any]:
         """What tells a check from others, as plain data."""
-        noise = {"sd": self.noise.sd.tolist(), "tau": self.noise.tau.tolist()}
+        process = [] if self.process is None else self.process.tolist()
+        noise = {"sd": self.noise.sd.tolist(), "tau": self.noise.tau.tolist(), "process": process}
         settings = json.loads(json.dumps(self.estimator.settings(), default=str))
         return {
             "model": self.name,
@@ -212,7 +214,7 @@ class _Worker:
 
     def __init__(self, study: Study, folder: Path, tell: Tell) -> None:
         self.study, self.folder, self.tell = study, folder, tell
-        self.replicas = Replicas(study.estimator.simulator, study.trajectories, study.noise)
+        self.replicas = Replicas(study.estimator.simulator, study.trajectories, study.noise, study.process)
         self._trained: Estimator | None = None
 
     def fit(self, number: int) -> Fit:
@@ -320,11 +322,12 @@ def study_of_task(
 def study_of_config(
     path: Path, estimator: str, *, budget: int | None, refits: int, seed: int, threads: int | None
 ) -> Study:
-    """The model, commands, starts and prior of a configuration, with the autoregressive noise that ``laplace`` finds in its logs."""
+    """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs: autoregressive, or with a
+    ``StateSpace`` white, and process noise."""
     from sipe_bayes.calibration import method_of, prepare
     from sipe_bayes.inference.recalibrated import fitted_noise
 
     problem = prepare(path, threads)
     method = method_of(problem, estimator, seed, budget)
-    noise, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
-    return Study(str(path), method, problem.train, noise, refits, seed)
+    noise, process, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
+    return Study(str(path), method, problem.train, noise, refits, seed, process)

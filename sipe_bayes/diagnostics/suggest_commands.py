@@ -113,7 +113,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
         noise = json.loads(record.read_text(encoding="utf-8"))["noise"]
         if set(fitted) <= set(noise):
             return Noise(*(np.array([noise[c][what] for c in fitted]) for what in ("sd", "tau")))
-    every, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior)
+    every, *_ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior)
     chosen = [channels.index(c) for c in fitted]
     return Noise(every.sd[chosen], every.tau[chosen])
 

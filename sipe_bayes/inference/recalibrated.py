@@ -25,7 +25,8 @@ Deviations. Issue and textbook name regression of truth on estimate; here estima
 width of the neighbourhood is not a second prior. One mode: estimates that jump between several make V wide. Uniform priors are
 normals of sd 10 about the cube's centre, flat within it to half a percent. Replicas have first-order autoregressive noise as
 ``laplace`` finds it in a measured log, whatever noise the estimator believes in; where states are recorded, the noise that the estimator
-infers, and for those that infer none, or where a function makes its own, as ``noise_level`` says. A model that is wrong is not mended by
+infers, and for those that infer none, or where a function makes its own, as ``noise_level`` says. With a ``StateSpace`` their states are
+shaken by the process noise that the fit of the log inferred, but for jumps that it let go. A model that is wrong is not mended by
 simulating it.
 """
 
@@ -133,6 +134,7 @@ class Recalibrated(Estimator):
             "own_sd": np.sqrt(np.maximum(np.diag(covariance), 0.0)),
             "noise_sd": noise.sd,
             "noise_tau": noise.tau,
+            "process": process_noise(base.diagnostics),
             "theta": np.empty((0, n)),
             "estimates": np.empty((0, n)),
             "tried": 0,
@@ -211,7 +213,7 @@ class Recalibrated(Estimator):
     def _noise(self, base: Estimator, theta: FloatArray, trajectories: Trajectories) -> Noise:
         """Of all O channels."""
         if self._looks_for_noise(trajectories):
-            noise, rollouts = fitted_noise(self.simulator, self.likelihood, trajectories, self.prior, theta)
+            noise, _, rollouts = fitted_noise(self.simulator, self.likelihood, trajectories, self.prior, theta)
             self.rollouts += rollouts
             return noise
         return observation_noise(base.diagnostics, trajectories, self.likelihood)
@@ -263,7 +265,7 @@ class Recalibrated(Estimator):
     def _simulated(self, state: State, trajectories: Trajectories) -> Replicas:
         if self._replicas is None or self._replicas[0] is not trajectories:
             noise = Noise(state["noise_sd"], state["noise_tau"])
-            self._replicas = (trajectories, Replicas(self.simulator, trajectories, noise))
+            self._replicas = (trajectories, Replicas(self.simulator, trajectories, noise, state["process"]))
         return self._replicas[1]
 
     def _rounds(self) -> tuple[int, ...]:
@@ -298,6 +300,11 @@ class Recalibrated(Estimator):
         return np.clip(mean, 0.0, 1.0), covariance * np.outer(shrink, shrink)
 
 
+def process_noise(diagnostics: dict[str, Any]) -> FloatArray:
+    """sd (D,) of a fit with a ``StateSpace``, none of any other."""
+    return np.array(diagnostics.get("process_noise", ()), float)
+
+
 def noise_is_unknown(simulator: Any, likelihood: Any, trajectories: Trajectories) -> bool:
     """Whether these are logs of a machine, whose noise only a fit tells."""
     return isinstance(simulator, Simulator) and isinstance(likelihood, Segments) and trajectories.states is None
@@ -310,13 +317,13 @@ def fitted_noise(
     prior: Posterior,
     theta: FloatArray | None = None,
     budget: int = NOISE_BUDGET,
-) -> tuple[Noise, int]:
-    """Noise of all O channels by a fit of ``laplace``, from theta (N,) where given, and its rollouts: autoregressive, or that of the
-    measurement with a ``StateSpace``."""
+) -> tuple[Noise, FloatArray, int]:
+    """Noise of all O channels by a fit of ``laplace``, from theta (N,) where given: autoregressive, or that of the measurement with a
+    ``StateSpace``; its process noise (D,), else none; and the fit's rollouts."""
     coloured = replace(likelihood, noise="ar1") if isinstance(likelihood, Segments) else likelihood
     fit = Laplace(simulator, likelihood=coloured, prior=prior, initial=theta, budget=budget)
     fit.fit(trajectories)
-    return observation_noise(fit.diagnostics, trajectories, likelihood), fit.rollouts
+    return observation_noise(fit.diagnostics, trajectories, likelihood), process_noise(fit.diagnostics), fit.rollouts
 
 
 def fresh(estimator: Estimator) -> Estimator:
