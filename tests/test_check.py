@@ -15,7 +15,9 @@ from sipe_bayes.diagnostics import check as checks
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
+from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 
 MODEL = """
@@ -141,8 +143,54 @@ def test_an_amortised_estimator_is_trained_once(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(ABC, "train", lambda self, *given: (trained.append(1), train(self, *given))[1])
     arguments = ("Pendulum", "abc", "--truths", 20, "--budget", 200, "--steps", 20, "--threads", 1, "--json", "--out")
     result = call(*arguments, tmp_path / "plain")
-    assert json.loads(result.stdout)["truths"] == 20, result.output
+    found = json.loads(result.stdout)
+    assert found["truths"] == 20, result.output
     assert len(trained) == 1
+    assert found["rollouts"] == 200  # counted once
+    again = json.loads(call("Pendulum", "abc", "--truths", 22, *arguments[4:], tmp_path / "plain").stdout)  # two more
+    assert (again["truths"], again["rollouts"]) == (22, 200)
+
+
+@pytest.mark.parametrize(
+    ("method", "refits", "said"),
+    [
+        ("abc", 0, "one training of 200 rollouts, then 20 fits, kept in"),
+        ("abc", 20, "one training of 200 rollouts, then 20 fits of at most 20 rollouts each, kept in"),
+        ("laplace", 0, "20 fits of at most 200 rollouts each, kept in"),
+        ("laplace", 20, "20 fits of at most 4220 rollouts each, kept in"),
+    ],
+)
+def test_the_cost_is_said_first(
+    method: str, refits: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With refits: a fit of the log, and for each replica the replica and a fit."""
+
+    def stopped(*given: Any) -> None:
+        raise ValueError("that is all")
+
+    monkeypatch.setattr(checks, "run", stopped)
+    result = call("Pendulum", method, "--truths", 20, "--budget", 200, "--refits", refits, "--out", tmp_path / "out")
+    assert result.stdout.startswith(said), result.stdout
+
+
+def test_every_fit_has_a_seed_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    fit = Laplace.fit
+    monkeypatch.setattr(Laplace, "fit", lambda self, given: (seeds.append(self.seed), fit(self, given))[1])
+    call("Pendulum", "laplace", "--truths", 20, "--steps", 10, "--noise", 0, "--threads", 1, "--out", tmp_path / "out")
+    assert len(seeds) == len(set(seeds)) == 20
+
+
+def test_fetch_is_checked_from_recorded_states() -> None:
+    """Its controller has a memory that StateSpace does not know."""
+    given = {"steps": 10, "noise": 0.01, "budget": None, "refits": 0, "seed": 0, "threads": 1}
+    for task, kind in (("FetchPush", Segments), ("Pendulum", StateSpace)):
+        study = checks.study_of_task(task, "laplace", **given)  # type: ignore[arg-type]
+        assert isinstance(study.estimator.likelihood, kind)
+    study = checks.study_of_task("FetchPush", "laplace", **given)  # type: ignore[arg-type]
+    fitted = checks._Worker(study, Path(), lambda *what: None).fit(0)
+    assert fitted.error == ""
+    assert len(fitted.draws)
 
 
 @pytest.mark.parametrize(

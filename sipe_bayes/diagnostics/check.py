@@ -1,8 +1,9 @@
 """Is an estimator calibrated on one's own model, noise and commands? What ``sipe check`` does, also from Python.
 
 Truths are drawn from the prior, the recorded experiment is simulated at each of them with the noise of the recording
-(``sipe_bayes.replicas``), the estimator is fitted to each simulated log, and ``diagnostics.calibration`` compares. An amortised
-estimator is trained once and then conditions on each log. Every fit is one file, so an interrupted check goes on.
+(``sipe_bayes.replicas``), the estimator is fitted to each simulated log, and ``diagnostics.calibration`` compares. Each fit has a seed
+of its own: with one seed the errors of sampling would be the same in all. An amortised estimator is trained once, so that its errors are,
+and then conditions on each log. Every fit is one file, so an interrupted check goes on.
 
 A truth whose simulation diverges is drawn anew: the check is of the prior restricted to what can be simulated.
 """
@@ -36,6 +37,7 @@ FloatArray = NDArray[np.float64]
 Tell = Callable[[str, int, int], None]
 
 FITS, IDENTITY, RESULT = "fits", "check.json", "result.json"
+_VERSION = 2  # of what a fit's file holds: each fit has a seed of its own
 _DRAWS = 999
 _TRIES = 50  # truths drawn until one can be simulated
 _LEVEL = 0.9
@@ -60,12 +62,22 @@ class Study:
         name = self.estimator.name
         return f"Recalibrated({name}, refits={self.refits})" if self.refits else name
 
+    @property
+    def cost(self) -> tuple[int, int]:
+        """Rollouts of training once, and of each fit, at most."""
+        once = self.estimator.budget if self.estimator.amortised else 0
+        if self.refits:
+            whole_fit = Recalibrated(self.estimator, refits=self.refits).cost(self.trajectories)
+            return once, whole_fit - once
+        return once, 0 if once else self.estimator.budget
+
     def identity(self) -> dict[str, Any]:
         """What tells a check from others, as plain data."""
         process = [] if self.process is None else self.process.tolist()
         noise = {"sd": self.noise.sd.tolist(), "tau": self.noise.tau.tolist(), "process": process}
         settings = json.loads(json.dumps(self.estimator.settings(), default=str))
         return {
+            "version": _VERSION,
             "model": self.name,
             "method": self.method,
             "seed": self.seed,
@@ -78,7 +90,7 @@ class Study:
 @dataclass(frozen=True)
 class Fit:
     """One simulation and its posterior: truth (N,), draws (M, N) in theta, rollouts, seconds; error: why there are no draws; warned: what
-    the estimator said of itself."""
+    the estimator said of itself. Training once counts with the first."""
 
     truth: FloatArray
     draws: FloatArray
@@ -216,6 +228,7 @@ class _Worker:
         self.study, self.folder, self.tell = study, folder, tell
         self.replicas = Replicas(study.estimator.simulator, study.trajectories, study.noise, study.process)
         self._trained: Estimator | None = None
+        self._before: tuple[int, frozenset[str]] = (0, frozenset())  # rollouts and warnings of training
 
     def fit(self, number: int) -> Fit:
         truth, log = self._log(number)
@@ -229,8 +242,10 @@ class _Worker:
                 draws = found.sample((_DRAWS,), generator=generator).numpy()
             except ValueError as problem:  # LinAlgError is one
                 error = " ".join(str(problem).split()) or type(problem).__name__
-        seconds, warned = time.monotonic() - began, tuple(estimator.warnings)
-        return Fit(truth, draws, estimator.rollouts, seconds, error, warned)
+        seconds = time.monotonic() - began
+        rollouts, said = self._before if number else (0, frozenset())
+        warned = tuple(words for words in estimator.warnings if words not in said)
+        return Fit(truth, draws, estimator.rollouts - rollouts, seconds, error, warned)
 
     def _log(self, number: int) -> tuple[FloatArray, Trajectories]:
         rng, generator = np.random.default_rng([self.study.seed, 1, number]), torch.Generator()
@@ -252,7 +267,11 @@ class _Worker:
             self._trained.progress = self.tell
             self._trained.fit(study.trajectories)
             self._trained.progress = None
-        base = self._trained or fresh(study.estimator)
+            self._before = self._trained.rollouts, frozenset(self._trained.warnings)
+        base = self._trained
+        if base is None:
+            base = fresh(study.estimator)
+            base.seed = self._seed(5, number)
         return Recalibrated(base, refits=study.refits, seed=self._seed(4, number)) if study.refits else base
 
     def _seed(self, *what: int) -> int:
@@ -296,7 +315,8 @@ def study_of_task(
     threads: int | None,
 ) -> Study:
     """A benchmark task: one demonstration's commands and start, white noise of ``noise`` times each channel's spread. The methods
-    that search use single control steps of recorded states without noise, ``StateSpace`` with it."""
+    that search use ``StateSpace``, or without noise, and where the controller has a memory that it does not know, single control
+    steps of recorded states."""
     from sipe_bayes.demonstration import demonstrations
     from sipe_bayes.envs.registry import make_task
     from sipe_bayes.inference.registry import estimator_class
@@ -311,7 +331,7 @@ def study_of_task(
     likelihood: Any = Segments(simulator.dt, noise="white", starts="recorded", noise_sd=tuple(sd.tolist()))
     if estimator_class(estimator).searches:
         likelihood = replace(likelihood, noise_sd=None)
-        if noise:
+        if noise and not simulator.environment.memory_size:
             from sipe_bayes.state_space import StateSpace
 
             likelihood = StateSpace()

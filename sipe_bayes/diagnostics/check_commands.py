@@ -64,9 +64,11 @@ def check(
         path = Path(target)
         stem = path.resolve().parent.name if path.stem in ("calibrate", "config") else path.stem
         folder = out or Path("checks") / f"{stem}-{estimator}{f'-recalibrated{refits}' if refits else ''}"
-        each = study.estimator.budget if not study.estimator.amortised else 1
+        once, each = study.cost
+        trained = f"one training of {once} rollouts, then " * bool(once)
+        of = f" of at most {each} rollouts each" * bool(each)
         if not as_json:
-            print(f"{truths} fits of at most {each * (refits + 1)} rollouts each, kept in {folder}", flush=True)
+            print(f"{trained}{truths} fits{of}, kept in {folder}", flush=True)
         found = checks.run(study, truths, folder, _say if not as_json and sys.stderr.isatty() else _silent)
     if as_json:
         print(to_json(found.to_dict()))
