@@ -89,6 +89,70 @@ def test_the_gymnasium_wrapper_writes_draws_as_the_library_does(case: tuple[Mjcf
         space["PosteriorRandomization"](robot)
 
 
+BODIES = """
+<mujoco><worldbody>
+  <body name="arm"><joint name="hinge" axis="0 1 0" damping="0.1" stiffness="0.5"/>
+    <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.02" mass="0.5"/>
+    <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="1 0 0"/><joint name="twist" axis="1 1 1"/>
+    <geom size="0.03" mass="0.2"/></body></body>
+  </worldbody><actuator><motor name="motor" joint="hinge"/><position name="servo" joint="twist" kp="2"/></actuator></mujoco>"""
+
+
+class Bodies(Robot):
+    def __init__(self, xml: str = BODIES) -> None:
+        self.model = mujoco.MjModel.from_xml_string(xml)
+
+
+def accelerations(model: Any) -> np.ndarray:
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = 0.3, 0.5, 0.2
+    mujoco.mj_forward(model, data)
+    return data.qacc.copy()
+
+
+@pytest.mark.parametrize(
+    ("target", "low", "high"),
+    [
+        *(("body:arm.mass", 0.2, 1.0), ("body:tip.com_x", -0.2, 0.2), ("body:tip.inertia_xy", -2e-5, 2e-5)),
+        *(("body:tip.inertia_yy", 6e-5, 1.2e-4), ("joint:hinge.damping", 0, 1), ("joint:hinge.frictionloss", 0, 1)),
+        *(("joint:twist.armature", 0, 1), ("joint:hinge.stiffness", 0, 3), ("joint:hinge.springref", -1, 1)),
+        *(("actuator:motor.gear", 0.5, 2), ("actuator:motor.gain", 0.5, 2), ("actuator:servo.kp", 1, 4)),
+        *(("actuator:motor.kv", 0, 2), ("actuator:motor.bias_force", 0, 1), ("actuator:motor.bias_position", -2, 0)),
+        *(("actuator:motor.bias_velocity", -2, 0), ("actuator:motor.offset", 0, 1), ("option.gravity_x", -2, 2)),
+        *(("option.density", 0, 300), ("option.viscosity", 0, 3)),
+    ],
+)
+def test_the_users_own_model_moves_as_the_calibrated_one(target: str, low: float, high: float) -> None:
+    """Accelerations after the wrapper wrote a draw into the MJCF as it is, which changes them."""
+    parameter = Parameter("value", low, high, targets=(target,))
+    environment = MjcfEnvironment.build(BODIES, [parameter], ["motor"], ["joint:hinge.position"])
+    draws = environment.space.values(np.array([[0.9]]))
+    space: dict[str, Any] = {}
+    exec(sources(environment, draws)["gymnasium_wrapper.py"], space)
+    wrapped, own = space["PosteriorRandomization"](Bodies()), environment.compile()
+    wrapped.reset(seed=0)
+    environment.write(own, draws[0])
+    mujoco.mj_setConst(own, mujoco.MjData(own))
+    found = accelerations(wrapped.unwrapped.model)
+    np.testing.assert_allclose(found, accelerations(own), rtol=1e-6, atol=1e-9)
+    assert np.abs(found - accelerations(Bodies().model)).max() > 1e-6
+
+
+def test_a_delay_asks_for_a_model_that_remembers_commands() -> None:
+    """Refused in the MJCF as it is, taken in the one that ``identified.xml`` is."""
+    parameters = [Parameter("delay", 0.0, 0.03, targets=("actuator:motor.delay",))]
+    environment = MjcfEnvironment.build(BODIES, parameters, ["motor"], ["joint:hinge.position"])
+    space: dict[str, Any] = {}
+    exec(sources(environment, np.array([[0.02]]))["gymnasium_wrapper.py"], space)
+    with pytest.raises(ValueError, match=r"expected nhistory = \d+, got 0; load identified\.xml"):
+        space["PosteriorRandomization"](Bodies())
+    spec = environment.spec()
+    spec.compile()
+    wrapped = space["PosteriorRandomization"](Bodies(spec.to_xml()))
+    wrapped.reset(seed=0)
+    assert wrapped.unwrapped.model.actuator_delay[0] == 0.02
+
+
 def test_files_are_python_and_name_what_has_no_place(case: tuple[MjcfEnvironment, np.ndarray], tmp_path: Path) -> None:
     environment, draws = case
     paths = write_randomization(environment, draws, tmp_path / "randomization")
@@ -104,8 +168,15 @@ def test_files_are_python_and_name_what_has_no_place(case: tuple[MjcfEnvironment
     assert "# dry friction in N m" in isaac
     assert "damping: " in isaac
     assert "controller's gain" in isaac
-    mean, sd = draws[:, 0].mean(), draws[:, 0].std()
-    assert f'"mass_distribution_params": ({mean:.9g}, {sd:.9g})' in isaac
+    low, high = np.quantile(draws[:, 0], [0.05, 0.95])  # a normal with this sd would reach below zero
+    assert (
+        f'"mass_distribution_params": ({low:.9g}, {high:.9g}), "operation": "abs", "distribution": "uniform"' in isaac
+    )
+    narrow = draws.copy()
+    narrow[:, 0] = 0.5 + 0.1 * (draws[:, 0] - draws[:, 0].mean())
+    mean, sd = narrow[:, 0].mean(), narrow[:, 0].std()
+    said = sources(environment, narrow)["isaac_lab_events.py"]
+    assert f'"mass_distribution_params": ({mean:.9g}, {sd:.9g}), "operation": "abs", "distribution": "gaussian"' in said
     assert "# actuator:motor.gear:" in isaac
     playground = (tmp_path / "randomization" / "mujoco_playground.py").read_text()
     functions = [n.name for n in ast.parse(playground).body if isinstance(n, ast.FunctionDef)]
@@ -133,6 +204,10 @@ def test_friction_that_mjx_would_not_know_is_refused(
     space: dict[str, Any] = {}
     exec(sources(environment, draws)["mujoco_playground.py"], space)
     model = environment.compile()
+    with pytest.raises(ValueError, match=r"body_sameframe is not that of the calibrated model.*load identified\.xml"):
+        space["randomize_fn"](model, None)
+    for name, (places, values) in space["KINDS"].items():
+        getattr(model, name).flat[places] = values
     with pytest.raises(ValueError, match=r"dof_frictionloss is 0 where it is drawn.*load identified\.xml"):
         space["randomize_fn"](model, None)
     model.dof_frictionloss[:] = 0.05
@@ -148,6 +223,8 @@ def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, 
     space: dict[str, Any] = {}
     exec(sources(environment, draws)["mujoco_playground.py"], space)
     given = environment.compile()
+    for name, (places, values) in space["KINDS"].items():
+        getattr(given, name).flat[places] = values
     given.dof_frictionloss[1] = 0.05
     model = mjx.put_model(given)
     batched, in_axes = space["randomize_fn"](model, jax.random.split(jax.random.key(0), 5))

@@ -2,8 +2,11 @@
 
 Playground and Gymnasium get the posterior itself: a table of draws, each as the numbers of MjModel that differ from the model as
 given, derived constants (mj_setConst) included, found by writing the draw into the model and comparing it field by field. So
-correlations are kept and every target is covered that is a number of the model. Isaac Lab has no MjModel: its event terms take each
-parameter's mean and sd as normals of their own, where an event for the target exists; what is lost stands in comments.
+correlations are kept and every target is covered that is a number of the model. Whole numbers in which the calibrated model differs from
+the MJCF as it is (the kind of an actuator's bias, whether a body's frame is its centre of mass's) are written once, or where
+MJX fixes them on loading asked for; sizes (a delay's command history) must be those of ``identified.xml``. Isaac Lab has no MjModel:
+its event terms take each parameter's mean and sd as normals of their own, or its 90 % interval where a normal would reach below zero,
+where an event for the target exists; what is lost stands in comments.
 
 Each file is compiled before it is written; sensor biases and other things without a place in a model are named in comments.
 """
@@ -19,13 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.atomic import write_text
-from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.envs.mjcf import MjcfEnvironment, compile_spec, load_spec
 from sipe_bayes.envs.targets import split
 
 FloatArray = NDArray[np.float64]
 
+_SIZES = ("nbody", "njnt", "nv", "nu", "ngeom")
 _OPTIONS = ("gravity", "wind", "density", "viscosity")
 _SKIPPED = ("bvh", "oct", "tex", "name", "path", "_")
+_REACH = 4.0  # sds: what a normal is taken to reach
 _DIGITS = 9  # significant, of numbers in the tables
 
 _NO_EVENT = {
@@ -41,6 +46,7 @@ import jax
 import jax.numpy as jp
 
 SIZES = {sizes}
+KINDS = {kinds}  # field of the model -> places in the flattened field, and their values
 # field of the model -> places in the flattened field, and one row of values for each draw
 TABLE = {table}
 
@@ -49,7 +55,11 @@ def randomize_fn(model, rng):
     """One posterior draw for each key of ``rng`` (B, 2): the model with batched fields, and its in_axes."""
     for name, size in SIZES.items():
         if getattr(model, name) != size:
-            raise ValueError(f"model: expected {{name}} = {{size}}, got {{getattr(model, name)}}; use the calibrated MJCF")
+            raise ValueError(f"model: expected {{name}} = {{size}}, got {{getattr(model, name)}}; load identified.xml")
+    for name, (places, values) in KINDS.items():
+        found = getattr(model, name, None)
+        if found is not None and [int(found.ravel()[place]) for place in places] != values:
+            raise ValueError(f"model: {{name}} is not that of the calibrated model, and MJX fixes it on loading; load identified.xml")
     rubs = [float(model.dof_frictionloss[place]) > 0 for place in TABLE.get("dof_frictionloss", ((), ()))[0]]
     if not all(rubs):
         raise ValueError("model: dof_frictionloss is 0 where it is drawn, and MJX then knows no friction there; load identified.xml")
@@ -77,19 +87,22 @@ import gymnasium
 import numpy as np
 
 SIZES = {sizes}
+KINDS = {kinds}  # field of the model -> places in the flattened field, and their values
 # field of the model -> places in the flattened field, and one row of values for each draw
 TABLE = {table}
 
 
 class PosteriorRandomization(gymnasium.Wrapper):
-    """Writes a posterior draw into ``env.unwrapped.model`` at every reset, drawn with the environment's own generator."""
+    """Writes a posterior draw into ``env.unwrapped.model`` at every reset, drawn with a generator of its own that ``reset(seed=...)`` seeds."""
 
     def __init__(self, env):
         super().__init__(env)
         model = env.unwrapped.model
         for name, size in SIZES.items():
             if getattr(model, name) != size:
-                raise ValueError(f"model: expected {{name}} = {{size}}, got {{getattr(model, name)}}; use the calibrated MJCF")
+                raise ValueError(f"model: expected {{name}} = {{size}}, got {{getattr(model, name)}}; load identified.xml")
+        for name, (places, values) in KINDS.items():
+            getattr(model, name).flat[places] = values
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
@@ -129,9 +142,8 @@ def sources(environment: MjcfEnvironment, draws: FloatArray) -> dict[str, str]:
     table, kept = _table(environment, draws)
     if not kept:
         raise ValueError("draws: expected some that a model can have, got none; look at the posterior")
-    model = environment.compile()
     names = ", ".join(environment.space.names)
-    sizes = {name: int(getattr(model, name)) for name in ("nbody", "njnt", "nv", "nu", "ngeom")}
+    sizes, kinds = _fixed(environment, draws)
     remarks = "".join(f"\n\n{line}" for line in _remarks(environment))
     found = {}
     for file, what, body in (
@@ -140,7 +152,7 @@ def sources(environment: MjcfEnvironment, draws: FloatArray) -> dict[str, str]:
     ):
         head = _HEAD.format(what=what, count=kept, names=names, remarks=remarks)
         text = pprint.pformat(table, width=120, compact=True, sort_dicts=True)
-        found[file] = head + body.format(sizes=sizes, table=text, count=kept)
+        found[file] = head + body.format(sizes=sizes, kinds=kinds, table=text, count=kept)
     head = _HEAD.format(what="Isaac Lab's event terms", count=kept, names=names, remarks=remarks)
     found["isaac_lab_events.py"] = head + _ISAAC.format(terms=_terms(environment, draws))
     for file, text in found.items():
@@ -176,6 +188,27 @@ def _table(environment: MjcfEnvironment, draws: FloatArray) -> tuple[dict[str, A
     return table, len(rows)
 
 
+def _fixed(
+    environment: MjcfEnvironment, draws: FloatArray
+) -> tuple[dict[str, int], dict[str, tuple[list[int], list[int]]]]:
+    """Sizes that a model must have, and the whole numbers in which the calibrated one differs from the MJCF as it is."""
+    plain, changed = compile_spec(load_spec(environment.source), environment.source), environment.compile()
+    next(values for values in draws if environment.write(changed, values))
+    mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    sizes, kinds = {name: int(getattr(changed, name)) for name in _SIZES}, {}
+    for name in sorted(dir(changed)):
+        if name.startswith(_SKIPPED):
+            continue
+        value, before = getattr(changed, name), getattr(plain, name)
+        if type(value) is int and value != before:
+            sizes[name] = value
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iub" and value.shape == before.shape:
+            places = np.flatnonzero(value.ravel() != before.ravel())
+            if len(places) and not name.endswith("adr"):
+                kinds[name] = places.tolist(), [int(x) for x in value.ravel()[places]]
+    return sizes, kinds
+
+
 def _numbers(model: Any) -> dict[str, FloatArray]:
     """The model's fields of floating-point numbers, and its options'."""
     found = {}
@@ -201,17 +234,18 @@ def _remarks(environment: MjcfEnvironment) -> list[str]:
 def _terms(environment: MjcfEnvironment, draws: FloatArray) -> str:
     lines = []
     for j, parameter in enumerate(environment.parameters):
-        mean, sd = float(draws[:, j].mean()), float(draws[:, j].std())
         for number, (target, factor) in enumerate(environment.multipliers(parameter).items()):
-            term = None if target.startswith("sensor:") else _event(target, factor * mean, abs(factor) * sd)
+            values = factor * draws[:, j]
+            term = None if target.startswith("sensor:") else _event(target, values)
             label = "".join(c if c.isalnum() else "_" for c in f"{parameter.name}_{number}" if c.isascii())
             if term is None:
                 why = _NO_EVENT.get(target.rpartition(".")[2], "no event of Isaac Lab sets it")
-                lines.append(f"    # {target}: {factor * mean:.6g} +- {abs(factor) * sd:.2g} {parameter.unit}; {why}")
+                lines.append(f"    # {target}: {values.mean():.6g} +- {values.std():.2g} {parameter.unit}; {why}")
             else:
                 function, entity, settings = term
                 lines += [
                     *([f"    # {_FRICTION}"] if "friction" in settings else []),
+                    *(["    # its 90 % interval: a normal would reach below zero"] if "uniform" in settings else []),
                     f"    event_{label} = EventTerm(",
                     f"        func=mdp.{function},",
                     '        mode="reset",' if function == "randomize_joint_parameters" else '        mode="startup",',
@@ -221,11 +255,15 @@ def _terms(environment: MjcfEnvironment, draws: FloatArray) -> str:
     return "\n".join(["    # independent normals: correlations between parameters are lost here", *lines, "    pass"])
 
 
-def _event(target: str, mean: float, sd: float) -> tuple[str, str, str] | None:
-    """Function, entity and settings of the event that sets a target."""
+def _event(target: str, values: FloatArray) -> tuple[str, str, str] | None:
+    """Function, entity and settings of the event that sets a target, none of whose values may be negative, from draws (D,)."""
     kind, name, attribute = split(target)
-    how = '"operation": "abs", "distribution": "gaussian"'
-    pair = f"({mean:.9g}, {sd:.9g})"
+    mean, sd = float(values.mean()), float(values.std())
+    ends, shape = (mean, sd), "gaussian"
+    if mean < _REACH * sd:
+        ends, shape = (float(np.quantile(values, 0.05)), float(np.quantile(values, 0.95))), "uniform"
+    how = f'"operation": "abs", "distribution": "{shape}"'
+    pair = f"({ends[0]:.9g}, {ends[1]:.9g})"
     if (kind, attribute) == ("body", "mass"):
         return "randomize_rigid_body_mass", f"body_names={[name]!r}", f'"mass_distribution_params": {pair}, {how}'
     if kind == "joint" and attribute in ("frictionloss", "armature"):
