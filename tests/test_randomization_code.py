@@ -216,8 +216,9 @@ def test_friction_that_mjx_would_not_know_is_refused(
 
 
 def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, np.ndarray]) -> None:
-    mjx = pytest.importorskip("mujoco.mjx", reason="mujoco-mjx is not installed")
+    """In MJX: fields of one draw each, and accelerations as MuJoCo has them with that draw, to single precision."""
     import jax
+    from mujoco import mjx
 
     environment, draws = case
     space: dict[str, Any] = {}
@@ -231,5 +232,15 @@ def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, 
     assert batched.body_mass.shape == (5, 3)
     assert in_axes.body_mass == 0
     assert in_axes.body_pos is None
-    for mass in np.asarray(batched.body_mass)[:, 1]:
-        assert np.abs(draws[:, 0] - mass).min() < 1e-5
+    data = mjx.make_data(given).replace(qpos=np.full(2, 0.3), qvel=np.full(2, 0.5), ctrl=np.full(1, 0.2))
+    found = jax.vmap(lambda one: mjx.forward(one, data).qacc, in_axes=(in_axes,))(batched)
+    for mass, moved in zip(np.asarray(batched.body_mass)[:, 1], np.asarray(found), strict=True):
+        number = int(np.abs(draws[:, 0] - mass).argmin())
+        assert draws[number, 0] == pytest.approx(mass, abs=1e-5)
+        own = environment.compile()
+        environment.write(own, draws[number])
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        plain = mujoco.MjData(own)
+        plain.qpos[:], plain.qvel[:], plain.ctrl[:] = 0.3, 0.5, 0.2
+        mujoco.mj_forward(own, plain)
+        np.testing.assert_allclose(moved, plain.qacc, rtol=2e-3, atol=2e-3)
