@@ -113,7 +113,7 @@ def _correlated(found: tuple[dict[Target, float], float] | None) -> list[str]:
         "## Does a better posterior train a better policy?",
         "",
         "Spearman's rank correlation of the percentage with minus the CRPS, over a target's rows without noise and delay: 1 where the better posterior "
-        "always earns more, 0 where it makes no difference.",
+        "always earns more, 0 where it makes no difference. The p-value takes targets and randomisations as independent.",
         "",
         *("| target | rank correlation |", "|---|---|"),
         *(f"| {_words(target).replace(' target:', '')} | {value:.2f} |" for target, value in by_target.items()),
