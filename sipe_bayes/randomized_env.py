@@ -47,6 +47,10 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
             raise ValueError(
                 f"env: {type(env.unwrapped).__name__} is not of sipe.make; pass write(env, values), which gives it the parameters"
             )
+        if write is not None and not callable(write):
+            raise ValueError(
+                f"write: expected a function of the environment and a dict of values by name, got {write!r}"
+            )
         self._write, self._draws = write, None
         if write is None:
             assert isinstance(simulator, Simulator)

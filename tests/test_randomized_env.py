@@ -98,6 +98,9 @@ def test_own_environment_gets_values_by_name() -> None:
     with pytest.raises(ValueError, match=r"env: PendulumEnv is not of sipe\.make; pass write\(env, values\)"):
         randomized(env=env)
 
+    with pytest.raises(ValueError, match="write: expected a function of the environment and a dict of values"):
+        randomized(env=env, write=3)
+
     def write(inner: Any, values: dict[str, float]) -> None:
         got.append(values)
         inner.unwrapped.m, inner.unwrapped.l = values["mass"], values["length"]

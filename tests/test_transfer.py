@@ -1,5 +1,6 @@
 """Sim2sim transfer: its cells, killed and resumed runs, what is refused, and what the report makes of returns."""
 
+import io
 import json
 import random
 import shutil
@@ -13,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 from typer.testing import CliRunner, Result
 
 import sipe_bayes as sipe_package
@@ -418,10 +418,16 @@ def test_rows_and_table() -> None:
     text = table(rows(given), given)
     assert "| adr | 0.10 |  | 2 | 650.0 ± 50.0 | 55 (50 to 60) | 59 (55 to 64) |" in text
     assert "| adr, wider=2.0 | prior (uniform) | 75.0 | 75.0 |" in text
-    for figure in (bars(rows(given)), curves(given)):
-        assert {t.get_text() for t in figure.legends[0].get_texts()} >= {"truth (oracle)", "prior (uniform)", "adr"}
-    heights = sorted(p.get_height() for p in bars(rows(given)).axes[0].patches)
-    assert heights == [25, 55, 100]
+    assert {t.get_text() for t in curves(given).legends[0].get_texts()} >= {"truth (oracle)", "prior (uniform)", "adr"}
+    (panel,) = bars(rows(given)).axes
+    assert [t.get_text() for t in panel.get_yticklabels()] == ["prior (uniform)", "adr", "adr, wider=2.0"]
+    assert [p.get_width() for p in panel.patches[1:]] == [25, 55, 100]  # behind them the oracle's shade
+    assert sorted(x for line in panel.lines if line.get_marker() == "o" for x in line.get_xdata()) == [25, 50, 60, 100]
+    points = [replace(r, sd=[0.0, 0.0]) for r in given]
+    assert "| adr, wider=2.0 (a point: not widened) |" in table(rows(points), points)
+    assert "5 agents" not in text
+    assert "7 agents, 0.0 h of CPU, but for 7 that" in text
+    assert "The oracle's seeds earn 100, 100, 100 % of their mean." in text
 
 
 def test_negative_returns_and_a_missing_oracle() -> None:
@@ -434,7 +440,7 @@ def test_negative_returns_and_a_missing_oracle() -> None:
     assert "for the oracle is lacking: run also `--select HalfCheetahLinks/truth`" in table(
         [alone], [record("adr", 0, 700.0)]
     )
-    assert "no target has an oracle" in bars([alone]).axes[0].texts[0].get_text()
+    assert "no target has an oracle" in bars([alone]).texts[0].get_text()
     failing = [record("truth", k, earned) for k, earned in enumerate((100.0, 1100.0))]
     assert "for an oracle fails" in table(rows(failing), failing)
 
@@ -487,16 +493,19 @@ def test_variations_are_held_against_what_they_vary() -> None:
 
 def test_whether_better_posteriors_train_better_policies() -> None:
     """Four randomisations in the same order of quality and return have a correlation of one, and of 24 orders two are as far from zero
-    (p is within .01 of that, 3.6 sds of its permutations); with a second target in the opposite order the mean is zero. What is
-    noisy or not scored does not count."""
+    (p is within .01 of that, 3.6 sds of its permutations); with a second target in the opposite order the mean is zero. The oracle,
+    variations and what is not scored do not count."""
     given, crps = [], {}
     for task, sign in (("HalfCheetahLinks", 1), ("FetchPush", -1)):
-        for k, name in enumerate(("truth", "prior", "adr", "npe")):
+        for k, name in enumerate(("prior", "adr", "npe", "laplace")):
             one = record(name, 0, 1100.0 - 50 * k, task)
             given.append(one)
-            crps[one.id] = 0.1 * sign * k
+            crps[one.id] = 0.2 + 0.1 * sign * k
+        oracle = record("truth", 0, 500.0, task)
+        given.append(oracle)
+        crps[oracle.id] = 0.0
     noisy = replace(record("cem", 0, 2000.0), setting=f"{SETTING},action_delay=2")
-    found = by_quality(rows([*given[:4], noisy, record("maml", 0, 3000.0)], {**crps, noisy.id: 0.9}))
+    found = by_quality(rows([*given[:5], noisy, record("maml", 0, 3000.0)], {**crps, noisy.id: 0.9}))
     assert found is not None
     assert found[0] == pytest.approx({("HalfCheetahLinks", "in_distribution"): 1.0})
     assert found[1] == pytest.approx(2 / 24, abs=0.01)
@@ -527,13 +536,27 @@ def test_the_studys_figures_tell_every_randomisation_apart() -> None:
     found = rows(given)
     names = [n for n in in_order({row.name for row in found}) if n != "truth"]
     assert len(names) == 12
-    left, right = bars(found).legends[0], curves(given).legends[0]
-    said, again = ([text.get_text() for text in legend.get_texts()] for legend in (left, right))
-    assert said == again == ["truth (oracle)", *(WORDS.get(n, n) for n in names)]
-    filled = [patch.get_facecolor()[:3] for patch in left.legend_handles[1:]]
-    assert filled == [to_rgb(line.get_color()) for line in right.legend_handles[1:]]
+    said = [text.get_text() for text in curves(given).legends[0].get_texts()]
+    assert said == ["truth (oracle)", *(WORDS.get(n, n) for n in names)]
     looks = [transfer_figures._look(name, names) for name in ["truth", *names]]
-    assert len({(look.colour, look.line) for look in looks}) == len({(look.colour, look.hatch) for look in looks}) == 13
+    assert len({(look.colour, look.line) for look in looks}) == 13
+    for panel in bars(found).axes:
+        task, variant = panel.get_title().replace("in distribution", "in_distribution").split(", ")
+        there = [row.name for row in found if row.group == (task, variant) and row.name != "truth"]
+        assert [text.get_text() for text in panel.get_yticklabels()] == [WORDS.get(n, n) for n in there]
+
+
+def test_long_names_keep_to_the_figure() -> None:
+    """A single panel with three variations at once."""
+    long = "wider=2.0,observation_noise=0.01,action_delay=2"
+    given = [replace(record(name, 0, 500.0), id=f"{name},{v}", setting=",".join([SETTING, *([v] if v else [])]))
+             for name in ("truth", "prior", "laplace", "regression") for v in (("", long) if name != "truth" else ("",))]  # fmt: skip
+    for figure in (curves(given), bars(rows(given))):
+        figure.savefig(io.BytesIO())
+        width = figure.bbox.width
+        boxes = [t.get_window_extent() for legend in figure.legends for t in legend.get_texts()]
+        boxes += [t.get_window_extent() for axes in figure.axes for t in axes.get_yticklabels()]
+        assert all(box.x0 >= 0 and box.x1 <= width for box in boxes)
 
 
 def test_the_example_runs(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,20 +19,26 @@ from sipe_bayes.benchmark.transfer_rows import WORDS, Percent, Row, Target, by_q
 from sipe_bayes.benchmark.transfer_run import believed, load, qualities, stale
 from sipe_bayes.diagnostics.drawing import png
 
-_EXPLAINED = """Every agent trains with the same settings, steps and seed, and acts in the target as it is. ± is the standard error over seeds. The
-percentage is 100 (R - Z) / (O - Z), R the return, O that of the oracle, Z of a policy that acts at random; the paper's is 100 R / O, left out
-where an oracle earns hardly more than 0. The oracle is an agent like the others, no upper bound: its own training has its luck, which every
-percentage shares. In brackets the 95 % bootstrap interval over seeds. With three seeds it ends at the best and the worst one and covers less than it says.
+_EXPLAINED = """Every agent trains with the same settings, steps and seed, and acts in the target as it is: the model as published (default), or one each of whose
+parameters is .1 to .4 of its range away from that (in distribution). ± is the standard error over seeds. The percentage is 100 (R - Z) / (O - Z),
+R the return, O that of the oracle, Z of a policy that acts at random; the paper's is 100 R / O, left out where an oracle earns hardly more
+than 0. The oracle is an agent like the others, no upper bound: its own training has its luck, which every percentage shares.
+In brackets the 95 % bootstrap interval over seeds, agent and oracle of a seed drawn together: with three seeds it ends at the least and the
+greatest ratio of a seed's own two, and covers less than it says. The figure's dots, the CSV and the differences below divide by the mean oracle.
 Spread is the mean sd of what was drawn from, in theta (the prior's is 0.29); where it is 0.00 the posterior was as good as a point. CRPS is how far
-what was drawn from is from the truth, in theta, 0 the truth itself. Where the same training serves two targets, as the prior's does, their
-rows are not independent."""
+what was drawn from is from the truth, in theta, 0 the truth itself. Solve it: seeds whose agent reaches what `sipe envs TASK` calls solved. Redrawn:
+theta that no model can have; diverged: episodes. Where the same training serves two targets, as the prior's does, their rows are not
+independent."""
+
+
+_POINT = 1e-9  # in theta
 
 
 def table(found: Sequence[Row], records: Sequence[TransferRecord], remarks: Sequence[str] = ()) -> str:
     """Markdown. remarks: what else a reader must know."""
     said = ["# Sim2sim transfer", "", _EXPLAINED, ""]
-    for remark in [*remarks, *_same_targets(records)]:
-        said += [f"**Mind**: {remark}.", ""]
+    for remark in [_took(records), *remarks, *_same_targets(records)]:
+        said += [f"{remark[0].upper()}{remark[1:]}.", ""]
     for group in dict.fromkeys(row.group for row in found):
         of, mine = (
             [r for r in records if r.done and (r.task, r.variant) == group],
@@ -48,7 +55,19 @@ def table(found: Sequence[Row], records: Sequence[TransferRecord], remarks: Sequ
             "|---|---|---|---|---|---|---|---|---|---|---|---|",
         ]
         said += [_line(row) for row in mine] + [""]
+        oracle = next((row for row in mine if row.name == TRUTH and len(row.by_seed) > 1), None)
+        if oracle is not None:
+            seeds = ", ".join(f"{value:.0f}" for _, value in sorted(oracle.by_seed.items()))
+            said += [f"The oracle's seeds earn {seeds} % of their mean.", ""]
     return "\n".join([*said, *_compared(found), *_correlated(by_quality(found))])
+
+
+def _took(records: Sequence[TransferRecord]) -> str:
+    done = [r for r in records if r.done]
+    hours = sum(r.cpu_seconds or 0.0 for r in done) / 3600
+    lost = sum(r.cpu_seconds is None for r in done)
+    more = f", but for {lost} that were interrupted or share another's training" * bool(lost)
+    return f"{len(done)} agents, {hours:.1f} h of CPU{more}"
 
 
 def _words(target: Target) -> str:
@@ -82,14 +101,16 @@ def _compared(found: Sequence[Row]) -> list[str]:
         return []
     targets = [g for g in dict.fromkeys(row.group for row in found) if any(g in c.by_target for c in compared)]
     seeds = sorted({len(c.gains) for c in compared})
-    tests = sum(len(c.by_target) + (len(c.by_target) > 1) for c in compared)
+    tests = sum(len(c.by_target) + (len(c.by_target) > 1) for c in compared if len(c.gains) > 1)
     head = [*("trained under", "against", "mean of its targets"), *(_words(t).replace(" target:", "") for t in targets)]
     lines = [
         "## What a randomisation is worth",
         "",
-        f"Differences in % of the oracle, seed by seed ({' or '.join(map(str, seeds))} of them). better, worse: outside noise by a t-test over seeds at "
-        f"5 %; the other differences are not told apart from none, which with few seeds says little. The {tests} tests are not corrected for their "
-        f"number: chance alone would call {LEVEL * tests:.1f} of them better or worse.",
+        "Differences in % of the oracle, seed by seed; of the mean of its targets, that mean is taken seed by seed first. ± is the standard error over "
+        f"seeds ({' or '.join(map(str, seeds))} of them), which share the luck of what is held against. better, worse: outside noise by a t-test over seeds at "
+        "5 %; the other differences are not told apart from none, which with few seeds says little; one seed tells nothing."
+        + f" The {tests} tests are not corrected for their number: chance alone would call {LEVEL * tests:.1f} of them better or worse."
+        * (tests > 0),
         "",
         f"| {' | '.join(head)} |",
         "|---" * len(head) + "|",
@@ -112,8 +133,8 @@ def _correlated(found: tuple[dict[Target, float], float] | None) -> list[str]:
     return [
         "## Does a better posterior train a better policy?",
         "",
-        "Spearman's rank correlation of the percentage with minus the CRPS, over a target's rows without noise and delay: 1 where the better posterior "
-        "always earns more, 0 where it makes no difference. The p-value takes targets and randomisations as independent.",
+        "Spearman's rank correlation of the percentage with minus the CRPS, over a target's rows but the oracle's and variations': 1 where the better "
+        "posterior always earns more, 0 where it makes no difference. The p-value takes targets and randomisations as independent.",
         "",
         *("| target | rank correlation |", "|---|---|"),
         *(f"| {_words(target).replace(' target:', '')} | {value:.2f} |" for target, value in by_target.items()),
@@ -131,7 +152,7 @@ def _spread(values: Sequence[float], digits: int = 1) -> str:
 def _line(row: Row) -> str:
     entries = [
         *(
-            WORDS.get(row.name, row.name),
+            WORDS.get(row.name, row.name) + " (a point: not widened)" * ("wider" in row.name and row.spread < _POINT),
             f"{row.spread:.2f}",
             "" if row.crps is None else f"{row.crps:.3f}",
             str(len(row.returns)),
@@ -164,9 +185,10 @@ def write(folder: Path, into: Path | None = None) -> list[Path]:
         qualities(records, drawn_from),
         [f"{cell} is stale, {why}" for cell, why in stale(drawn_from).items()],
     )
-    versions = {r.checksums.get("source", "") for r in records if r.done}
-    if len(versions) > 1:
-        remarks.append(f"these trainings were made with {len(versions)} versions of the code, which the records name")
+    versions = Counter((r.checksums.get("source", ""), r.task) for r in records if r.done)
+    if len({source for source, _ in versions}) > 1:
+        which = ", ".join(f"{source} ({count} of {task})" for (source, task), count in sorted(versions.items()))
+        remarks.append(f"these trainings were made with several versions of the code: {which}")
     found = rows(records, crps)
     text = {"transfer.md": table(found, records, remarks), "transfer.csv": _csv(records, crps)}
     drawn = {"bars.png": png(bars(found)), "curves.png": png(curves(records))}

@@ -199,14 +199,19 @@ def _contrast(
 
 
 def by_quality(found: Sequence[Row]) -> tuple[dict[Target, float], float] | None:
-    """Spearman's rank correlation of percent of the oracle with -CRPS over a target's randomisations without noise and delay, by target with
-    four of them at least, and the p-value of their mean by permutations within the targets; None without such a target."""
+    """Spearman's rank correlation of percent of the oracle with -CRPS over a target's randomisations, by target with four of them at least,
+    and the p-value of their mean by permutations within the targets; None without such a target. The oracle, of the best CRPS by definition,
+    and variations, which share a posterior, do not count."""
     ranked = {}
     for target in dict.fromkeys(row.group for row in found):
         of = [
             (-row.crps, row.percent[0])
             for row in found
-            if row.group == target and row.crps is not None and row.percent is not None and not _noisy(row.name)
+            if row.group == target
+            and row.name != TRUTH
+            and row.crps is not None
+            and row.percent is not None
+            and "," not in row.name
         ]
         if len(of) >= _LEAST_RANKED:
             ranked[target] = np.array([_standard_ranks(column) for column in np.array(of).T])
@@ -220,10 +225,6 @@ def by_quality(found: Sequence[Row]) -> tuple[dict[Target, float], float] | None
     )
     observed = float(np.mean(list(correlations.values())))
     return correlations, float((1 + (np.abs(chance) >= abs(observed) - 1e-12).sum()) / (1 + _PERMUTATIONS))
-
-
-def _noisy(name: str) -> bool:
-    return any(part.split("=")[0] in DISTURBING for part in _parts(name))
 
 
 def _standard_ranks(values: FloatArray) -> FloatArray:
