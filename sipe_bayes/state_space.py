@@ -14,7 +14,8 @@ https://doi.org/10.1137/0804035).
 The state's coordinates are tangents (dq (nv), dv (nv), dact (na)), so quaternions stay of length one; a difference of two
 states is MuJoCo's mj_differentiatePos. The first state of a log has a normal prior about the measured one whose sd is far
 wider than any measurement, or, where it is known, about the recorded one with an sd far narrower; command histories of
-delayed actuators are taken as commanded.
+delayed actuators are taken as commanded. What a controller remembers (``memory_size``) is computed from each state, as positions and
+velocities tell it.
 
 Deviations from the textbooks: measurement channels that the environment reads one physics step late (``derived_late``)
 are predicted by the step that led to the sample, so that process noise does not reach them.
@@ -72,10 +73,10 @@ class StateSpace:
         """The Chain of the trajectories; raises ValueError for logs or simulators that do not fit."""
         if not isinstance(simulator, Simulator):
             raise ValueError("likelihood: StateSpace needs a MuJoCo simulator with states; use sipe.Segments")
-        if simulator.environment.memory_size:
+        if simulator.environment.memory_size and self.starts == "estimated":
             raise ValueError(
-                f"likelihood: StateSpace does not know the controller's memory of {type(simulator.environment).__name__}; "
-                "use sipe.Segments"
+                f"likelihood: StateSpace looks for no controller's memory, as {type(simulator.environment).__name__} has one, in "
+                "measurements; use starts='recorded', or sipe.Segments"
             )
         return Chain(self, simulator, trajectories)
 
@@ -280,7 +281,7 @@ class Chain:
         result = self.simulator.rollout(
             lanes,
             np.tile(self.actions[at], (batch, 1, 1)),
-            states.reshape(batch * len(at), -1),
+            self._recalled(states.reshape(batch * len(at), -1), np.tile(self.dt[at], batch)),
             np.tile(self.dt[at], batch),
             names,
             goals=None if self.goals is None else np.tile(self.goals[at], (batch, 1)),
@@ -292,6 +293,20 @@ class Chain:
         sound = result.valid[:, 0] & (result.valid[:, 1] | ~np.tile(goes_on, batch))
         predicted = np.where(self.late, seen[:, 1], seen[:, 0]).reshape(*shape, -1)
         return predicted, result.states[:, 1].reshape(*shape, -1), sound.reshape(shape)
+
+    def _recalled(self, states: FloatArray, dt: FloatArray) -> FloatArray:
+        """States (B, S) with the memory that a controller comes to them with, which their positions and velocities tell: a physics step ago
+        the positions were less by these velocities."""
+        simulator, environment = self.simulator, self.simulator.environment
+        if not environment.memory_size:
+            return states
+        nq, nv = simulator.model.nq, simulator.model.nv
+        back = np.zeros((len(states), self.num_start))
+        timestep = np.array([simulator.physics_steps(float(d))[1] for d in dt])
+        back[:, :nv] = -timestep[:, None] * states[:, 1 + nq : 1 + nq + nv]
+        late = environment.probe(simulator.model, self.moved(states, back), states)
+        memory = environment.remember(simulator.engine.sensors([simulator.model] * len(late), late))
+        return np.concatenate([states[:, : simulator.engine.physics_size], memory], axis=1)
 
     def _spend(self, cost: float) -> None:
         cost += self.part

@@ -15,7 +15,6 @@ from sipe_bayes.diagnostics import check as checks
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.inference.state import State
-from sipe_bayes.likelihood import Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
@@ -181,12 +180,13 @@ def test_every_fit_has_a_seed_of_its_own(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(seeds) == len(set(seeds)) == 20
 
 
-def test_fetch_is_checked_from_recorded_states() -> None:
-    """Its controller has a memory that StateSpace does not know."""
-    given = {"steps": 10, "noise": 0.01, "budget": None, "refits": 0, "seed": 0, "threads": 1}
-    for task, kind in (("FetchPush", Segments), ("Pendulum", StateSpace)):
+def test_fetch_is_checked_from_its_recorded_start() -> None:
+    """Its controller has a memory, which StateSpace does not look for in measurements."""
+    given = {"steps": 4, "noise": 0.01, "budget": 300, "refits": 0, "seed": 0, "threads": 1}
+    for task, starts in (("FetchPush", "recorded"), ("Pendulum", "estimated")):
         study = checks.study_of_task(task, "laplace", **given)  # type: ignore[arg-type]
-        assert isinstance(study.estimator.likelihood, kind)
+        assert isinstance(study.estimator.likelihood, StateSpace)
+        assert study.estimator.likelihood.starts == starts
     study = checks.study_of_task("FetchPush", "laplace", **given)  # type: ignore[arg-type]
     fitted = checks._Worker(study, Path(), lambda *what: None).fit(0)
     assert fitted.error == ""

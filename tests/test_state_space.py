@@ -519,7 +519,7 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
         ),
         (
             lambda: StateSpace().bind(Simulator(sipe.make_task("FetchPush")), Trajectories.stack(spring_logs())),
-            "controller's memory of Fetch",
+            "no controller's memory, as Fetch has one, in measurements; use starts='recorded'",
         ),
         (lambda: StateSpace(starts="known"), "expected 'estimated' or 'recorded', got 'known'"),
         (

@@ -315,8 +315,8 @@ def study_of_task(
     threads: int | None,
 ) -> Study:
     """A benchmark task: one demonstration's commands and start, white noise of ``noise`` times each channel's spread. The methods
-    that search use ``StateSpace``, or without noise, and where the controller has a memory that it does not know, single control
-    steps of recorded states."""
+    that search use ``StateSpace``, where the controller has a memory with the recorded start; without noise single control steps of recorded
+    states."""
     from sipe_bayes.demonstration import demonstrations
     from sipe_bayes.envs.registry import make_task
     from sipe_bayes.inference.registry import estimator_class
@@ -331,10 +331,10 @@ def study_of_task(
     likelihood: Any = Segments(simulator.dt, noise="white", starts="recorded", noise_sd=tuple(sd.tolist()))
     if estimator_class(estimator).searches:
         likelihood = replace(likelihood, noise_sd=None)
-        if noise and not simulator.environment.memory_size:
+        if noise:
             from sipe_bayes.state_space import StateSpace
 
-            likelihood = StateSpace()
+            likelihood = StateSpace(starts="recorded" if simulator.environment.memory_size else "estimated")
     method = get_estimator(simulator, estimator, budget=budget, seed=seed, likelihood=likelihood)
     return Study(name, method, log, Noise(sd, np.zeros(len(sd))), refits, seed)
 
