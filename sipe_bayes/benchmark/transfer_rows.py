@@ -6,9 +6,10 @@ means something only where returns are positive. Deviation: here zero is a polic
 
     100 (R - Z) / (O - Z),
 
-and the paper's percentage stands beside it. Neither is given where an oracle earns hardly more than zero (``relative``). Intervals: 95 %, percentile bootstrap over seeds (B. Efron
-1979, "Bootstrap Methods: Another Look at the Jackknife", https://doi.org/10.1214/aos/1176344552), a seed's agent and oracle drawn together. With
-three seeds it has ten different resamples and ends at the best and the worst seed.
+and the paper's percentage stands beside it. Neither is given where an oracle earns hardly more than zero (``relative``). Intervals:
+95 %, percentile bootstrap over seeds (B. Efron 1979, "Bootstrap Methods: Another Look at the Jackknife",
+https://doi.org/10.1214/aos/1176344552), a seed's agent and oracle drawn together. With three seeds it has ten different resamples and ends
+at the least and the greatest ratio of a seed's agent to its own oracle.
 
 What a randomisation is worth against another one is told by differences in that percentage, seed by seed, in each target and over all
 that have both (``contrasts``). Whether a better posterior trains a better policy is told by rank correlations of the percentage with the CRPS
