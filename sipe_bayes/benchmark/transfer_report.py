@@ -40,10 +40,8 @@ def table(found: Sequence[Row], records: Sequence[TransferRecord], remarks: Sequ
     for remark in [_took(records), *remarks, *_same_targets(records)]:
         said += [f"{remark[0].upper()}{remark[1:]}.", ""]
     for group in dict.fromkeys(row.group for row in found):
-        of, mine = (
-            [r for r in records if r.done and (r.task, r.variant) == group],
-            [r for r in found if r.group == group],
-        )
+        of = [r for r in records if r.done and (r.task, r.variant) == group]
+        mine = [r for r in found if r.group == group]
         steps = sorted({r.training for r in of})
         said += [
             f"## {_words(group)}",
@@ -181,10 +179,8 @@ def write(folder: Path, into: Path | None = None) -> list[Path]:
     if not any(r.done for r in records):
         raise RecordError(f"{folder}: every cell of the transfer failed; `sipe transfer status {folder}` shows why")
     drawn_from = believed(records, folder)
-    crps, remarks = (
-        qualities(records, drawn_from),
-        [f"{cell} is stale, {why}" for cell, why in stale(drawn_from).items()],
-    )
+    crps = qualities(records, drawn_from)
+    remarks = [f"{cell} is stale, {why}" for cell, why in stale(drawn_from).items()]
     versions = Counter((r.checksums.get("source", ""), r.task) for r in records if r.done)
     if len({source for source, _ in versions}) > 1:
         which = ", ".join(f"{source} ({count} of {task})" for (source, task), count in sorted(versions.items()))

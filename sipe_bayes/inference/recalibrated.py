@@ -26,7 +26,8 @@ width of the neighbourhood is not a second prior. One mode: estimates that jump 
 normals of sd 10 about the cube's centre, flat within it to half a percent. Replicas have first-order autoregressive noise as
 ``laplace`` finds it in a measured log, whatever noise the estimator believes in; where states are recorded, the noise that the estimator
 infers, and for those that infer none, or where a function makes its own, as ``noise_level`` says. With a ``StateSpace`` their states are
-shaken by the process noise that the fit of the log inferred, but for jumps that it let go. A model that is wrong is not mended by
+shaken by the process noise that the fit of the log inferred, but for jumps that it let go; that is never inferred to be zero, so that
+where there is none the result is somewhat too wide. A model that is wrong is not mended by
 simulating it.
 """
 
@@ -284,8 +285,7 @@ class Recalibrated(Estimator):
 
     @property
     def _before(self) -> QuadraticPrior:
-        mean, covariance = self.prior.gaussian_moments()
-        own = QuadraticPrior(mean.numpy(), np.linalg.inv(covariance.numpy()))
+        own = QuadraticPrior.of(self.prior)
         flat = _FLAT_PRECISION * np.eye(len(self.space))
         precision = own.precision + flat
         pull = own.precision @ own.mean + flat @ np.full(len(self.space), 0.5)
