@@ -211,10 +211,9 @@ def eliminate(
     n, d = num_theta, (width - 1 - num_theta) // 2
     theta, own, prev, r = slice(0, n), slice(n, n + d), slice(n + d, n + 2 * d), width - 1
     if not d:  # recorded starts
-        whole, none = normal[0], np.zeros((len(start_pull), 0, n))
-        return Arrow(
-            whole[theta, theta], whole[theta, r], 0.0, 0.0, float(whole[r, r]), none[..., 0], none, np.zeros((0, 0))
-        )
+        whole, none = normal[0], np.zeros((len(start_pull), 0))
+        slope = np.zeros((len(start_pull), 0, n))
+        return Arrow(whole[theta, theta], whole[theta, r], 0.0, 0.0, float(whole[r, r]), none, slope, np.zeros((0, 0)))
     diagonal = normal[:, own, own].copy()
     diagonal[:-1] += normal[1:, prev, prev]
     corner = normal[1:, prev, own]  # couples x_{w-1} (rows) with x_w (columns)

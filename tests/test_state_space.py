@@ -308,16 +308,10 @@ def test_the_target_with_fresh_jacobians_is_the_kalman_filter(lengths: float) ->
     assert found is not None
     solved = eliminate(found, noise)
     states = chain.moved(chain.reference, solved.states(np.zeros(1)))
-    state = {"fit_sd": noise.sd, "fit_process": noise.process, "fit_theta": theta, "fit_states": states}
-    state |= {"fit_movement": PROCESS, "fit_loose": np.zeros(len(chain.linked), bool)}
-    mode = {
-        "theta": theta,
-        "states": states,
-        "theta_step": np.full(1, lengths),
-        "state_step": np.full((len(states), 2), lengths),
-    }
-    state |= {"fit_slope": solved.slope, **{f"fit_{name}": mode[name] for name in ("theta_step", "state_step")}}
-    state |= at_optimum(chain, mode)
+    mode = {"theta": theta, "states": states, "slope": solved.slope, "sd": noise.sd, "tau": np.zeros(len(noise.sd))}
+    mode |= {"process": noise.process, "movement": PROCESS, "loose": np.zeros(len(chain.linked), bool)}
+    mode |= {"theta_step": np.full(1, lengths), "state_step": np.full((len(states), 2), lengths)}
+    state = at_optimum(chain, mode)
     target = ChainTarget(sipe.get_estimator(spring(), "laplace").prior, chain, state)
     sd = solved.precision[0, 0] ** -0.5
     points = theta + sd * np.array([[-2.0], [-1.0], [0.0], [1.0], [2.0]])

@@ -11,7 +11,7 @@ as far as they lie within the bounds. The noise is white or first-order autoregr
 Both methods run in turn on the same log, one thread each, with default settings; mujoco.sysid's divide each joint's residuals by their
 size, which weighs equal noise unequally. As there is one truth, an exact posterior need not cover it in 95 % of logs where a log says little
 beside the bounds; what it covers stands beside. Fits are kept one by one in runs/arm, so an interrupted
-study goes on. Coverage is pooled over the armatures, its standard error clustered by log. The interval score of T. Gneiting, A. Raftery
+study goes on; each run writes the summary of all fits there are to results/. Coverage is pooled over the armatures, its standard error clustered by log. The interval score of T. Gneiting, A. Raftery
 2007, "Strictly Proper Scoring Rules", https://doi.org/10.1198/016214506000001437, Section 6.2, in kg m^2, is smaller for intervals that are
 narrow and right.
 """
@@ -161,12 +161,21 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def study(simulator: sipe.Simulator, cell: str, count: int) -> dict[str, Any]:
+def kept(cell: str) -> Path:
+    return RUNS / f"{cell.replace(', ', '-').replace(' ', '')}.jsonl"
+
+
+def study(simulator: sipe.Simulator, cell: str, count: int) -> None:
     """A cell: fit what is missing."""
-    kept = RUNS / f"{cell.replace(', ', '-').replace(' ', '')}.jsonl"
-    rows = fits(kept)
-    rows += [keep(kept, one(simulator, cell, seed)) for seed in range(len(rows), count)]
-    rows = rows[:count]
+    for seed in range(len(fits(kept(cell))), count):
+        keep(kept(cell), one(simulator, cell, seed))
+
+
+def summaries(simulator: sipe.Simulator, cell: str) -> dict[str, Any] | None:
+    """Of a cell's fits; None without any."""
+    rows = fits(kept(cell))
+    if len(rows) < 2:
+        return None
     mine, rival = ([r[name] for r in rows] for name in ("sipe_bayes", "mujoco.sysid"))
     ratio = float(np.median([a["seconds"] / b["seconds"] for a, b in zip(mine, rival, strict=True)]))
     return {
@@ -218,14 +227,15 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=FITS)
     given = parser.parse_args()
     logging.getLogger("absl").setLevel(logging.ERROR)
-    simulator, cells = arm(), {}
+    simulator = arm()
     for cell in given.cells:
-        cells[cell] = study(simulator, cell, given.fits)
-        print(cell, json.dumps(cells[cell]), flush=True)
-    if given.fits == FITS and given.cells == list(CELLS):
-        versions = {p: version(p) for p in ("mujoco", "numpy", "scipy")}
-        found = {"command": "python examples/studies/arm.py", "versions": versions, "cells": cells}
-        write_text(HERE / "results" / "arm.json", to_json(found, indent=1) + "\n")
+        study(simulator, cell, given.fits)
+    cells = {cell: found for cell in CELLS if (found := summaries(simulator, cell))}
+    for cell, found in cells.items():
+        print(cell, json.dumps(found), flush=True)
+    versions = {p: version(p) for p in ("mujoco", "numpy", "scipy")}
+    found = {"command": "python examples/studies/arm.py", "versions": versions, "cells": cells}
+    write_text(HERE / "results" / "arm.json", to_json(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,10 @@ Several starting points (the model as given and the best of a few draws from the
 not the same become components of a mixture, weighted by their restricted likelihood; with ``StateSpace`` also by the prior of the
 process noise and the price of jumps let go.
 
+The curvature at the optimum need not be that of the posterior. Where a few points around a single optimum say that it is not, the normal gives way to
+kernels on importance draws, or a warning (``importance``, which costs 2 N + 1 rollouts, and some hundreds where the normal is wrong). It is not asked where the starts are
+estimated or states inferred, where residuals are as small as the simulation's rounding, or where the intervals are guessed.
+
 How the search spares simulations, follows ridges and looks around an optimum is said in ``window_search``. With ``StateSpace`` every
 sample's state is unknown and the search is that of ``state_space_search``, or where the first ones are known of ``known_start_search``.
 
@@ -33,13 +37,14 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
-from sipe_bayes.inference import known_start_search, state_space_search, window_search
+from sipe_bayes.inference import importance, known_start_search, state_space_search, window_search
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.chain_state import process_diagnostics
 from sipe_bayes.inference.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
-from sipe_bayes.likelihood import BudgetTooSmall
+from sipe_bayes.inference.window_target import WindowTarget, at_optimum
+from sipe_bayes.likelihood import BudgetTooSmall, Windows
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
@@ -47,6 +52,7 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
+_LEAST_BATCHES = 6  # of importance draws for which the budget must have room, and before they are called hopeless
 
 
 class Laplace(Estimator):
@@ -92,11 +98,48 @@ class Laplace(Estimator):
         return self._how(windows).start(self, windows)
 
     def describe(self, state: State) -> str:
+        if "draws_share" in state:
+            return f"laplace: {len(state['draws_values'])} importance draws"
         return f"laplace: start {state['point'] + 1} of {len(state['points'])}, step {state['iteration']}"
 
     def step(self, state: State, trajectories: Trajectories) -> State:
         windows = self.windows(trajectories)
-        return self._how(windows).step(self, windows, state)
+        if "draws_share" in state:
+            return self._draw(windows, state)
+        state = self._how(windows).step(self, windows, state)
+        return self._probed(windows, state) if state["done"] else state
+
+    def _probed(self, windows: Any, state: State) -> State:
+        """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
+        if isinstance(windows, Chain) or windows.num_start or windows.settings.noise == "sandwich":
+            return state
+        kept, n, count = distinct_modes(state), len(self.space), len(windows.trajectories)
+        least = (importance.cost(n) + _LEAST_BATCHES * importance.batch(n)) * count
+        if len(kept) != 1 or state["mode_guessed"][kept[0]] or windows.rollouts + least > windows.budget:
+            return state
+        target = self._target(windows, state, kept[0])
+        optimum = (state[f"mode_{k}"][kept[0]] for k in ("theta", "mean", "covariance"))
+        if target.silent or importance.normal(target, *optimum):
+            return state
+        return {**state, "done": False, **importance.begin(n)}
+
+    def _draw(self, windows: Windows, state: State) -> State:
+        """One more batch of draws, as long as they promise something and the budget lasts."""
+        kept = distinct_modes(state)
+        found, n = self._normals(state, kept), len(self.space)
+        state = importance.draw(state, self._target(windows, state, kept[0]), found, self.prior, self.seed)
+        batches, effective = (
+            len(state["draws_share"]),
+            importance.effective(importance.weights(state, self.prior)),
+        )
+        hopeless = batches >= _LEAST_BATCHES and effective < batches
+        room = windows.rollouts + importance.batch(n) * len(windows.trajectories) <= windows.budget
+        done = effective >= importance.ENOUGH or batches >= importance.MOST or hopeless or not room
+        return {**state, "done": done}
+
+    def _target(self, windows: Windows, state: State, mode: int) -> WindowTarget:
+        picked = {k[5:]: v[mode] for k, v in state.items() if k.startswith("mode_")}
+        return WindowTarget(self.prior, windows, at_optimum(windows, picked))
 
     def _how(self, windows: Any) -> ModuleType:
         """The search that fits the likelihood: its functions ``start`` and ``step``."""
@@ -110,12 +153,7 @@ class Laplace(Estimator):
                 f"budget: {self.budget} rollouts were not enough for one optimum; "
                 f"one step takes {self._cost(trajectories)} rollouts, so raise the budget"
             )
-        means, covariances, evidence = [], [], []
         kept = distinct_modes(state)
-        for m in kept:
-            means.append(state["mode_mean"][m])
-            covariances.append(state["mode_covariance"][m])
-            evidence.append(state["mode_evidence"][m])
         self.diagnostics = {
             "modes": len(kept),
             "noise_sd": state["mode_sd"][kept[0]].tolist(),
@@ -128,8 +166,26 @@ class Laplace(Estimator):
                 self.warn("the process noise had not settled: do not rely on the intervals; more restarts may help")
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
-        weights = torch.tensor(np.array(evidence) - np.max(evidence))
-        return GaussianMixture(weights, np.stack(means), np.stack(covariances), self.space)
+        found = self._normals(state, kept)
+        if "draws_share" not in state:
+            return found
+        weight = importance.weights(state, self.prior)
+        effective = importance.effective(weight)
+        self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
+        if effective >= importance.LEAST:
+            return importance.kernels(state, weight, self.space, self.seed)
+        if state["done"]:
+            self.warn(
+                f"the posterior is no normal, and {len(weight)} draws from it came to {effective:.1f} effective ones: compare with mcmc before you "
+                "trust the intervals"
+            )
+        return found
+
+    def _normals(self, state: State, kept: list[int]) -> GaussianMixture:
+        """Those of the optima, weighted by their evidence."""
+        evidence = state["mode_evidence"][kept]
+        weights = torch.from_numpy(evidence - evidence.max())
+        return GaussianMixture(weights, state["mode_mean"][kept], state["mode_covariance"][kept], self.space)
 
     def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance, before truncation, of the quadratic model of data and prior at theta."""

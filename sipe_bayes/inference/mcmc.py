@@ -1,23 +1,13 @@
-"""Markov chain Monte Carlo over theta and the noise, starts marginalised: emcee on the windowed likelihood.
+"""Markov chain Monte Carlo over theta, noise and starts integrated out: emcee on the windowed likelihood.
 
 D. Foreman-Mackey et al. 2013, "emcee: The MCMC Hammer", PASP 125 (https://arxiv.org/abs/1202.3665). Moves: an independent
 Metropolis-Hastings proposal from the widened ``laplace`` posterior (all walkers in one batch, nearly independent draws
 where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008), which finds its way where it is not.
 
-Target, with r the residual at the predicted starts x(theta), V the noise covariance and J_x the starts' Jacobian:
-
-    log p(theta, sigma, tau | y) = log prior - 1/2 [log|V| + log|A| + r' V^-1 r - b' A^-1 b],
-    A = J_x' V^-1 J_x + P_x,   b = J_x' V^-1 r - P_x x,
-
-which is the likelihood with the starts integrated out, exact where the prediction is linear in the starts over their
-(narrow) conditional posterior. x(theta) = x_hat - S (theta - theta_hat) and J_x are taken from the ``laplace`` fit that
-comes first and also places the walkers; that saves D of D + 1 simulations. How far a fresh J_x would move the target
-is measured on some of the first walkers and reported as ``linearisation_error`` (sd in nats; NaN where it would cost more than a
-tenth of the budget).
-
-With ``StateSpace`` the target is that of ``state_space_target``, over theta alone, with the noise of the ``laplace`` fit.
-
-Priors of the noise: log sigma and log tau uniform within wide bounds.
+The target is that of ``window_target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes first and also places the
+walkers; that saves D of D + 1 simulations. How far a fresh Jacobian would move the target is measured on some of the first walkers and reported as
+``linearisation_error`` (sd in nats; NaN where it would cost more than a tenth of the budget). With ``StateSpace`` the target is that of
+``state_space_target``, with the noise of the ``laplace`` fit.
 
 Deviations: R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do;
 walkers share information, so R-hat is an optimistic diagnostic.
@@ -33,17 +23,13 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.checks import whole
+from sipe_bayes.inference import state_space_target, window_target
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.chain_state import process_diagnostics
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
-from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
-from sipe_bayes.inference.window_noise import free_noise
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
-from sipe_bayes.marginal import Marginal
-from sipe_bayes.noise import Noise, Pulls
-from sipe_bayes.noise_spread import noise_covariance
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.state_space import Chain
 from sipe_bayes.trajectory import Trajectories
@@ -116,29 +102,28 @@ class MCMC(Estimator):
                 self.warn(sentence)
         assert first._state is not None
         best = distinct_modes(first._state)[0]
-        conditioned = self._on_states if isinstance(windows, Chain) else self._on_starts
-        picked, spread = conditioned(
-            windows, {k[5:]: v[best] for k, v in first._state.items() if k.startswith("mode_")}
-        )
+        mode = {k[5:]: v[best] for k, v in first._state.items() if k.startswith("mode_")}
+        at_optimum = (state_space_target if isinstance(windows, Chain) else window_target).at_optimum
+        picked, proposal = at_optimum(windows, mode), found
+        if "draws_share" in first._state:  # kernels, which are slow to draw from
+            mean, covariance = found.gaussian_moments()
+            proposal = GaussianMixture([0.0], mean[None], covariance[None], self.space)
         random = np.random.RandomState(self.seed)
         state = {
             "done": False,
             **picked,
-            "proposal_weights": found.log_weights.numpy(),
-            "proposal_means": found.means.numpy(),
-            "proposal_covariances": _WIDER**2 * found.covariances.numpy(),
-            "proposal_noise": _WIDER**2 * spread,
+            "proposal_weights": proposal.log_weights.numpy(),
+            "proposal_means": proposal.means.numpy(),
+            "proposal_covariances": _WIDER**2 * proposal.covariances.numpy(),
         }
-        dimensions = len(self.space) + len(spread)
-        count = self.walkers or max(24, 2 * dimensions + 2)
+        count = self.walkers or max(24, 2 * len(self.space) + 2)
         walkers, log_prob = self._place(windows, state, count, random)
-        centre = np.concatenate([state["fit_theta"], _Proposal(self, windows, state).centre])
         return {
             **state,
             "walkers": walkers,
             "log_prob": log_prob,
             "best": state["fit_theta"],
-            "best_log_prob": float(self._target(windows, state)(centre[None])[0]),
+            "best_log_prob": float(self._target(windows, state)(state["fit_theta"][None])[0]),
             "linearisation_error": self._linearisation_error(windows, state, walkers),
             "chain": np.empty((0, *walkers.shape)),
             "chain_log_prob": np.empty((0, count)),
@@ -146,36 +131,17 @@ class MCMC(Estimator):
             **_random_state(random),
         }
 
-    def _on_starts(self, windows: Windows, mode: State) -> tuple[State, FloatArray]:
-        """What the target takes from the laplace optimum, and the covariance of the free noise there."""
-        picked = {k: mode[k] for k in ("theta", "starts", "slope", "sd", "tau")}
-        linearisation = windows.linearise(picked["theta"], picked["starts"])
-        noise, held = Noise(picked["sd"], picked["tau"]), (picked["theta"] <= 0) | (picked["theta"] >= 1)
-        prior = np.linalg.inv(self.prior.gaussian_moments()[1].numpy())
-        start_pull = -windows.start_precision * picked["starts"]
-        here = Pulls(prior, np.zeros(len(held)), windows.start_precision, start_pull, ~held)
-        moments = windows.moments(linearisation, white=self.likelihood.noise == "white")
-        spread = noise_covariance(moments, noise, here, free_noise(windows))
-        jacobian = np.ascontiguousarray(linearisation.jacobian[..., len(self.space) :])
-        return {**{f"fit_{k}": v for k, v in picked.items()}, "fit_jacobian": jacobian}, spread
-
-    def _on_states(self, chain: Chain, mode: State) -> tuple[State, FloatArray]:
-        """The same of a chain of states, whose noise is not free."""
-        names = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step")
-        picked = {f"fit_{k}": mode[k] for k in names}
-        return {**picked, **at_optimum(chain, mode)}, np.empty((0, 0))
-
     def _target(self, windows: Windows | Chain, state: State) -> Any:
-        """log p(theta, noise | y) of walkers, of either likelihood."""
+        """log p(theta | y) of walkers, of either likelihood."""
         if isinstance(windows, Chain):
-            return ChainTarget(self.prior, windows, state)
-        return _Target(self, windows, state)
+            return state_space_target.ChainTarget(self.prior, windows, state)
+        return window_target.WindowTarget(self.prior, windows, state)
 
     def _place(
         self, windows: Windows, state: State, count: int, random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
-        """Walkers (count, N + noise) drawn from the proposal, each where the target is finite, and its values there."""
-        proposal, target = _Proposal(self, windows, state), self._target(windows, state)
+        """Walkers (count, N) drawn from the proposal, each where the target is finite, and its values there."""
+        proposal, target = _Proposal(self, state), self._target(windows, state)
         walkers = proposal.draw(count, random)
         log_prob = target(walkers)
         for _ in range(_PLACINGS):
@@ -189,13 +155,6 @@ class MCMC(Estimator):
             "the simulation diverges there: narrow the bounds or shorten the model's timestep"
         )
 
-    def _noise_bounds(self, windows: Windows, picked: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        shortest = float(windows.dt.min())
-        sd = np.log(picked["sd"])
-        low = np.concatenate([sd - 5, np.full(len(sd), np.log(0.1 * shortest))])
-        high = np.concatenate([sd + 5, np.full(len(sd), np.log(windows.trajectories.longest))])
-        return low, high
-
     def describe(self, state: State) -> str:
         return f"mcmc: step {len(state['chain'])}"
 
@@ -208,7 +167,7 @@ class MCMC(Estimator):
         steps = min(_BLOCK, (self.budget - windows.rollouts) // (walkers * len(trajectories)))
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")
-        proposal = _Proposal(self, windows, state)
+        proposal = _Proposal(self, state)
         sampler = emcee.EnsembleSampler(
             walkers,
             dimensions,
@@ -231,7 +190,7 @@ class MCMC(Estimator):
             **state,
             "walkers": end.coords,
             "log_prob": end.log_prob,
-            "best": chain[top][: len(self.space)] if better else state["best"],
+            "best": chain[top] if better else state["best"],
             "best_log_prob": float(max(log_prob[top], state["best_log_prob"])),
             "chain": np.concatenate([state["chain"], chain]),
             "chain_log_prob": np.concatenate([state["chain_log_prob"], log_prob]),
@@ -244,7 +203,7 @@ class MCMC(Estimator):
 
     def _mixing(self, state: State) -> dict[str, float]:
         """Worst R-hat over the parameters, effective draws and acceptance of the chain after warm-up."""
-        kept = self._kept(state)[:, :, : len(self.space)]
+        kept = self._kept(state)
         if len(kept) < 2 * _BLOCK:
             return {"rhat": np.inf, "ess": 0.0, "acceptance": 0.0, "steps": len(state["chain"])}
         import arviz
@@ -265,7 +224,7 @@ class MCMC(Estimator):
         }
 
     def _kept(self, state: State) -> FloatArray:
-        """The chain after warm-up (steps, walkers, dimensions)."""
+        """The chain after warm-up (steps, walkers, N)."""
         return state["chain"][int(_WARM_UP * len(state["chain"])) :]
 
     def posterior(self, state: State, trajectories: Trajectories) -> Particles:
@@ -274,13 +233,13 @@ class MCMC(Estimator):
         n = len(self.space)
         chain = self._kept(state)
         thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
-        theta = np.swapaxes(chain[::-thin][::-1], 0, 1)[:, :, :n]
+        theta = np.swapaxes(chain[::-thin][::-1], 0, 1)
         log_prob = state["chain_log_prob"][-len(chain) :][::-thin][::-1].T
         rates = np.repeat(state["accepted"] / len(state["chain"]), theta.shape[1])
         stats = {"lp": log_prob.ravel(), "acceptance_rate": rates}
         mixing = self._mixing(state)
         mixing["linearisation_error"] = state["linearisation_error"]
-        self.diagnostics = {"mixing": mixing, **self._noise_summary(state, trajectories)}
+        self.diagnostics = {"mixing": mixing, **_noise_of(state)}
         if not (mixing["rhat"] <= _MIXED_RHAT and mixing["ess"] >= self.effective / 2):
             self.warn(
                 f"the chains have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective draws): "
@@ -293,14 +252,6 @@ class MCMC(Estimator):
             self.warn(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
         flat = np.clip(theta.reshape(-1, n), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
-
-    def _noise_summary(self, state: State, trajectories: Trajectories) -> dict[str, Any]:
-        target = self._target(self.windows(trajectories), state)
-        sd, tau = target.noise(np.median(self._kept(state).reshape(-1, state["chain"].shape[2]), axis=0)[None])
-        found = {"noise_sd": sd[0].tolist(), "noise_tau": tau[0].tolist()}
-        if "fit_process" not in state:
-            return found
-        return found | process_diagnostics(*(state[f"fit_{name}"] for name in ("process", "movement", "loose")))
 
     def _linearisation_error(self, windows: Windows, state: State, walkers: FloatArray) -> float:
         """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""
@@ -315,92 +266,34 @@ class MCMC(Estimator):
         return float(np.std([float(target(p[None])[0]) - target.refreshed(p) for p in points]))
 
 
-class _Proposal:
-    """Independent draws of (theta, free noise), and the log density ratio that Metropolis-Hastings needs."""
+def _noise_of(state: State) -> dict[str, Any]:
+    """The noise of the laplace fit."""
+    found = {"noise_sd": state["fit_sd"].tolist(), "noise_tau": state["fit_tau"].tolist()}
+    if "fit_process" not in state:
+        return found
+    return found | process_diagnostics(*(state[f"fit_{name}"] for name in ("process", "movement", "loose")))
 
-    def __init__(self, owner: MCMC, windows: Windows, state: State) -> None:
-        self.n = len(owner.space)
+
+class _Proposal:
+    """Independent draws of theta, and the log density ratio that Metropolis-Hastings needs."""
+
+    def __init__(self, owner: MCMC, state: State) -> None:
         self.theta = GaussianMixture(
             state["proposal_weights"], state["proposal_means"], state["proposal_covariances"], owner.space
         )
-        free = free_noise(windows)
-        logs = np.log(np.maximum(np.concatenate([state["fit_sd"], state["fit_tau"]]), 1e-300))
-        low, high = owner._noise_bounds(windows, {k: state[f"fit_{k}"] for k in ("sd", "tau")})
-        self.centre = np.clip(logs, low + 0.1, high - 0.1)[free]
-        self.factor = np.linalg.cholesky(state["proposal_noise"]) if len(free) else np.zeros((0, 0))
 
     def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
-        """(count, N + noise)."""
+        """(count, N)."""
         generator = torch.Generator().manual_seed(int(random.randint(2**31)))
-        theta = self.theta.sample((count,), generator=generator).numpy()
-        return np.concatenate(
-            [theta, self.centre + random.standard_normal((count, len(self.centre))) @ self.factor.T], axis=1
-        )
+        return self.theta.sample((count,), generator=generator).numpy()
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """(count,), up to a constant."""
-        theta = self.theta.log_prob(torch.from_numpy(np.clip(points[:, : self.n], 0, 1))).numpy()
-        if not len(self.centre):
-            return theta
-        half = np.linalg.solve(self.factor, (points[:, self.n :] - self.centre).T)
-        return theta - 0.5 * (half**2).sum(0)
+        return self.theta.log_prob(torch.from_numpy(np.clip(points, 0, 1))).numpy()
 
     def __call__(self, coords: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
         proposed = self.draw(len(coords), random)
         return proposed, self.log_density(coords) - self.log_density(proposed)
-
-
-class _Target:
-    """log p(theta, noise | y) of walkers (B, N + noise)."""
-
-    def __init__(self, owner: MCMC, windows: Windows, state: State) -> None:
-        self.owner, self.windows, self.n = owner, windows, len(owner.space)
-        self.fit = {k[4:]: v for k, v in state.items() if k.startswith("fit_")}
-        self.free = free_noise(windows)
-        self.low, self.high = owner._noise_bounds(windows, self.fit)
-        self.marginal = Marginal(windows.sequences, self.fit["jacobian"], windows.start_precision)
-
-    def noise(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """sd and tau (B, C) of walkers."""
-        logs = np.tile(np.log(np.maximum(np.concatenate([self.fit["sd"], self.fit["tau"]]), 1e-300)), (len(points), 1))
-        logs[:, self.free] = points[:, self.n :]
-        channels = len(self.fit["sd"])
-        tau = np.exp(logs[:, channels:]) if self.owner.likelihood.noise == "ar1" else np.zeros((len(points), channels))
-        return np.exp(logs[:, :channels]), tau
-
-    def __call__(self, points: FloatArray) -> FloatArray:
-        out = np.full(len(points), -np.inf)
-        theta, logs = points[:, : self.n], points[:, self.n :]
-        inside = ((theta >= 0) & (theta <= 1)).all(1)
-        inside &= ((logs >= self.low[self.free]) & (logs <= self.high[self.free])).all(1)
-        if not inside.any():
-            return out
-        theta = theta[inside]
-        starts = self.fit["starts"] - np.einsum("wdn,bn->bwd", self.fit["slope"], theta - self.fit["theta"])
-        residual, valid = self.windows.residuals(theta, starts)
-        sd, tau = self.noise(points[inside])
-        prior = self.owner.prior.log_prob(torch.from_numpy(theta)).numpy()
-        value = prior + self.marginal(residual, starts, sd, tau)
-        out[inside] = np.where(valid & np.isfinite(value), value, -np.inf)
-        return out
-
-    @property
-    def check_cost(self) -> int:
-        """Rollouts of a log to hold ``refreshed`` against the target."""
-        return 2 * self.windows.num_start + 3
-
-    def refreshed(self, point: FloatArray) -> float:
-        """The target at one point with the starts' Jacobian taken there, after one step of the starts."""
-        theta = point[: self.n]
-        starts = self.fit["starts"] - self.fit["slope"] @ (theta - self.fit["theta"])
-        sd, tau = self.noise(point[None])
-        noise = Noise(sd[0], tau[0])
-        for _ in range(2):
-            lin = self.windows.linearise(theta, starts, with_theta=False)
-            marginal = Marginal(self.windows.sequences, lin.jacobian, self.windows.start_precision)
-            value = marginal(lin.residual[None], starts[None], sd, tau)
-            starts = starts + marginal.best(lin.residual, starts, noise)
-        return float(value[0] + self.owner.prior.log_prob(torch.from_numpy(theta)))
 
 
 def _random_state(random: np.random.RandomState) -> State:

@@ -23,15 +23,17 @@ from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, lo
 
 FloatArray = NDArray[np.float64]
 
+_NAMES = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step")
 _STEPS = 2  # of the states, before a fresh linearisation is compared
 
 
 def at_optimum(chain: Chain, mode: State) -> State:
-    """The Jacobians that ``ChainTarget`` needs, taken as those of the optimum, under names of a fit's state."""
+    """What ``ChainTarget`` needs of a ``laplace`` optimum, with the Jacobians there, under names of a fit's state."""
     found = _linearised(chain, mode["theta"], mode["states"], mode["theta_step"], mode["state_step"])
     if found is None:
         raise ValueError("mcmc: the simulation diverges at the laplace fit; narrow the bounds")
-    return {f"fit_{f.name}": getattr(found, f.name) for f in fields(found)}
+    kept = {f"fit_{k}": mode[k] for k in _NAMES}
+    return kept | {f"fit_{f.name}": getattr(found, f.name) for f in fields(found)}
 
 
 def _linearised(
@@ -51,11 +53,6 @@ class ChainTarget:
         self.fit = ChainLinearisation(**{f.name: state[f"fit_{f.name}"] for f in fields(ChainLinearisation)})
         self.sd = ChainNoise(state["fit_sd"], state["fit_process"], state["fit_movement"], state["fit_loose"])
         self.solved = eliminate(self.fit, self.sd)
-
-    def noise(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """sd and tau (B, C) of walkers: all that of the optimum, and white."""
-        shape = (len(points), len(self.sd.sd))
-        return np.broadcast_to(self.sd.sd, shape), np.zeros(shape)
 
     def states(self, theta: FloatArray) -> FloatArray:
         """States (B, K, S) that follow theta (B, N)."""

@@ -81,6 +81,7 @@ def start(search: Search, windows: Windows) -> State:
         "mode_sd": np.empty((0, c)),
         "mode_tau": np.empty((0, c)),
         "mode_evidence": np.empty(0),
+        "mode_guessed": np.empty(0, bool),
     }
 
 
@@ -357,7 +358,8 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
             )
     elif state["polls"]:  # the budget ends: at least as wide as the optimum before, which this one betters
         found["covariance"] = found["covariance"] + state["mode_covariance"][-1]
-    if optimum.doubtful or (around is not None and around.rough):
+    found["guessed"] = np.array(optimum.doubtful or (around is not None and around.rough))
+    if found["guessed"]:
         found["covariance"] = found["covariance"] + optimum.guess**2 * np.eye(len(theta))
     further = None if state["centred"] else _middle(search, windows, found)
     if further is not None:
