@@ -47,6 +47,10 @@ class CallableWindows(Windows):
     def starts_measured(self) -> bool:
         return True
 
+    @property
+    def least_steps(self) -> FloatArray:
+        return np.zeros(self.num_theta)
+
     def states(self, starts: FloatArray) -> FloatArray:
         return starts
 

@@ -305,6 +305,11 @@ class Windows:
         return max(least, most / int(self.steps.max()))
 
     @property
+    def least_steps(self) -> FloatArray:
+        """Least changes (N,) of theta that finite differences can be taken over."""
+        return self.simulator.environment.least_steps
+
+    @property
     def num_windows(self) -> int:
         return len(self.log)
 
@@ -376,11 +381,11 @@ class Windows:
         with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
         at this very point, which spares the one. theta_step: of the finite differences, default ``self.theta_step``."""
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
-        size = self.theta_step if theta_step is None else theta_step
+        size = np.maximum(self.theta_step if theta_step is None else theta_step, self.least_steps)
         sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
         for j in range(n):
-            thetas[j + 1, j] += sign[j] * size
+            thetas[j + 1, j] += sign[j] * size[j]
         for j in range(d):
             all_starts[n + 1 + j, :, j] += _START_STEP
         if residual is None:
@@ -393,10 +398,10 @@ class Windows:
         if wrong and valid[0]:  # a step across a physical limit: look the other way
             sign[wrong] = -sign[wrong]
             again = np.tile(theta, (len(wrong), 1))
-            again[np.arange(len(wrong)), wrong] += sign[wrong] * size
+            again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
             inside = np.clip(again, 0, 1)
             predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
-        scale = np.concatenate([sign[:n] * size, np.full(d, _START_STEP)])
+        scale = np.concatenate([sign[:n] * size[:n], np.full(d, _START_STEP)])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
         jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)

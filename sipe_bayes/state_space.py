@@ -346,9 +346,10 @@ class Chain:
         A finite difference whose simulation diverges counts as zero. with_states: else their Jacobians are zero."""
         n, d = self.num_theta, self.num_start
         count = 1 + n + d * with_states
-        sign = np.where(theta + _THETA_STEP <= 1, 1.0, -1.0)
+        size = np.maximum(_THETA_STEP, self.simulator.environment.least_steps)
+        sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_states = np.tile(theta, (count, 1)), np.tile(states, (count, 1, 1))
-        thetas[np.arange(1, n + 1), np.arange(n)] += sign * _THETA_STEP
+        thetas[np.arange(1, n + 1), np.arange(n)] += sign * size
         for j in range(count - 1 - n):
             tangent = np.zeros(d)
             tangent[j] = _STATE_STEP
@@ -356,7 +357,7 @@ class Chain:
         predicted, ends, valid = self.simulate(thetas, all_states)
         if not valid[0].all():
             return None
-        scale = np.concatenate([sign * _THETA_STEP, np.full(count - 1 - n, _STATE_STEP)])[:, None, None]
+        scale = np.concatenate([sign * size, np.full(count - 1 - n, _STATE_STEP)])[:, None, None]
         sound = valid[1:, :, None]
         seen = np.where(sound & self.observed, (predicted[1:] - predicted[0]) / scale, 0.0)
         reached = np.where(sound, self.difference(ends[1:], ends[0]) / scale, 0.0)[:, :-1]

@@ -61,6 +61,11 @@ class Environment(ABC):
         the engine when ``needs_constants``."""
 
     @property
+    def least_steps(self) -> FloatArray:
+        """Least changes (N,) of theta that finite differences can be taken over; zero for all that is smooth."""
+        return np.zeros(len(self.space))
+
+    @property
     def needs_constants(self) -> bool:
         """Whether mj_setConst must follow ``write``."""
         return True

@@ -27,6 +27,7 @@ FloatArray = NDArray[np.float64]
 _CHANNEL = re.compile(
     r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity)|sensor:(?P<sensor>[^\[\]]+)(?:\[(?P<item>\d+)\])?)$"
 )
+_LONGEST_STEP = 0.25  # of the cube: a finite difference of what is not smooth
 _BIAS = re.compile(r"^sensor:(.+)\.bias$")
 _LINEAR_INTERPOLATION = 1
 
@@ -240,6 +241,16 @@ class MjcfEnvironment(Environment):
                 physical &= value >= target.minimum
                 target.write(model, value)
         return physical and (not bodies or check_inertia(model, bodies))
+
+    @cached_property
+    def least_steps(self) -> FloatArray:
+        found = np.zeros(len(self.parameters))
+        for j, multiplier, target in self._targets:
+            if target.step:
+                low = self.parameters[j].value(0.5)
+                step = float(self.parameters[j].normalise(low + target.step / multiplier)) - 0.5
+                found[j] = max(found[j], min(step, _LONGEST_STEP))
+        return found
 
     @property
     def needs_constants(self) -> bool:

@@ -43,7 +43,7 @@ class TargetError(ValueError):
 class Target:
     """One number of a compiled model. ``order``: writes with a smaller order come first. ``constants``:
     MuJoCo's derived constants depend on it, so mj_setConst follows a write. ``minimum``: the smallest
-    physical value."""
+    physical value. ``step``: the least change of the value that a finite difference can be taken over."""
 
     spec: str
     unit: str
@@ -53,6 +53,7 @@ class Target:
     constants: bool = False
     minimum: float = -np.inf
     physical: bool = True
+    step: float = 0.0
 
 
 def named(model: Any, kind: str, name: str, where: str) -> int:
@@ -212,12 +213,14 @@ def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Ta
 
 def _actuator_delay(model: Any, spec: str, actuator: int, attribute: str) -> Target:
     """MuJoCo reads a delayed command before it stores the present one: any delay above zero up to one physics
-    step acts as one physics step, and zero as none; beyond one step it is interpolated between steps."""
+    step acts as one physics step, and zero as none; beyond one step it is interpolated between steps. A difference over less than two steps sees
+    either nothing or the whole first one."""
 
     def write(other: Any, value: float) -> None:
         other.actuator_delay[actuator] = value
 
-    return Target(spec, "s", float(model.actuator_delay[actuator]), write, minimum=0.0, physical=False)
+    present, step = float(model.actuator_delay[actuator]), 2 * float(model.opt.timestep)
+    return Target(spec, "s", present, write, minimum=0.0, physical=False, step=step)
 
 
 def _geom_friction(slot: int, unit: str) -> Callable[..., Target]:
