@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config
+from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config, overlap
 from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
@@ -94,6 +94,12 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
     trajectories = [t for t, _ in read]
     held = trajectories[len(train_logs) :]
     reports = tuple(report for _, report in read)
+    for held_log, copy in zip(held_logs, reports[len(train_logs) :], strict=True):
+        for log, report in zip(train_logs, reports[: len(train_logs)], strict=True):
+            if copy.sha256 == report.sha256 and overlap(held_log.span, log.span):
+                raise ConfigError(
+                    f"{config.path}: log {held_log.name!r} is held out, but {held_log.file} is a copy of {log.file}, which trains; hold out another log"
+                )
     prior, doubts = _prior(config, environment.space, reports[: len(train_logs)])
     return Problem(
         config,
@@ -205,7 +211,7 @@ def _doubts(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> t
     doubts = []
     if isinstance(earlier, GaussianMixture) and len(earlier.means) > 1:
         doubts.append(
-            f"the earlier posterior has {len(earlier.means)} separate modes; one normal with its mean and covariance stands for it"
+            f"the earlier posterior is a mixture of {len(earlier.means)} normals; one with its mean and covariance stands for it"
         )
     record = Path(config.prior.source).parent / RUN
     if record.is_file():
@@ -288,6 +294,8 @@ def calibrate(
     found = ridges(problem.environment.space, draws, [p.contraction for p in summaries])
     scores = {use: channel_scores(w, theta) for use, w in bound.items()}
     held = scores.get("holdout", [])
+    comparison = compare_errors(bound["holdout"], theta) if "holdout" in bound else None
+    telling = held if comparison is None or comparison.starts is None else []  # errors that are not the starts'
     return Calibration(
         name=_run_name(problem.config),
         estimator=method.name,
@@ -296,11 +304,11 @@ def calibrate(
         parameters=summaries,
         train=scores["train"],
         holdout=held,
-        warnings=_alarms(lacking, outside) + _warnings(problem, method, summaries, dead, found, conflict, held),
+        warnings=_alarms(lacking, outside) + _warnings(problem, method, summaries, dead, found, conflict, telling),
         signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
         residuals=residuals,
         ridges=found,
-        comparison=compare_errors(bound["holdout"], theta) if "holdout" in bound else None,
+        comparison=comparison,
         misfit=lacking,
         outside=outside,
         left_out=_left_out(problem, method),

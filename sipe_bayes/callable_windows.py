@@ -47,8 +47,7 @@ class CallableWindows(Windows):
     def starts_measured(self) -> bool:
         return True
 
-    @property
-    def least_steps(self) -> FloatArray:
+    def least_steps(self, theta: FloatArray) -> FloatArray:
         return np.zeros(self.num_theta)
 
     def states(self, starts: FloatArray) -> FloatArray:

@@ -439,7 +439,7 @@ class Config(Table):
         """A held-out sample that also trains would be no test."""
         for i, held in enumerate(self.logs):
             for train in self.logs_for("train") if held.use == "holdout" else ():
-                if held.file == train.file and _overlap(held.span, train.span):
+                if held.file == train.file and overlap(held.span, train.span):
                     raise _problem(
                         f"held out, but its samples also train as log {train.name!r}; give spans apart",
                         "logs",
@@ -448,7 +448,8 @@ class Config(Table):
                     )
 
 
-def _overlap(a: Pair | None, b: Pair | None) -> bool:
+def overlap(a: Pair | None, b: Pair | None) -> bool:
+    """Whether two spans in seconds share samples; None is the whole log."""
     return a is None or b is None or (a[0] < b[1] and b[0] < a[1])
 
 

@@ -17,6 +17,7 @@ import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import mujoco
@@ -47,6 +48,24 @@ class BudgetTooSmall(ValueError):
     """A budget that ran out before there was anything to estimate from."""
 
 
+def checked(fit: Any, noise_sd: Any, zero: bool = True) -> None:
+    """Raises ValueError for settings of a likelihood that are no names of channels, or no sds. zero: whether an sd may be."""
+    if fit is not None and (isinstance(fit, str) or not len(fit) or not all(isinstance(n, str) for n in fit)):
+        raise ValueError(f"fit: expected names of channels, such as ('angle',), got {fit!r}; None for all")
+    if noise_sd is None:
+        return
+    if not isinstance(noise_sd, tuple | list | np.ndarray):
+        raise ValueError(
+            f"noise_sd: expected one sd for each channel, None where unknown, got {noise_sd!r}; such as (0.01, None)"
+        )
+    for sd in noise_sd:
+        least = 0.0 if zero else 1e-300
+        if sd is not None and not (isinstance(sd, Real) and least <= float(sd) < math.inf):
+            raise ValueError(
+                f"noise_sd: expected finite sds {'not below' if zero else 'above'} zero, got {sd!r}; None where unknown"
+            )
+
+
 @dataclass(frozen=True)
 class Segments:
     """Multiple shooting with white or autoregressive noise.
@@ -72,6 +91,7 @@ class Segments:
             raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
+        checked(self.fit, self.noise_sd)
 
     def bind(self, simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> Windows:
         """Cut the trajectories into windows; raises ValueError for logs that do not fit the simulator."""
@@ -296,7 +316,7 @@ class Windows:
     @property
     def fixed_sd(self) -> FloatArray:
         """Given noise sd (C,) of the fitted channels, NaN where it is inferred."""
-        return chosen_sd(self.settings.noise_sd, self.channels)
+        return chosen_sd(self.settings.noise_sd, self.channels, self.simulator.environment.channels)
 
     @property
     def theta_step(self) -> float:
@@ -304,10 +324,9 @@ class Windows:
         least, most = _THETA_STEP
         return max(least, most / int(self.steps.max()))
 
-    @property
-    def least_steps(self) -> FloatArray:
-        """Least changes (N,) of theta that finite differences can be taken over."""
-        return self.simulator.environment.least_steps
+    def least_steps(self, theta: FloatArray) -> FloatArray:
+        """Least changes (N,) of theta (N,) that finite differences can be taken over."""
+        return self.simulator.environment.least_steps(theta)
 
     @property
     def num_windows(self) -> int:
@@ -374,14 +393,16 @@ class Windows:
         with_theta: bool = True,
         with_starts: bool = True,
         residual: FloatArray | None = None,
-        theta_step: float | None = None,
+        theta_step: float | FloatArray | None = None,
     ) -> Linearisation:
         """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs.
 
         with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
-        at this very point, which spares the one. theta_step: of the finite differences, default ``self.theta_step``."""
+        at this very point, which spares the one. theta_step: of the finite differences, default ``self.theta_step``, or where that is too
+        short ``least_steps``."""
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
-        size = np.maximum(self.theta_step if theta_step is None else theta_step, self.least_steps)
+        default = np.maximum(self.theta_step, self.least_steps(theta))
+        size = default if theta_step is None else np.broadcast_to(theta_step, theta.shape)
         sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
         for j in range(n):

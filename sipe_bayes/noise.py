@@ -46,10 +46,14 @@ class Noise:
     tau: FloatArray
 
 
-def chosen_sd(given: tuple[float | None, ...] | None, channels: list[int]) -> FloatArray:
-    """Noise sds (C,) of some channels, NaN where none is given."""
+def chosen_sd(given: tuple[float | None, ...] | None, channels: list[int], names: tuple[str, ...]) -> FloatArray:
+    """Noise sds (C,) of some channels, NaN where none is given; raises ValueError unless there is one for each of ``names``."""
     if given is None:
         return np.full(len(channels), np.nan)
+    if len(given) != len(names):
+        raise ValueError(
+            f"noise_sd: expected one for each of the channels {list(names)}, got {len(given)}; None where unknown"
+        )
     return np.array([np.nan if given[c] is None else given[c] for c in channels], float)
 
 

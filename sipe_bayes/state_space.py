@@ -32,7 +32,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.likelihood import START_SD, BudgetExhausted, chosen_channels, estimate_states, moved, past_commands
+from sipe_bayes.likelihood import (
+    START_SD,
+    BudgetExhausted,
+    checked,
+    chosen_channels,
+    estimate_states,
+    moved,
+    past_commands,
+)
 from sipe_bayes.noise import chosen_sd
 from sipe_bayes.read_off import read_off
 from sipe_bayes.simulator import Simulator
@@ -68,6 +76,7 @@ class StateSpace:
     def __post_init__(self) -> None:
         if self.starts not in ("estimated", "recorded"):
             raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
+        checked(self.fit, self.noise_sd, zero=False)
 
     def bind(self, simulator: Any, trajectories: Trajectories) -> Any:
         """The Chain of the trajectories; raises ValueError for logs or simulators that do not fit."""
@@ -220,7 +229,7 @@ class Chain:
     @property
     def fixed_sd(self) -> FloatArray:
         """Given noise sd (C,) of the fitted channels, NaN where it is inferred."""
-        return chosen_sd(self.settings.noise_sd, self.channels)
+        return chosen_sd(self.settings.noise_sd, self.channels, self.simulator.environment.channels)
 
     @property
     def least(self) -> tuple[FloatArray, FloatArray]:
@@ -346,7 +355,7 @@ class Chain:
         A finite difference whose simulation diverges counts as zero. with_states: else their Jacobians are zero."""
         n, d = self.num_theta, self.num_start
         count = 1 + n + d * with_states
-        size = np.maximum(_THETA_STEP, self.simulator.environment.least_steps)
+        size = np.maximum(_THETA_STEP, self.simulator.environment.least_steps(theta))
         sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_states = np.tile(theta, (count, 1)), np.tile(states, (count, 1, 1))
         thetas[np.arange(1, n + 1), np.arange(n)] += sign * size

@@ -7,6 +7,7 @@ import pytest
 
 import sipe_bayes as sipe
 from sipe_bayes.diagnostics.evaluate import _jackknifed, channel_scores, compare_errors, errors
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import Segments, Windows
 from sipe_bayes.parameters import Parameter
 from sipe_bayes.simulator import Simulator
@@ -44,6 +45,11 @@ def test_a_diverging_log_does_not_hide_the_others() -> None:
     rows = {row.log: row for row in channel_scores(windows, simulator.space.normalise(np.array([0.6, 0.05])))}
     assert rows["good"].rmse < 0.05
     assert not rows["wild"].rmse < 1e3
+
+
+CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0"/>
+  <geom type="box" size=".1 .05 .05" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="push" joint="rail" gear="8"/></actuator></mujoco>"""
 
 
 def held_out(truth: list[float], *windows: float | None) -> Windows:
@@ -95,3 +101,29 @@ def test_nothing_finite_is_no_comparison() -> None:
     windows = held_out([0.6, 0.05], 0.5)
     windows.measured[:] = np.inf
     assert compare_errors(windows, windows.simulator.space.default_theta) is None
+
+
+def test_noisy_starts_do_not_decide() -> None:
+    """A cart on a rail, its place with noise of 2 mm and no velocity: a free run of 4 s from measured starts errs by its start, so each model fits its
+    own. The right model is then better than one of the wrong mass, and a worse one worse; with little noise on a pendulum nothing is fitted."""
+    parameters = [Parameter("mass", 0.3, 3.0, targets=("body:cart.mass",))]
+    environment = MjcfEnvironment.build(CART, parameters, ["push"], ["joint:rail.position"])
+    simulator, rng = Simulator(environment, num_threads=1), np.random.default_rng(0)
+    push = rng.choice([-1.0, 1.0], (40, 1)).repeat(10, axis=0)
+    made = simulator.rollout(
+        simulator.space.normalise(np.array([1.3])), push, simulator.default_state(), dt=0.01
+    ).observations[0]
+    noisy = Trajectory(made + 0.002 * rng.standard_normal(made.shape), push, 0.01, name="log")
+    windows = Windows(Segments(None), simulator, Trajectories.stack([noisy]))
+    found = compare_errors(windows, simulator.space.normalise(np.array([1.3])))
+    assert found is not None
+    print(found)
+    assert found.starts is not None
+    assert found.starts > 0.95
+    assert found.verdict == "better"
+    far = compare_errors(windows, simulator.space.normalise(np.array([0.5])))
+    assert far is not None
+    assert far.verdict == "worse"
+    quiet = compare_errors(held_out([0.9, 0.15], 0.5), pendulum().space.normalise(np.array([0.9, 0.15])))
+    assert quiet is not None
+    assert quiet.starts is None

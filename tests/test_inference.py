@@ -154,3 +154,20 @@ def test_wrong_input() -> None:
     for call, exception, words in table:
         with pytest.raises(exception, match=words):
             call()
+
+
+@pytest.mark.parametrize(
+    "likelihood", [sipe.Segments(0.5, noise="white"), sipe.StateSpace()], ids=["segments", "states"]
+)
+def test_a_delay_of_none_is_found(likelihood: Any) -> None:
+    """The model as given has none either, and any delay up to one physics step acts as one: a slope taken there says nothing."""
+    delay = Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",))
+    simulator = pendulum(delay)
+    posterior = get_estimator(simulator, "laplace", likelihood=likelihood).fit(
+        log(simulator, [0.6, 0.1, 0.0], 2, steps=200)
+    )
+    low, middle, high = simulator.space.values(posterior.quantile([0.05, 0.5, 0.95]).numpy())
+    print(low, middle, high)
+    assert middle[2] < 0.005
+    assert low[0] < 0.6 < high[0]
+    assert low[1] < 0.1 < high[1]

@@ -180,6 +180,23 @@ def test_history_has_room_for_the_longest_delay() -> None:
         environment.history(model, state, past, np.array([0.0005]))
 
 
+def test_differences_of_a_delay_are_two_physics_steps() -> None:
+    """Of .002 s each, from delays below two; on a log scale as well, and never more than a quarter of the range."""
+    environment = build(
+        p("delay", 0, 0.05, "actuator:motor.delay"),
+        p("log", 0.001, 0.1, "actuator:servo.delay", scale="log"),
+        MASS,
+        measurements=("joint:hinge.position",),
+        source=XML.replace(' nsample="3" delay=".004"', "").replace('kp="10"', 'kp="10" delay=".02" nsample="60"'),
+    )
+    low = environment.space.normalise(np.array([0.003, 0.0039, 1.0]))
+    np.testing.assert_allclose(environment.least_steps(low), [0.08, np.log(7.9 / 3.9) / np.log(100), 0.0])
+    high = environment.space.normalise(np.array([0.0041, 0.0041, 1.0]))
+    np.testing.assert_array_equal(environment.least_steps(high), 0.0)
+    plain = build(p("delay", 0, 0.01, "actuator:motor.delay"), source=XML.replace(' nsample="3" delay=".004"', ""))
+    assert plain.least_steps(np.zeros(1))[0] == 0.25
+
+
 def test_history_leaves_models_without_delay_alone() -> None:
     environment = build()
     state = np.zeros((1, 3))
@@ -298,7 +315,17 @@ def test_wrong_models_and_measurements_are_named(arguments: dict[str, Any], erro
             "writes what parameter 'o' writes too",
         ),
         (
-            [p("d", -1, 1, "joint:hinge.damping"), p("d", -1, 1, "option.wind_x")],
+            [p("m", -1, 3, "body:rod.mass")],
+            TargetError,
+            "parameter 'm': bounds from -1 kg, but body:rod.mass cannot be below 0; raise the lower one",
+        ),
+        (
+            [p("m", -1, 2, "body:rod.mass", relative=True)],
+            TargetError,
+            "parameter 'm': bounds from -1 kg",
+        ),
+        (
+            [p("d", 0, 1, "joint:hinge.damping"), p("d", -1, 1, "option.wind_x")],
             ValueError,
             "the names must differ",
         ),

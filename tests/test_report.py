@@ -440,7 +440,7 @@ ALIKE = Comparison(1.1, 0.8, 1.5, 0.6, 10)
             scores((0.1, 0.11)),
             ALIKE,
             "bad",
-            "NOT better than the model you had, beyond noise: its error is 1.1 times smaller",
+            "NOT shown that the calibrated model is better than the model you had: its error is 1.1 times smaller",
         ),
         (scores((0.1, 9.0), (0.3, 0.2)), BETTER, "fair", "but it is larger in log (c1)"),
         (scores((0.1, 0.102)), Comparison(1.02, 1.01, 1.03, 0.01, 10), "fair", "1.02 times smaller"),
@@ -459,7 +459,7 @@ def test_verdict_on_the_prediction(
 
 
 def test_a_calibration_that_does_not_help_says_so_first(calibration: Calibration) -> None:
-    for comparison, first in ((WORSE, "WORSE"), (ALIKE, "NOT better"), (BETTER, "may be trusted")):
+    for comparison, first in ((WORSE, "WORSE"), (ALIKE, "NOT shown"), (BETTER, "may be trusted")):
         found = dataclasses.replace(calibration, comparison=comparison)
         assert first in report.verdicts(found)[0].text
         page = Page(report.render(found, [])).text

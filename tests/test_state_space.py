@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -526,3 +527,30 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
 def test_wrong_input_is_named(call, words: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=words):
         call()
+
+
+@pytest.mark.parametrize("kind", [StateSpace, sipe.Segments])
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"noise_sd": 0.1}, "noise_sd: expected one sd for each channel, None where unknown, got 0.1"),
+        ({"noise_sd": (-0.1,)}, "noise_sd: expected finite sds .* zero, got -0.1"),
+        ({"noise_sd": (float("nan"),)}, "noise_sd: expected finite sds .* zero, got nan"),
+        (
+            {"noise_sd": (0.1, 0.1)},
+            r"noise_sd: expected one for each of the channels \['joint:hinge.position'\], got 2",
+        ),
+        ({"fit": "hinge"}, "fit: expected names of channels, .* got 'hinge'"),
+        ({"fit": ()}, "fit: expected names of channels"),
+    ],
+)
+def test_wrong_settings_are_named(kind: Any, settings: dict[str, Any], words: str) -> None:
+    simulator = pendulum()
+    log = pendulum_log(simulator, [0.6, 0.1], 1, steps=100)
+    with pytest.raises(ValueError, match=words):
+        Laplace(simulator, likelihood=kind(**settings)).fit(log)
+
+
+def test_states_without_measurement_noise_are_refused() -> None:
+    with pytest.raises(ValueError, match="noise_sd: expected finite sds above zero"):
+        StateSpace(noise_sd=(0.0,))

@@ -168,3 +168,14 @@ def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], wo
     assert result.exit_code == 2, result.output
     assert words in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_what_the_configuration_reads_is_not_written_over(config: Path) -> None:  # noqa: F811
+    """Its own logs, its model, itself."""
+    problem = prepare(config, 1)
+    for path in (problem.config.logs[0].file, problem.config.model, config):
+        before = Path(path).read_bytes()
+        result = call(config, "--out", path)
+        assert result.exit_code == 2
+        assert f"--out {path}: is what {config} reads, and would be lost" in result.stderr
+        assert Path(path).read_bytes() == before

@@ -160,15 +160,21 @@ def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) ->
         return Verdict("bad", f"On held-out logs the calibrated model has no finite error in {where}.")
     if comparison is None:
         return Verdict("fair", "On held-out logs the errors of the two models cannot be compared.")
-    found = f"{_margin(comparison)}; paired t-test on {comparison.pieces} pieces of the logs, p = {comparison.p:.2g})"
+    found = f"{_margin(comparison)}; paired t-test on {comparison.pieces} pieces of the logs, p = {comparison.p:.2g}"
+    if comparison.starts is not None:
+        found += f"; from starts that each model fits, since those measured make {100 * comparison.starts:.3g} % of the error"
+    found += ")"
     if comparison.verdict == "worse":
         return Verdict(
             "bad", f"On held-out logs the calibrated model is WORSE than the model you had: its error is {found}."
         )
     if comparison.verdict == "not better":
-        text = "On held-out logs the calibrated model is NOT better than the model you had, beyond noise: its error is "
+        text = (
+            "On held-out logs it is NOT shown that the calibrated model is better than the model you had: its error is "
+        )
         return Verdict("bad", f"{text}{found}.")
-    worse = [f"{s.log} ({s.channel})" for s in scores if s.rmse > ALIKE * s.rmse_default]
+    alone = comparison.starts is None  # the errors by log are from measured starts
+    worse = [f"{s.log} ({s.channel})" for s in scores if alone and s.rmse > ALIKE * s.rmse_default]
     text = f"On held-out logs the calibrated model is better than the model you had: its error is {found}"
     if worse:
         return Verdict("fair", f"{text}; but it is larger in {listed(worse)}.")

@@ -55,6 +55,9 @@ def suggest(
         whole("--draws", draws)
         positive("--duration", duration)
         problem = prepare(config, threads)
+        used = {path.resolve() for path in (config, problem.config.model, *(log.file for log in problem.config.logs))}
+        if out.resolve() in used:
+            raise ValueError(f"--out {out}: is what {config} reads, and would be lost; choose another name")
         dt = float(problem.train.dt[0])
         bounds = suggestions.limits(problem.simulator, np.concatenate([log.actions for log in problem.train]))
         band = (low or 1 / duration, high or min(5.0, 0.2 / dt))

@@ -60,9 +60,8 @@ class Environment(ABC):
         Returns whether they are physical; an unphysical model is never simulated. Derived constants are refreshed by
         the engine when ``needs_constants``."""
 
-    @property
-    def least_steps(self) -> FloatArray:
-        """Least changes (N,) of theta that finite differences can be taken over; zero for all that is smooth."""
+    def least_steps(self, theta: FloatArray) -> FloatArray:
+        """Least changes (N,) of theta (N,) that finite differences can be taken over; zero for all that is smooth."""
         return np.zeros(len(self.space))
 
     @property

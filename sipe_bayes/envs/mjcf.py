@@ -242,14 +242,13 @@ class MjcfEnvironment(Environment):
                 target.write(model, value)
         return physical and (not bodies or check_inertia(model, bodies))
 
-    @cached_property
-    def least_steps(self) -> FloatArray:
+    def least_steps(self, theta: FloatArray) -> FloatArray:
         found = np.zeros(len(self.parameters))
         for j, multiplier, target in self._targets:
-            if target.step:
-                low = self.parameters[j].value(0.5)
-                step = float(self.parameters[j].normalise(low + target.step / multiplier)) - 0.5
-                found[j] = max(found[j], min(step, _LONGEST_STEP))
+            value = multiplier * float(self.parameters[j].value(theta[j]))
+            if value < target.step:
+                ahead = float(self.parameters[j].normalise((value + target.step) / multiplier))
+                found[j] = max(found[j], min(ahead - theta[j], _LONGEST_STEP))
         return found
 
     @property
@@ -441,7 +440,7 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
     """The parameter with the unit and the default that the model gives it."""
     if not parameter.targets:
         raise TargetError(f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass")
-    units, values = [], []
+    units, values, least = [], [], -np.inf
     for spec in parameter.targets:
         match = _BIAS.match(spec)
         if match:
@@ -462,6 +461,7 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
                 raise TargetError(f"parameter {parameter.name!r}: {error}") from None
             units.append(target.unit)
             values.append(target.value)
+            least = max(least, target.minimum)
     if parameter.relative and parameter.default is None:
         if not values[0]:
             raise TargetError(
@@ -473,4 +473,9 @@ def _with_model_values(model: Any, parameter: Parameter, channels: Sequence[Chan
         if mean is not None and sd is not None:
             mean, sd = mean * values[0], abs(sd * values[0])
         parameter = replace(parameter, low=low, high=high, prior_mean=mean, prior_sd=sd)
+    if parameter.low < least:
+        raise TargetError(
+            f"parameter {parameter.name!r}: bounds from {parameter.low:g} {parameter.unit or units[0]}, but "
+            f"{parameter.targets[0]} cannot be below {least:g}; raise the lower one"
+        )
     return replace(parameter, unit=parameter.unit or units[0], default=values[0])

@@ -43,7 +43,7 @@ class TargetError(ValueError):
 class Target:
     """One number of a compiled model. ``order``: writes with a smaller order come first. ``constants``:
     MuJoCo's derived constants depend on it, so mj_setConst follows a write. ``minimum``: the smallest
-    physical value. ``step``: the least change of the value that a finite difference can be taken over."""
+    physical value. ``step``: the least change that a finite difference can be taken over, from values below it."""
 
     spec: str
     unit: str

@@ -34,7 +34,7 @@ def linearise(
     n, d = chain.num_theta, chain.num_start
     count = n + d
     thetas, lanes = np.tile(theta, (1 + 2 * count, 1)), np.tile(states, (1 + 2 * count, 1, 1))
-    theta_step = np.maximum(theta_step, chain.simulator.environment.least_steps)
+    theta_step = np.maximum(theta_step, chain.simulator.environment.least_steps(theta))
     up, down = np.minimum(theta_step, 1 - theta), np.minimum(theta_step, theta)
     thetas[np.arange(1, n + 1), np.arange(n)] += up
     thetas[np.arange(count + 1, count + n + 1), np.arange(n)] -= down

@@ -8,6 +8,8 @@ the search has all but come to an optimum that is already known.
 Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ from
 place to place, and the place would otherwise be an accident of the start.
 
+An optimum at which differences have been too short to see what a parameter does (a delay below two physics steps) is searched on with longer ones.
+
 Where the starts are recorded and theta alone is searched, points around each optimum are tried as well (``poll``), and the search
 goes on from a better one, with finite differences no longer than the way there. The normal that is left is no narrower than the
 shortest of these ways, and holds the points that fit as well as the optimum, whatever the curvature says; one that fits as
@@ -160,6 +162,7 @@ def _begin(windows: Windows, theta: FloatArray) -> State:
         "polls": 0,
         "misfit": 0.0,
         "theta_step": windows.theta_step,
+        "long": False,
     }
 
 
@@ -248,7 +251,11 @@ def _held_step(windows: Windows, state: State, prior: QuadraticPrior) -> State:
     view, theta = windows.glimpse(), state["theta"]
     before = view.rollouts
     found = view.linearise(
-        theta, view.no_starts(), with_starts=False, residual=state["residual"] if state["residual"].size else None
+        theta,
+        view.no_starts(),
+        with_starts=False,
+        residual=state["residual"] if state["residual"].size else None,
+        theta_step=view.theta_step,
     )
     still = np.zeros((*found.residual.shape, windows.num_start))
     found = replace(found, jacobian=np.concatenate([found.jacobian, still], axis=-1))
@@ -277,7 +284,7 @@ def _held_step(windows: Windows, state: State, prior: QuadraticPrior) -> State:
 def _linearise(windows: Windows, state: State) -> tuple[Linearisation, bool, float]:
     """Linearisation at the state's point, whether part of it is of an earlier one, and the drift of that part."""
     theta, starts, jacobian, n = state["theta"], state["starts"], state["jacobian"], windows.num_theta
-    size = state["theta_step"]
+    size = np.maximum(state["theta_step"], windows.least_steps(theta) if state["long"] else 0.0)
     residual = state["residual"] if state["residual"].size else None
     if not jacobian.size or not np.isfinite(state["drift"]) or not state["keep_starts"]:
         return windows.linearise(theta, starts, residual=residual, theta_step=size), False, 0.0
@@ -364,6 +371,8 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     further = None if state["centred"] else _middle(search, windows, found)
     if further is not None:
         return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
+    if not state["long"] and windows.least_steps(theta).any():
+        return {**state, "long": True, "moved": True, **_AFRESH}
     before = len(state["mode_evidence"]) - (state["polls"] > 0)  # an optimum that a poll has bettered is none
     modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"][:before], v[None]]) for k, v in found.items()}
     state, polls = {**state, **modes}, state["polls"]
@@ -426,6 +435,10 @@ def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArra
     """Precision and gradient of plain least squares when the residuals' covariance gives ``middle``."""
     shift = np.linalg.pinv(arrow.precision, rcond=1e-12, hermitian=True) @ arrow.gradient
     precision = arrow.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ arrow.precision
+    eigenvalues, axes = np.linalg.eigh(
+        0.5 * (precision + precision.T)
+    )  # rounding leaves some of an open direction negative
+    precision = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
     return precision, precision @ shift
 
 
