@@ -13,6 +13,7 @@ from sipe_bayes.benchmark import commands as benchmark_commands
 from sipe_bayes.benchmark import transfer_commands
 from sipe_bayes.diagnostics import check_commands, suggest_commands
 from sipe_bayes.inference.registry import ESTIMATORS
+from sipe_bayes.refusing import refusing
 from sipe_bayes.rl import commands as rl_commands
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ app.command()(suggest_commands.suggest)
 app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 
-BAD_INPUT = 2
 _ABORTED = 1
 # what the parser says of options and arguments, whose name typer keeps private
 _REFUSED: Any = typer.BadParameter.__mro__[2]
@@ -79,18 +79,11 @@ def calibrate(
     from sipe_bayes.calibration import run
     from sipe_bayes.output import to_json
 
-    with Progress(quiet=as_json) as progress:
-        try:
-            _check("--seed", seed, 0)
-            _check("--budget", budget, 1)
-            _check("--threads", threads, 1)
-            found = run(config, estimator, seed, budget, out, threads, progress.update)
-        except (ValueError, OSError) as error:
-            progress.stop()
-            if type(error).__name__ == "LinAlgError":  # a ValueError to NumPy, but no input is at fault
-                raise
-            print(f"sipe: {_one_line(error)}", file=sys.stderr)
-            raise typer.Exit(BAD_INPUT) from None
+    with refusing("; the same command goes on"), Progress(quiet=as_json) as progress:
+        _check("--seed", seed, 0)
+        _check("--budget", budget, 1)
+        _check("--threads", threads, 1)
+        found = run(config, estimator, seed, budget, out, threads, progress.update)
     if as_json:
         print(to_json(found.to_dict()))
     else:
@@ -106,11 +99,8 @@ def envs(
     from sipe_bayes.diagnostics.catalogue import describe, tasks
     from sipe_bayes.output import to_json
 
-    try:
+    with refusing():  # assets may not be installed
         found: Any = tasks() if name is None else describe(name)
-    except (ValueError, ImportError, OSError) as error:  # the two last: assets that are not installed
-        print(f"sipe: {_one_line(error)}", file=sys.stderr)
-        raise typer.Exit(BAD_INPUT) from None
     if as_json:
         print(to_json(found))
     elif name is None:
@@ -122,10 +112,6 @@ def envs(
 def _check(option: str, value: int | None, least: int) -> None:
     if value is not None and value < least:
         raise ValueError(f"{option} {value}: expected at least {least}; raise it or leave it out")
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 class Progress:

@@ -4,30 +4,19 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from sipe_bayes.refusing import BAD_INPUT, refusing
+
 app = typer.Typer(name="data", help="Trajectories of the benchmark: make, check, export.", no_args_is_help=True)
 
-BAD_INPUT = 2
 Tasks = Annotated[list[str] | None, typer.Option("--task", help="Again for several; default the benchmark's nine.")]
 Variants = Annotated[list[str] | None, typer.Option("--variant", help="Again for several; default all three.")]
 Splits = Annotated[list[str] | None, typer.Option("--split", help="Again for several; default all three.")]
 Types = Annotated[list[str] | None, typer.Option("--type", help="expert, suboptimal or random; default all three.")]
-
-
-@contextmanager
-def _refusing() -> Iterator[None]:
-    """Input errors are one line on standard error and exit code 2."""
-    try:
-        yield
-    except (ValueError, ImportError, OSError, RuntimeError) as error:
-        print(f"sipe: {' '.join(str(error).split())}", file=sys.stderr)
-        raise typer.Exit(BAD_INPUT) from None
 
 
 @app.command()
@@ -48,7 +37,7 @@ def generate(
     from sipe_bayes.generation import generate as made_one_by_one
 
     made, missing = 0, 0
-    with _refusing():
+    with refusing():
         _at_least(1, count=count, steps=steps, threads=threads)
         _at_least(0, seed=seed)
         for found in made_one_by_one(_names(task, variant, split, type), out, count, steps, seed, _command(), threads):
@@ -71,7 +60,7 @@ def verify(
     from sipe_bayes import trajectory_sets
 
     chosen = folder or trajectory_sets.SHIPPED
-    with _refusing():
+    with refusing():
         wrong = trajectory_sets.verify(chosen)
         sizes = [entry["bytes"] for entry in trajectory_sets.manifest(chosen).values()]
     for line in wrong:
@@ -102,7 +91,7 @@ def export(
     from sipe_bayes.minari_data import to_minari
 
     words: Any = (type, split, variant)
-    with _refusing(), warnings.catch_warnings(record=True) as said:
+    with refusing(), warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UserWarning)
         found = demonstrations(task, *words, count=count, seed=seed, steps=steps, folder=folder)
         about = f"{type} trajectories of {task} ({variant}, {split})."
@@ -127,7 +116,7 @@ def demonstrate(
     from sipe_bayes.cli import Progress
     from sipe_bayes.rl.demonstrate import make
 
-    with _refusing():
+    with refusing():
         _at_least(1, count=count, threads=threads)
         _at_least(0, seed=seed)
         if out.suffix != ".npz":

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import errno
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from sipe_bayes.refusing import refusing
 
 if TYPE_CHECKING:
     from sipe_bayes.benchmark.cells import Suite
@@ -18,12 +18,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(name="benchmark", help="Measure estimators on the benchmark's environments.", no_args_is_help=True)
 
-BAD_INPUT = 2
-_INTERRUPTED = 130
-_REMEDIES = {
-    errno.EACCES: "make it writable, or choose another folder",
-    errno.ENOSPC: "free some space, and the same command goes on",
-}
 Out = Annotated[Path, typer.Option(help="Folder of results; the same command goes on where it was interrupted.")]
 Folder = Annotated[Path, typer.Argument(help="Folder of results.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
@@ -34,28 +28,6 @@ Where = Annotated[
     str, typer.Option(help="pool: processes of this machine; ray: a cluster; inline: this process alone.")
 ]
 Address = Annotated[str | None, typer.Option(help="HOST:PORT of a Ray cluster; default one on this machine.")]
-
-
-@contextmanager
-def refusing(then: str = "") -> Iterator[None]:
-    """Input errors are one line on standard error and exit code 2; an interruption says what to do ``then``."""
-    try:
-        yield
-    except (ValueError, ImportError, OSError, RuntimeError) as error:
-        if type(error).__name__ == "LinAlgError":  # a ValueError to NumPy, but no input is at fault
-            raise
-        print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
-        raise typer.Exit(BAD_INPUT) from None
-    except KeyboardInterrupt:
-        print(f"sipe: interrupted{then}", file=sys.stderr)
-        raise typer.Exit(_INTERRUPTED) from None
-
-
-def _text(error: Exception) -> str:
-    """Of an error of the file system: the path, what is wrong, and a remedy."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror.lower()}; {_REMEDIES.get(error.errno or 0, 'choose another folder')}"
-    return str(error)
 
 
 @app.command()

@@ -24,9 +24,9 @@ from sipe_bayes.benchmark.commands import (
     exit_if_failed,
     needs_suite,
     print_status,
-    refusing,
     say,
 )
+from sipe_bayes.refusing import refusing
 
 app = typer.Typer(
     name="transfer",

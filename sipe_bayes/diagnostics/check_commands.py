@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -12,20 +10,7 @@ import typer
 
 from sipe_bayes.checks import at_least, whole
 from sipe_bayes.inference.registry import ESTIMATORS
-
-BAD_INPUT = 2
-
-
-@contextmanager
-def refusing() -> Iterator[None]:
-    """Input errors are one line on standard error and exit code 2."""
-    try:
-        yield
-    except (ValueError, ImportError, OSError) as error:
-        if type(error).__name__ == "LinAlgError":  # a ValueError to NumPy, but no input is at fault
-            raise
-        print(f"sipe: {' '.join(str(error).split())}", file=sys.stderr)
-        raise typer.Exit(BAD_INPUT) from None
+from sipe_bayes.refusing import refusing
 
 
 def check(
@@ -46,11 +31,16 @@ def check(
     """Simulation-based calibration: do the estimator's intervals hold the truth on this model, noise and commands?
 
     Exit code 1 where they do not."""
-    with refusing():
+    with refusing("; the same command goes on"):
         from sipe_bayes.diagnostics import check as checks
         from sipe_bayes.output import to_json
 
-        for option, value, least in (("--steps", steps, 1), ("--refits", refits, 0), ("--seed", seed, 0)):
+        for option, value, least in (
+            ("--truths", truths, checks.FEWEST),
+            ("--steps", steps, 1),
+            ("--refits", refits, 0),
+            ("--seed", seed, 0),
+        ):
             whole(option, value, least)
         at_least("--noise", noise, 0)
         if target.endswith(".toml"):

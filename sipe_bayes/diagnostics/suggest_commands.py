@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sipe_bayes.checks import positive, whole
-from sipe_bayes.diagnostics.check_commands import refusing
+from sipe_bayes.refusing import refusing
 
 if TYPE_CHECKING:
     from sipe_bayes.calibration import Problem
@@ -52,6 +52,7 @@ def suggest(
         from sipe_bayes.output import to_json
 
         whole("--candidates", candidates, 0)
+        whole("--seed", seed, 0)
         whole("--draws", draws)
         positive("--duration", duration)
         problem = prepare(config, threads)

@@ -167,11 +167,11 @@ class MCMC(Estimator):
         steps = min(_BLOCK, (self.budget - windows.rollouts) // (walkers * len(trajectories)))
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")
-        proposal = _Proposal(self, state)
+        proposal, target = _Proposal(self, state), self._target(windows, state)
         sampler = emcee.EnsembleSampler(
             walkers,
             dimensions,
-            self._target(windows, state),
+            target,
             vectorize=True,
             moves=[
                 (emcee.moves.MHMove(proposal), 0.6),
@@ -179,6 +179,7 @@ class MCMC(Estimator):
                 (emcee.moves.DESnookerMove(), 0.1),
             ],
         )
+        sampler.log_prob_fn = target  # bare: emcee's wrapper prints the walkers when it is interrupted
         begin = emcee.State(state["walkers"], log_prob=state["log_prob"], random_state=_restore_random(state))
         end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
         random = np.random.RandomState()

@@ -6,27 +6,15 @@ import inspect
 import platform
 import shlex
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from sipe_bayes.refusing import refusing
 from sipe_bayes.rl.settings import Settings
-
-BAD_INPUT = 2
-
-
-@contextmanager
-def _refusing() -> Iterator[None]:
-    """Input errors are one line on standard error and exit code 2."""
-    try:
-        yield
-    except (ValueError, ImportError, OSError) as error:
-        print(f"sipe: {' '.join(str(error).split())}", file=sys.stderr)
-        raise typer.Exit(BAD_INPUT) from None
 
 
 def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
@@ -80,7 +68,7 @@ def train(
     **settings: Any,
 ) -> None:
     """Train an agent by DDPG: expert, suboptimal agent and their cards, learning curve, checkpoint."""
-    with _refusing():
+    with refusing():
         import torch
 
         from sipe_bayes.cli import Progress
@@ -118,7 +106,7 @@ def agents(
     install: Annotated[bool, typer.Option("--install", help="First ship FOLDER's pair, made by `sipe train`.")] = False,
 ) -> None:
     """Evaluate each agent anew and compare with its card; exit code 1 where one is beyond two standard errors."""
-    with _refusing():
+    with refusing():
         from sipe_bayes.rl import evaluation
         from sipe_bayes.rl.evaluation import AGENTS, check_agents
 
