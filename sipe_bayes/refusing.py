@@ -13,7 +13,7 @@ BAD_INPUT, _INTERRUPTED = 2, 130
 _REMEDIES = {
     errno.EACCES: "make it writable, or choose another folder",
     errno.ENOSPC: "free some space, and the same command goes on",
-    errno.ENOENT: "look at the name",
+    errno.ENOENT: "look at the name, or choose another folder",
 }
 
 

@@ -177,7 +177,7 @@ def test_failed_simulations_are_named() -> None:
 def test_a_missing_output_is_skipped_where_it_can_be() -> None:
     """laplace told to compare two of three outputs is wider, and right."""
     simulator, mean = sipe.CallableSimulator(plain, SPACE, likelihood=SD), exact()[0]
-    missing, two = [X[0], X[1], np.nan], sipe.Segments(None, noise="white", noise_sd=(SD, SD), fit=("x0", "x1"))
+    missing, two = [X[0], X[1], np.nan], sipe.Segments(None, noise="white", noise_sd=(SD, SD, None), fit=("x0", "x1"))
     whole = sipe.get_estimator(simulator, "laplace").fit(X)
     part = sipe.get_estimator(simulator, "laplace", likelihood=two).fit(missing)
     assert (part.stddev > whole.stddev).all()

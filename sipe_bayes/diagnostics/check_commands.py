@@ -33,10 +33,11 @@ def check(
     Exit code 1 where they do not."""
     with refusing("; the same command goes on"):
         from sipe_bayes.diagnostics import check as checks
+        from sipe_bayes.diagnostics.calibration import FEWEST
         from sipe_bayes.output import to_json
 
         for option, value, least in (
-            ("--truths", truths, checks.FEWEST),
+            ("--truths", truths, FEWEST),
             ("--steps", steps, 1),
             ("--refits", refits, 0),
             ("--seed", seed, 0),
