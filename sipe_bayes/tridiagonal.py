@@ -219,30 +219,17 @@ def restricted(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Log-likelihood of the noise, states and theta integrated out, up to a constant; its derivatives by log sd (C,) and
     by log process (D,). held: with states and theta where they are, not after the step that would be best were all linear."""
-    value, solved, step, covariance = restricted_value(found, noise, border, held)
-    squares, jumps = expected_squares(found, solved, step, covariance)
-    variance = found.jump_variance(noise)
-    share = (found.linked[:, None] & noise.tight) * noise.process**2 / variance
-    by_sd = squares.sum(0) / noise.sd**2 - found.observed.sum(0)
-    return value, by_sd, (share * (jumps / variance - 1)).sum(0)
-
-
-def restricted_value(
-    found: ChainLinearisation, noise: ChainNoise, border: Border, held: bool = False
-) -> tuple[float, Eliminated, FloatArray, FloatArray]:
-    """The log-likelihood of ``restricted`` alone, and what it was found with: the states eliminated, the best step (N,) of theta and its
-    covariance (N, N)."""
     solved = eliminate(found, noise)
     step, covariance, determinant = border.solve(solved)
     if held:
         solved, step = replace(solved, shift=np.zeros_like(solved.shift), explained=0.0), np.zeros_like(step)
     pulled = solved.gradient + border.pull
-    return (
-        log_likelihood(found, noise, solved) + 0.5 * float(step @ pulled) - 0.5 * determinant,
-        solved,
-        step,
-        covariance,
-    )
+    value = log_likelihood(found, noise, solved) + 0.5 * float(step @ pulled) - 0.5 * determinant
+    squares, jumps = expected_squares(found, solved, step, covariance)
+    variance = found.jump_variance(noise)
+    share = (found.linked[:, None] & noise.tight) * noise.process**2 / variance
+    by_sd = squares.sum(0) / noise.sd**2 - found.observed.sum(0)
+    return value, by_sd, (share * (jumps / variance - 1)).sum(0)
 
 
 def expected_squares(

@@ -14,7 +14,6 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.chain_state import PROCESS_SCALES
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.inference.smoother import Point, descend, first_noise, infer_noise, sound
@@ -261,8 +260,8 @@ def kicked_logs(kick: float = 1.0) -> list[Trajectory]:
 
 
 def test_a_jump_that_stands_out_is_let_go() -> None:
-    """A kick in each of two logs: one step of each is loose, at most 40 ms from it, none of logs without a kick, and the interval is at most three
-    times as wide as theirs (with one process noise for all steps ten times). mcmc agrees."""
+    """A kick in each of two logs: one step of each is loose, at most 40 ms from it, none of logs without a kick, and the interval is hardly wider
+    than theirs (with one process noise for all steps it is ten times as wide). mcmc agrees."""
     fits = {}
     for kick in (0.0, 1.0):
         estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
@@ -272,7 +271,7 @@ def test_a_jump_that_stands_out_is_let_go() -> None:
     assert none == []
     assert len(loose) == 2
     assert np.abs(np.array(loose) - [20, 121 + 20]).max() <= 2
-    assert sd < 3 * usual
+    assert sd < 2 * usual
     assert abs(mean - (12.0 - LOW) / (HIGH - LOW)) < 3 * sd
     chains = MCMC(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
     sampled = chains.fit(kicked_logs())
@@ -313,7 +312,6 @@ def test_the_target_with_fresh_jacobians_is_the_kalman_filter(lengths: float) ->
     mode = {"theta": theta, "states": states, "slope": solved.slope, "sd": noise.sd, "tau": np.zeros(len(noise.sd))}
     mode |= {"process": noise.process, "movement": PROCESS, "loose": np.zeros(len(chain.linked), bool)}
     mode |= {"theta_step": np.full(1, lengths), "state_step": np.full((len(states), 2), lengths)}
-    mode |= {"shares": np.eye(len(PROCESS_SCALES))[0]}
     state = at_optimum(chain, mode)
     target = ChainTarget(sipe.get_estimator(spring(), "laplace").prior, chain, state)
     sd = solved.precision[0, 0] ** -0.5

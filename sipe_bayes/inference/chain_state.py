@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,10 @@ from sipe_bayes.inference.optima import Search
 from sipe_bayes.inference.smoother import border, penalty, process_penalty, scale
 from sipe_bayes.inference.state import State
 from sipe_bayes.state_space import Chain
-from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted, restricted_value
+from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-PROCESS_SCALES = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01)
 
 
 def opening(chain: Chain, points: FloatArray) -> State:
@@ -28,7 +25,6 @@ def opening(chain: Chain, points: FloatArray) -> State:
     shapes = {"theta": (n,), "states": chain.reference.shape, "slope": (k, d, n), "mean": (n,), "covariance": (n, n)}
     shapes |= {"sd": (c,), "tau": (c,), "process": (d,), "movement": (d,), "loose": (k - 1,)}
     shapes |= {"theta_step": (n,), "state_step": (k, d), "settled": (), "evidence": (), "point": ()}
-    shapes |= {"shares": (len(PROCESS_SCALES),)}
     kinds = {"loose": bool, "settled": bool, "point": int}
     return {
         "done": False,
@@ -108,55 +104,19 @@ def recorded(
     evidence: float,
     settled: bool,
     untried: bool = False,
-    scales: tuple[float, ...] = (1.0,),
 ) -> State:
-    """The optimum at its linearisation, in place of this starting point's earlier one: the normal about the best step from here, averaged over
-    common ``scales`` of the process noise, some of PROCESS_SCALES, and where no step has been tried yet, also as wide as that step is long."""
+    """The optimum at its linearisation, in place of this starting point's earlier one: the normal about the best step from here, and where
+    no step has been tried yet, also as wide as that step is long."""
     theta, solved = state["theta"], eliminate(found, noise)
-    mean, covariance, shares = _averaged(search, theta, found, noise, settled, scales)
+    mean, covariance = search.normal(theta, solved.precision, solved.gradient)
     if untried:
         covariance = covariance + np.outer(mean - theta, mean - theta)
     here = {"theta": theta, "states": state["states"], "slope": solved.slope, "mean": mean, "covariance": covariance}
-    here |= {"shares": shares}
     here |= {"sd": noise.sd, "tau": np.zeros_like(noise.sd), "process": noise.process, "movement": state["movement"]}
     here |= {name: state[name] for name in ("loose", "theta_step", "state_step")}
     here |= {"settled": np.array(settled), "evidence": np.array(evidence), "point": np.array(state["point"])}
     others = state["mode_point"] != state["point"]
     return {**state, **{f"mode_{k}": np.concatenate([state[f"mode_{k}"][others], v[None]]) for k, v in here.items()}}
-
-
-def _averaged(
-    search: Search,
-    theta: FloatArray,
-    found: ChainLinearisation,
-    noise: ChainNoise,
-    settled: bool,
-    scales: tuple[float, ...],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean (N,) and covariance (N, N) of the normals at shares of the optimum's process noise, and the weights of PROCESS_SCALES: by the restricted likelihood of one linearisation, all scales as probable beforehand. The prior of single process
-    noises keeps the optimum from zero; where the likelihood cares no more, this takes back what that widens."""
-    values, means, covariances = np.full(len(PROCESS_SCALES), -np.inf), [], []
-    for k, scaled in enumerate(scales):
-        one = replace(noise, process=scaled * noise.process)
-        try:
-            solved = eliminate(found, one)
-            values[k] = restricted_value(
-                found, one, border(search.quadratic_prior, theta, solved.gradient), not settled
-            )[0]
-        except np.linalg.LinAlgError:
-            if not k:
-                raise
-            break
-        mean, covariance = search.normal(theta, solved.precision, solved.gradient)
-        means.append(mean)
-        covariances.append(covariance)
-    shares = np.exp(values - values.max())
-    shares /= shares.sum()
-    used = shares[: len(means)]
-    mean = used @ np.array(means)
-    spread = np.einsum("k,kij->ij", used, np.array(covariances))
-    apart = np.array(means) - mean
-    return mean, spread + (apart.T * used) @ apart, shares
 
 
 def diverged(chain: Chain, state: State) -> State:

@@ -19,8 +19,7 @@ freedom: contacts amplify the noise of a measurement manyfold. Where some coordi
 about those that the commands lead to. (Of all this, a search from known first states uses the steps and the noise only; it linearises
 over what is still open, ``inference.posterior_linearisation``.)
 
-Deviations: the noise is held at its optimum but for a common scale of the process noise, over which the posterior is averaged
-(``chain_state``); else the posterior of theta does not widen for it. A coordinate's process noise q
+Deviations: the noise is held at its optimum, the posterior of theta does not widen for it. A coordinate's process noise q
 has a prior q^0.5 exp(-q / movement), movement being how far the coordinate moves in a control step: the likelihood leaves the
 process noise of an unmeasured coordinate open above, and any that is small enough open below, where an estimate of zero would
 be overconfident (Y. Chung, S. Rabe-Hesketh, V. Dorie, A. Gelman, J. Liu, "A nondegenerate penalized likelihood estimator for

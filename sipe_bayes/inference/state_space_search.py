@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.chain_state import PROCESS_SCALES, diverged, evidence_of, onward, opening, recorded, screened
+from sipe_bayes.inference.chain_state import diverged, evidence_of, onward, opening, recorded, screened
 from sipe_bayes.inference.least_squares import QuadraticPrior
 from sipe_bayes.inference.loose_jumps import needed, outstanding
 from sipe_bayes.inference.optima import Search
@@ -172,7 +172,7 @@ def _ended(
     evidence = evidence_of(search, state, found, noise, settled)
     if evidence <= before + _SETTLED:
         return onward(chain, state)
-    state = recorded(search, state, found, noise, evidence, settled, scales=PROCESS_SCALES)
+    state = recorded(search, state, found, noise, evidence, settled)
     again = {**state, "round": 1, "inner": 0, "due": False}
     if loose.any():
         closed = _closed(search, chain, state, found, noise)

@@ -3,7 +3,7 @@
 The states follow theta as the smoother found, x(theta) = x_hat - slope (theta - theta_hat), and are simulated there; what
 remains of the likelihood is quadratic in them with the Jacobians of the ``laplace`` optimum, so its block-tridiagonal
 matrix is factorised once. Exact where measurement and transition are linear in the states. The noise is that of the
-optimum, summed over the common scale of the process noise that the optimum is averaged over (``chain_state``).
+optimum.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.chain_state import PROCESS_SCALES
 from sipe_bayes.inference.posterior_linearisation import linearise
 from sipe_bayes.inference.state import State
 from sipe_bayes.posterior import Posterior
@@ -24,8 +23,7 @@ from sipe_bayes.tridiagonal import ChainLinearisation, ChainNoise, eliminate, lo
 
 FloatArray = NDArray[np.float64]
 
-_NAMES = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step", "shares")
-_LEAST_SHARE = 0.01  # of a process noise's scale that counts
+_NAMES = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step")
 _STEPS = 2  # of the states, before a fresh linearisation is compared
 
 
@@ -53,12 +51,8 @@ class ChainTarget:
     def __init__(self, prior: Posterior, chain: Chain, state: State) -> None:
         self.prior, self.chain, self.state = prior, chain, state
         self.fit = ChainLinearisation(**{f.name: state[f"fit_{f.name}"] for f in fields(ChainLinearisation)})
-        self.noises = [
-            ChainNoise(state["fit_sd"], scale * state["fit_process"], state["fit_movement"], state["fit_loose"])
-            for scale, share in zip(PROCESS_SCALES, state["fit_shares"], strict=True)
-            if share > _LEAST_SHARE
-        ]
-        self.solved = [eliminate(self.fit, noise) for noise in self.noises]
+        self.sd = ChainNoise(state["fit_sd"], state["fit_process"], state["fit_movement"], state["fit_loose"])
+        self.solved = eliminate(self.fit, self.sd)
 
     def states(self, theta: FloatArray) -> FloatArray:
         """States (B, K, S) that follow theta (B, N)."""
@@ -81,34 +75,27 @@ class ChainTarget:
 
     def _marginal(self, found: list[ChainLinearisation]) -> FloatArray:
         """log p(y | theta) of comparisons that share the optimum's Jacobians."""
-        values = []
-        for noise, fit in zip(self.noises, self.solved, strict=True):
-            forces = np.stack([pull(one, noise).ravel() for one in found], axis=1)
-            moved = scipy.linalg.cho_solve_banded((fit.factor, True), forces, check_finite=False)
-            gains = (forces * moved).sum(0)
-            solved = [replace(fit, explained=float(g)) for g in gains]
-            values.append([log_likelihood(one, noise, s) for one, s in zip(found, solved, strict=True)])
-        return np.asarray(np.logaddexp.reduce(values, axis=0))
+        forces = np.stack([pull(one, self.sd).ravel() for one in found], axis=1)
+        moved = scipy.linalg.cho_solve_banded((self.solved.factor, True), forces, check_finite=False)
+        gains = (forces * moved).sum(0)
+        solved = [replace(self.solved, explained=float(g)) for g in gains]
+        return np.array([log_likelihood(one, self.sd, s) for one, s in zip(found, solved, strict=True)])
 
     @property
     def check_cost(self) -> int:
         """Rollouts of a log to hold ``refreshed`` against the target."""
         sides = 2 if self.state["fit_state_step"].any() else 1
-        each = _STEPS * (1 + sides * (self.chain.num_theta + self.chain.num_start))
-        return 1 + each * len(self.noises)
+        return 1 + _STEPS * (1 + sides * (self.chain.num_theta + self.chain.num_start))
 
     def refreshed(self, point: FloatArray) -> float:
         """The target at one point (N,) with the Jacobians taken there, after steps of the states alone."""
-        return float(np.logaddexp.reduce([self._refreshed(point, noise) for noise in self.noises]))
-
-    def _refreshed(self, point: FloatArray, noise: ChainNoise) -> float:
         states = self.states(point[None])[0]
         value = -np.inf
         for _ in range(_STEPS):
             found = _linearised(self.chain, point, states, self.state["fit_theta_step"], self.state["fit_state_step"])
             if found is None:
                 return -np.inf
-            solved = eliminate(found, noise)
-            value = log_likelihood(found, noise, solved)
+            solved = eliminate(found, self.sd)
+            value = log_likelihood(found, self.sd, solved)
             states = self.chain.moved(states, solved.shift)
         return value + float(self.prior.log_prob(torch.from_numpy(point)))
