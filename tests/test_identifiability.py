@@ -54,6 +54,23 @@ def test_a_member_that_is_determined_is_not_said_to_be_open() -> None:
     assert set(ridge.parameters) == {"mass", "gear"}
 
 
+def test_three_that_go_together_are_all_named() -> None:
+    """Mass, gear and damping of a cart whose forces have no scale: two determined combinations, in which each of the three occurs."""
+    rng = np.random.default_rng(0)
+    space = ParameterSpace(
+        [Parameter("mass", 0.5, 3.0, unit="kg"), Parameter("gear", 3.0, 18.0), Parameter("damping", 0.0, 3.0)]
+    )
+    scale, noise = rng.uniform(0.4, 2.2, 4000), rng.standard_normal((3, 4000))
+    draws = np.stack([1.3 * scale * (1 + 0.002 * noise[0]), 8 * scale, 0.8 * scale * (1 + 0.02 * noise[1])], 1)
+    contraction = 1 - draws.std(0) / np.array([2.5, 15.0, 3.0]) * np.sqrt(12)
+    found = ridges(space, draws, contraction.tolist())
+    print(found)
+    assert len(found) == 2
+    assert {name for r in found for name in r.parameters} == {"mass", "gear", "damping"}
+    assert "damping" in found[1].parameters
+    assert len(found[1].parameters) == 2
+
+
 def test_a_sum_of_many_is_found() -> None:
     """Thirty masses whose sum is known, none of them by itself."""
     rng = np.random.default_rng(0)

@@ -75,6 +75,11 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
             if all(contraction[j] > _DETERMINED for j in members):
                 continue
             ridge = _describe(space, draws, members, contraction)
+            named = set().union(*used)
+            fresh = [j for j in members if space[j].name not in named]
+            if 0 < len(fresh) < len(members) and (ridge is None or set(ridge.parameters) <= named):
+                one = next(j for j in members if j not in fresh)  # of those that go together, the others follow
+                ridge = _describe(space, draws, sorted([one, *fresh]), contraction)
             if ridge is not None and not any(set(ridge.parameters) <= seen for seen in used):
                 used.append(set(ridge.parameters))
                 found.append(ridge)
