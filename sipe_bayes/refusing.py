@@ -23,8 +23,8 @@ def refusing(then: str = "") -> Iterator[None]:
     try:
         yield
     except (ValueError, ImportError, OSError, RuntimeError) as error:
-        if type(error).__name__ == "LinAlgError":  # a ValueError to NumPy, but no input is at fault
-            raise
+        if type(error).__name__.endswith("LinAlgError") or isinstance(error, NotImplementedError | RecursionError):
+            raise  # no input is at fault
         print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
     except KeyboardInterrupt:

@@ -63,6 +63,58 @@ def test_a_normal_posterior_stays_a_normal() -> None:
     np.testing.assert_allclose(found.covariances[0], 0.05**2 * np.linalg.inv(mixing.T @ mixing), rtol=0.02)
 
 
+def test_the_probe_goes_two_sds_along_each_parameter() -> None:
+    """Unequal sds, strongly correlated: a normal density is found to be normal, and every point lies two nats down."""
+    covariance, seen = np.array([[1e-6, 0.9e-4], [0.9e-4, 1e-2]]), []
+
+    def target(points: np.ndarray) -> np.ndarray:
+        seen.append(points)
+        gaps = points - 0.5
+        return np.asarray(10 * np.tanh(-0.05 * np.einsum("bi,ij,bj->b", gaps, np.linalg.inv(covariance), gaps)))
+
+    assert importance.normal(target, np.full(2, 0.5), np.full(2, 0.5), covariance)
+    gaps = seen[0][1:] - 0.5
+    np.testing.assert_allclose(np.einsum("bi,ij,bj->b", gaps, np.linalg.inv(covariance), gaps), 4.0)
+
+
+def test_an_open_direction_beside_a_sharp_one() -> None:
+    """Sds of 10 and 1e-5: the weighted variance of the sharp one is right to 3.5 standard errors (false alarm 1 in 2000), that of the open one the prior's."""
+    space = sipe.ParameterSpace([sipe.Parameter("sharp", 0.0, 1.0), sipe.Parameter("open", 0.0, 1.0)])
+    found = GaussianMixture([0.0], np.full((1, 2), 0.5), np.diag([1e-10, 100.0])[None], space)
+    state: dict[str, Any] = importance.begin(2)
+    for _ in range(40):
+        state = importance.draw(
+            state, lambda p: np.asarray(-0.5 * ((p[:, 0] - 0.5) / 1e-5) ** 2), found, default_prior(space), 2
+        )
+    weight, points = importance.weights(state, default_prior(space)), state["draws_points"]
+    count = importance.effective(weight)
+    assert count > 200
+    variance = weight @ (points - weight @ points) ** 2 / np.array([1e-10, 1 / 12])
+    print(variance, count)
+    assert (np.abs(variance - 1) < 3.5 * np.sqrt(2 / count)).all()
+
+
+def test_kernels_at_a_bound_keep_the_draws_quantiles() -> None:
+    """Half-normal draws: without each kernel's own mass the 5 % quantile would be twice too large."""
+    space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
+    draws = np.abs(0.1 * np.random.default_rng(0).standard_normal((400, 1)))
+    found = importance.kernels({"draws_points": draws}, np.full(400, 1 / 400), space, 0)
+    levels = [0.05, 0.5, 0.95]
+    wanted = np.quantile(draws[:, 0], levels)
+    print(found.quantile(levels)[:, 0], wanted)
+    np.testing.assert_allclose(found.quantile(levels)[:, 0], wanted, atol=0.02)
+
+
+def test_a_given_noise_is_not_made_larger() -> None:
+    """An sd of 1e-4 as stated; of 1e-8 no draws, and the least sd that the search resolves."""
+    space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
+    for stated, wanted in ((1e-4, 1e-4), (1e-8, 1e-6)):
+        estimator = Laplace(sipe.CallableSimulator(lambda v: 1.0 + v, space, likelihood=stated))
+        found = estimator.fit(np.array([1.5]))
+        assert "draws" not in estimator.diagnostics
+        assert float(found.stddev[0]) == pytest.approx(wanted, rel=0.3)
+
+
 def test_unknown_noise_of_a_log_is_integrated_out() -> None:
     """A pendulum from a known start, 25 noisy samples: the kernels' quantiles are those of a grid over mass and damping on which white noise of unknown sd is
     integrated out in closed form, to .08 of the range."""

@@ -233,6 +233,8 @@ def main() -> None:
     cells = {cell: found for cell in CELLS if (found := summaries(simulator, cell))}
     for cell, found in cells.items():
         print(cell, json.dumps(found), flush=True)
+    if given.fits != FITS:
+        return
     versions = {p: version(p) for p in ("mujoco", "numpy", "scipy")}
     found = {"command": "python examples/studies/arm.py", "versions": versions, "cells": cells}
     write_text(HERE / "results" / "arm.json", to_json(found, indent=1) + "\n")

@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 
 _BAND_DRAWS = 64
 _MOSTLY = 0.95  # of an error
+_SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
@@ -90,7 +91,8 @@ def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
     fitted = _best_squares(windows, theta)
     share = _share_of_starts(windows, square[0], fitted)
     if share > _MOSTLY:
-        square = np.stack([fitted, _best_squares(windows, thetas[1])])
+        other = _best_squares(windows, thetas[1])
+        square, share = (np.stack([fitted, other]), share) if np.isfinite(other).all() else (square, 0.0)
     parts = []  # of each log: sums (2, pieces, C)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
@@ -236,5 +238,14 @@ def best_starts(windows: Windows, theta: FloatArray, noise: Noise, iterations: i
         if not (linearisation.valid and np.isfinite(linearisation.residual).all()):
             break
         marginal = Marginal(windows.sequences, linearisation.jacobian, windows.start_precision)
-        starts = starts + marginal.best(linearisation.residual, starts, noise)
+        move, before = (
+            marginal.best(linearisation.residual, starts, noise),
+            windows.chi_square(linearisation.residual[None], noise)[0],
+        )
+        trials = starts + np.array(_SHORTER)[:, None, None] * move
+        residuals, valid = windows.residuals(np.tile(theta, (len(trials), 1)), trials)
+        after = np.where(valid, windows.chi_square(residuals, noise), np.inf)
+        if not after.min() < before:
+            break
+        starts = trials[int(after.argmin())]
     return starts

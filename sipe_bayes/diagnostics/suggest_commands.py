@@ -56,7 +56,10 @@ def suggest(
         whole("--draws", draws)
         positive("--duration", duration)
         problem = prepare(config, threads)
-        used = {path.resolve() for path in (config, problem.config.model, *(log.file for log in problem.config.logs))}
+        used = {
+            path.resolve()
+            for path in (config, problem.config.model, *(log.file for log in problem.config.logs), *(given or []))
+        }
         if out.resolve() in used:
             raise ValueError(f"--out {out}: is what {config} reads, and would be lost; choose another name")
         dt = float(problem.train.dt[0])

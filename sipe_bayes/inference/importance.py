@@ -6,7 +6,7 @@ Mira, C. Robert 2012, "Adaptive Multiple Importance Sampling", Scand. J. Stat. 3
 batch comes in equal parts from the widened normal and from the prior; later ones from a normal with the weighted draws' moments, widened, and to a fifth from the
 prior, which keeps the weights bounded (T. Hesterberg 1995, "Weighted Average Importance Sampling and Defensive Mixture Distributions", Technometrics 37). A
 draw's weight is the posterior's density by that of all batches together. They end with enough effective draws, and become a mixture of
-kernels, drawn together so that mean and covariance stay those of the draws (M. West 1993, "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
+kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M. West 1993, "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
 
 Deviation: the batches' covariance is drawn towards the first normal's by the effective draws there are, so that few do not make it singular.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import scipy.stats
+import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
@@ -32,7 +32,7 @@ _BATCH, _FIRST_SHARE, _SHARE = 24, 0.5, 0.2  # draws; of the prior
 _FIRST_WIDER, _WIDER = 1.5, 1.3  # times the sds
 ENOUGH, LEAST = 100, 30  # effective draws: with which it ends, and with which it may be relied on
 MOST = 20  # batches
-_KERNELS, _JITTER = 40, 1e-9  # of the variances
+_KERNELS, _NARROWER, _JITTER = 60, 0.5, 1e-9  # the last of the variances
 
 Target = Callable[[FloatArray], FloatArray]
 """Log densities (B,) of points (B, N)."""
@@ -46,8 +46,7 @@ def cost(size: int) -> int:
 def normal(target: Target, theta: FloatArray, mean: FloatArray, cov: FloatArray) -> bool:
     """Whether a log density is about that of N(mean, cov) around its optimum theta (N,); all in the cube."""
     sd, precision = np.sqrt(np.diag(cov)), np.linalg.inv(cov)
-    steps = np.concatenate([cov / sd, -cov / sd]).T.reshape(len(theta), 2, -1)  # (N, side, parameter)
-    steps = _SDS * np.moveaxis(steps, 0, -1).reshape(-1, len(theta))
+    steps = _SDS * np.concatenate([(cov / sd).T, -(cov / sd).T])  # a row for each parameter and side
     room = np.where(steps > 0, 1 - theta, theta) / np.maximum(np.abs(steps), 1e-300)
     points = np.clip(theta + np.minimum(1.0, room.min(1))[:, None] * steps, 0.0, 1.0)
     all_points = np.concatenate([theta[None], points])
@@ -101,13 +100,20 @@ def weights(state: State, prior: Posterior) -> FloatArray:
     base = prior.log_prob(torch.from_numpy(points)).numpy()
     batches = (state[f"draws_{name}"] for name in ("share", "mass", "mean", "covariance"))
     for share, mass, mean, covariance in zip(*batches, strict=True):
-        own = scipy.stats.multivariate_normal.logpdf(points, mean, covariance, allow_singular=True) - mass
+        own = _log_normal(points, mean, covariance) - mass
         terms.append(np.logaddexp(np.log1p(-share) + own, np.log(share) + base))
     ratios = state["draws_values"] - np.logaddexp.reduce(terms, axis=0)
     if not np.isfinite(ratios.max()):
         return np.zeros(len(ratios))
     relative = np.exp(ratios - ratios.max())
     return np.asarray(relative / relative.sum())
+
+
+def _log_normal(points: FloatArray, mean: FloatArray, covariance: FloatArray) -> FloatArray:
+    factor = np.linalg.cholesky(covariance)
+    white = scipy.linalg.solve_triangular(factor, (points - mean).T, lower=True)
+    constant = float(np.log(np.diag(factor)).sum()) + 0.5 * len(mean) * np.log(2 * np.pi)
+    return np.asarray(-0.5 * (white**2).sum(0) - constant)
 
 
 def effective(weight: FloatArray) -> float:
@@ -120,13 +126,20 @@ def kernels(state: State, weight: FloatArray, space: ParameterSpace, seed: int) 
     points, n = state["draws_points"], len(space)
     mean = weight @ points
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
-    width = (4 / (effective(weight) * (n + 2))) ** (1 / (n + 4))  # of the sds: Silverman's rule
-    shrunk = mean + np.sqrt(1 - min(width, 1.0) ** 2) * (points - mean)
-    comb = (np.arange(_KERNELS) + np.random.default_rng([seed, 1]).random()) / _KERNELS
-    picked = np.minimum(np.searchsorted(np.cumsum(weight), comb), len(weight) - 1)
+    width = _NARROWER * (4 / (effective(weight) * (n + 2))) ** (
+        1 / (n + 4)
+    )  # of the sds: Silverman's rule, narrower for the bounds' sake
+    shrunk = mean + np.sqrt(1 - width**2) * (points - mean)
+    order = np.argsort((points - mean) @ np.linalg.eigh(covariance)[1][:, -1], kind="stable")
+    comb = (np.arange(_KERNELS) + np.random.default_rng([seed, 0, 1]).random()) / _KERNELS
+    picked = order[np.minimum(np.searchsorted(np.cumsum(weight[order]), comb), len(weight) - 1)]
     which, counts = np.unique(picked, return_counts=True)
-    spread = min(width, 1.0) ** 2 * covariance + _JITTER * np.diag(np.diag(covariance))
-    return GaussianMixture(np.log(counts), shrunk[which], np.tile(spread, (len(which), 1, 1)), space)
+    spread = width**2 * covariance + _JITTER * np.diag(np.diag(covariance))
+    means, spreads = shrunk[which], np.tile(spread, (len(which), 1, 1))
+    masses = GaussianMixture(
+        np.log(counts), means, spreads, space
+    ).log_masses.numpy()  # one at a bound weighs as much as others
+    return GaussianMixture(np.log(counts) - masses, means, spreads, space)
 
 
 def _moments(state: State, found: GaussianMixture, prior: Posterior) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,8 @@ process noise and the price of jumps let go.
 
 The curvature at the optimum need not be that of the posterior. Where a few points around a single optimum say that it is not, the normal gives way to
 kernels on importance draws, or a warning (``importance``, which costs 2 N + 1 rollouts, and some hundreds where the normal is wrong). It is not asked where the starts are
-estimated or states inferred, where residuals are as small as the simulation's rounding, or where the intervals are guessed.
+estimated or states inferred, where there are several optima, where residuals are as small as the simulation's rounding or intervals as small as the search resolves, where the
+intervals are guessed, or where the budget has no room left for draws.
 
 How the search spares simulations, follows ridges and looks around an optimum is said in ``window_search``. With ``StateSpace`` every
 sample's state is unknown and the search is that of ``state_space_search``, or where the first ones are known of ``known_start_search``.
@@ -42,6 +43,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.chain_state import process_diagnostics
 from sipe_bayes.inference.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.inference.optima import distinct_modes
+from sipe_bayes.inference.poll import SHORTEST
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.window_target import WindowTarget, at_optimum
 from sipe_bayes.likelihood import BudgetTooSmall, Windows
@@ -52,6 +54,7 @@ from sipe_bayes.trajectory import Trajectories
 FloatArray = NDArray[np.float64]
 
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
+_SHARP = 10 * SHORTEST  # an sd that the look around the optimum may have set
 _LEAST_BATCHES = 6  # of importance draws for which the budget must have room, and before they are called hopeless
 
 
@@ -116,6 +119,8 @@ class Laplace(Estimator):
         kept, n, count = distinct_modes(state), len(self.space), len(windows.trajectories)
         least = (importance.cost(n) + _LEAST_BATCHES * importance.batch(n)) * count
         if len(kept) != 1 or state["mode_guessed"][kept[0]] or windows.rollouts + least > windows.budget:
+            return state
+        if np.sqrt(np.diag(state["mode_covariance"][kept[0]])).min() < _SHARP:
             return state
         target = self._target(windows, state, kept[0])
         optimum = (state[f"mode_{k}"][kept[0]] for k in ("theta", "mean", "covariance"))

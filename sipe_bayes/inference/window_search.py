@@ -242,7 +242,7 @@ def step(search: Search, windows: Windows, state: State) -> State:
         return _finish(
             search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian, guess, doubtful)
         )
-    return _next(windows, state) if not state["polls"] and known(state) else state
+    return _next(windows, state) if not (state["polls"] or state["long"]) and known(state) else state
 
 
 def _held_step(windows: Windows, state: State, prior: QuadraticPrior) -> State:
@@ -371,11 +371,11 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     further = None if state["centred"] else _middle(search, windows, found)
     if further is not None:
         return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
-    if not state["long"] and windows.least_steps(theta).any():
-        return {**state, "long": True, "moved": True, **_AFRESH}
-    before = len(state["mode_evidence"]) - (state["polls"] > 0)  # an optimum that a poll has bettered is none
+    before = len(state["mode_evidence"]) - (state["polls"] > 0 or state["long"])  # one that a poll has bettered is none
     modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"][:before], v[None]]) for k, v in found.items()}
     state, polls = {**state, **modes}, state["polls"]
+    if not state["long"] and windows.least_steps(theta).any():
+        return {**state, "long": True, "moved": True, "iteration": 0, **_AFRESH}
     if around is not None and around.other is not None and len(state["points"]) < _MOST_POINTS:
         state = {**state, "points": np.concatenate([state["points"], around.other[None]])}
     if around is None or around.better is None or polls >= _MOST_POLLS:

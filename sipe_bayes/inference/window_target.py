@@ -48,7 +48,8 @@ class WindowTarget:
         self.noise = Noise(self.fit["sd"], self.fit["tau"])
         silent = beyond_rounding(windows, self.noise).sd
         self.silent = bool((silent > self.noise.sd).any())  # residuals of rounding are no evidence
-        self.least_sd = np.where(silent > self.noise.sd, silent, windows.rounding)
+        least = np.where(silent > self.noise.sd, silent, windows.rounding)
+        self.least_sd = np.where(np.isnan(windows.fixed_sd), least, 0.0)
 
     def starts(self, theta: FloatArray) -> FloatArray:
         """Starts (B, W, D) that follow theta (B, N)."""
