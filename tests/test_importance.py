@@ -13,7 +13,9 @@ import sipe_bayes as sipe
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import default_prior
 from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.window_target import WindowTarget, at_optimum
 from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.trajectory import Trajectories
 from tests.pendulums import log as pendulum_log
 from tests.pendulums import pendulum
 
@@ -94,30 +96,36 @@ def test_an_open_direction_beside_a_sharp_one() -> None:
     assert (np.abs(variance - 1) < 3.5 * np.sqrt(2 / count)).all()
 
 
-def test_kernels_at_a_bound_keep_the_draws_quantiles() -> None:
-    """Half-normal draws: without each kernel's own mass the 5 % quantile would be twice too large."""
-    space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
-    draws = np.abs(0.1 * np.random.default_rng(0).standard_normal((400, 1)))
-    found = importance.kernels({"draws_points": draws}, np.full(400, 1 / 400), space, 0)
-    levels = [0.05, 0.5, 0.95]
-    wanted = np.quantile(draws[:, 0], levels)
-    print(found.quantile(levels)[:, 0], wanted)
-    np.testing.assert_allclose(found.quantile(levels)[:, 0], wanted, atol=0.02)
+def test_kernels_at_a_bound_keep_the_draws_mean() -> None:
+    """Half-normal draws, eight times 400: the kernels' mean is that of the draws to 1 % (their picking leaves .3 %); cut as a whole, without each kernel's
+    own mass, it would be 2 to 3 % too large. The quartiles are right to a tenth."""
+    space, ratios = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)]), []
+    for seed in range(8):
+        draws = np.abs(0.1 * np.random.default_rng(seed).standard_normal((400, 1)))
+        found = importance.kernels({"draws_points": draws}, np.full(400, 1 / 400), space, seed)
+        quartiles = np.quantile(draws[:, 0], [0.25, 0.5, 0.75])
+        ratios.append(
+            [float(found.mean[0]) / draws.mean(), *(found.quantile([0.25, 0.5, 0.75])[:, 0].numpy() / quartiles)]
+        )
+    print(np.mean(ratios, axis=0))
+    assert (np.abs(np.mean(ratios, axis=0) - 1) < [0.01, 0.1, 0.1, 0.1]).all()
 
 
 def test_a_given_noise_is_not_made_larger() -> None:
-    """An sd of 1e-4 as stated; of 1e-8 no draws, and the least sd that the search resolves."""
+    """Stated sds of 1e-8 beside outputs of 1, less than what is taken for rounding where noise is estimated: no draws, and the sd that follows; of a slope with
+    which it is sharper than the search resolves, the least one."""
     space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
-    for stated, wanted in ((1e-4, 1e-4), (1e-8, 1e-6)):
-        estimator = Laplace(sipe.CallableSimulator(lambda v: 1.0 + v, space, likelihood=stated))
-        found = estimator.fit(np.array([1.5]))
+    for slope, wanted in ((5e-4, 2e-5), (1.0, 1e-6)):
+        estimator = Laplace(sipe.CallableSimulator(lambda v, slope=slope: 1.0 + slope * v, space, likelihood=1e-8))
+        found = estimator.fit(np.array([1.0 + 0.5 * slope]))
+        print(found.stddev, estimator.diagnostics)
         assert "draws" not in estimator.diagnostics
         assert float(found.stddev[0]) == pytest.approx(wanted, rel=0.3)
 
 
 def test_unknown_noise_of_a_log_is_integrated_out() -> None:
-    """A pendulum from a known start, 25 noisy samples: the kernels' quantiles are those of a grid over mass and damping on which white noise of unknown sd is
-    integrated out in closed form, to .08 of the range."""
+    """A pendulum from a known start, 25 noisy samples, against a grid over mass and damping on which white noise of unknown sd is integrated out in closed
+    form: the target to .005 nats, the posterior's quantiles to .08 of the range."""
     simulator, theta = pendulum(), np.array([0.4, 0.5])
     values = [p.value(t) for p, t in zip(simulator.space, theta, strict=True)]
     log = pendulum_log(simulator, values, 3, steps=25)
@@ -142,6 +150,12 @@ def test_unknown_noise_of_a_log_is_integrated_out() -> None:
     wanted = [np.interp(levels, (np.cumsum(m) - 0.5 * m) / m.sum(), grid) for m in (density.sum(1), density.sum(0))]
     print(found.T, np.array(wanted), estimator.diagnostics, estimator.rollouts)
     np.testing.assert_allclose(found.T, wanted, atol=0.08)
+    assert estimator._state is not None
+    mode = {k[5:]: v[0] for k, v in estimator._state.items() if k.startswith("mode_")}
+    windows = likelihood.bind(simulator, Trajectories.stack([log]))
+    values = WindowTarget(estimator.prior, windows, at_optimum(windows, mode))(points)
+    expected = -0.5 * len(log) * np.log(squares).sum(1)
+    np.testing.assert_allclose(values - values.max(), expected - expected.max(), atol=5e-3)
 
 
 def test_resumes_between_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

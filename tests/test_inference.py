@@ -160,7 +160,8 @@ def test_wrong_input() -> None:
     "likelihood", [sipe.Segments(0.5, noise="white"), sipe.StateSpace()], ids=["segments", "states"]
 )
 def test_a_delay_of_none_is_found(likelihood: Any) -> None:
-    """The model as given has none either, and any delay up to one physics step acts as one: a slope taken there says nothing."""
+    """The model as given has none either, and any delay up to one physics step acts as one: a slope taken there says nothing.
+    Intervals of 99 %: of the four, right ones fail with probability 4 %, and the seed is fixed."""
     delay = Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",))
     simulator = pendulum(delay)
     posterior = get_estimator(simulator, "laplace", likelihood=likelihood).fit(

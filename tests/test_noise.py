@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sipe_bayes.marginal import Marginal, log_determinant
+from sipe_bayes.marginal import marginal
 from sipe_bayes.noise import (
     Moments,
     Noise,
@@ -132,7 +132,7 @@ def test_whitening_is_the_inverse_root_of_the_covariance(name: str, noise: Noise
         total += (white**2).sum(-1)
     chi_square = residual @ np.linalg.solve(covariance, residual)
     close(total, [chi_square, 4 * chi_square])
-    close(log_determinant(case.sequences, noise), np.linalg.slogdet(covariance)[1])
+    close(case.moments().log_determinant(noise), np.linalg.slogdet(covariance)[1])
 
 
 def test_whitening_makes_the_noise_white() -> None:
@@ -267,16 +267,18 @@ def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tu
 def test_marginal_likelihood_integrates_the_starts_out(name: str, noise: Noise) -> None:
     """At its reference the residual is normal with covariance V + J P^-1 J', whatever the starts."""
     case, rng = PROBLEMS[name], np.random.default_rng(3)
-    windows, channels = len(case.log), case.observed.shape[2]
+    windows = len(case.log)
     covariance, jacobian, residual = dense(case, noise)
     starts = rng.normal(size=(3, windows, D))
     moved = case.residual - np.einsum("wlcd,bwd->bwlc", case.jacobian[..., N:], starts)
     spread = covariance + jacobian[:, N:] @ np.diag(np.tile(1 / PRECISION, windows)) @ jacobian[:, N:].T
     constant = windows * np.log(PRECISION).sum()
     expected = -0.5 * (np.linalg.slogdet(spread)[1] + constant + residual @ np.linalg.solve(spread, residual))
-    marginal = Marginal(case.sequences, case.jacobian[..., N:], PRECISION)
-    sd, tau = np.tile(noise.sd[:channels], (3, 1)), np.tile(noise.tau[:channels], (3, 1))
-    close(marginal(moved, starts, sd, tau), np.full(3, expected))
+    found = []
+    for one, start in zip(moved, starts, strict=True):
+        moments = Moments(one, case.jacobian[..., N:], 0, case.sequences)
+        found.append(marginal(moments, noise, start, PRECISION)[0])
+    close(np.array(found), np.full(3, expected))
 
 
 @ALL
@@ -284,20 +286,9 @@ def test_marginal_likelihood_integrates_the_starts_out(name: str, noise: Noise) 
 def test_best_starts_solve_the_dense_equations(name: str, noise: Noise) -> None:
     case, starts = PROBLEMS[name], np.random.default_rng(4).normal(size=(len(PROBLEMS[name].log), D))
     matrix, right, _, _ = system(case, noise, PRECISION, -PRECISION * starts)
-    marginal = Marginal(case.sequences, case.jacobian[..., N:], PRECISION)
-    found = marginal.best(case.residual, starts, noise)
+    moments = Moments(case.residual, case.jacobian[..., N:], 0, case.sequences)
+    found = marginal(moments, noise, starts, PRECISION)[1]
     close(found.ravel(), np.linalg.solve(matrix[N:, N:], right[N:]))
-
-
-def test_marginal_takes_each_lane_with_its_own_noise() -> None:
-    case = PROBLEMS["gaps"]
-    marginal = Marginal(case.sequences, case.jacobian[..., N:], PRECISION)
-    noises = list(NOISES.values())
-    sd, tau = np.stack([n.sd[:2] for n in noises]), np.stack([n.tau[:2] for n in noises])
-    starts = np.random.default_rng(0).normal(size=(3, len(case.log), D))
-    residual = np.stack([case.residual * k for k in (1, 2, 3)])
-    alone = [marginal(residual[[b]], starts[[b]], sd[[b]], tau[[b]])[0] for b in range(3)]
-    close(marginal(residual, starts, sd, tau), alone)
 
 
 def test_sequences_begin_anew_where_memory_ends() -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.result import ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.marginal import Marginal
+from sipe_bayes.marginal import marginal
 from sipe_bayes.noise import Noise, whiten
 from sipe_bayes.posterior import Posterior
 
@@ -237,11 +237,8 @@ def best_starts(windows: Windows, theta: FloatArray, noise: Noise, iterations: i
         linearisation = windows.linearise(theta, starts, with_theta=False)
         if not (linearisation.valid and np.isfinite(linearisation.residual).all()):
             break
-        marginal = Marginal(windows.sequences, linearisation.jacobian, windows.start_precision)
-        move, before = (
-            marginal.best(linearisation.residual, starts, noise),
-            windows.chi_square(linearisation.residual[None], noise)[0],
-        )
+        move = marginal(windows.moments(linearisation), noise, starts, windows.start_precision)[1]
+        before = windows.chi_square(linearisation.residual[None], noise)[0]
         trials = starts + np.array(_SHORTER)[:, None, None] * move
         residuals, valid = windows.residuals(np.tile(theta, (len(trials), 1)), trials)
         after = np.where(valid, windows.chi_square(residuals, noise), np.inf)

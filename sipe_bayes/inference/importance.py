@@ -1,6 +1,6 @@
 """Whether a posterior is the normal that Laplace's method makes of it, and what it is where it is not.
 
-``probe``: along each parameter's direction, two of its sds to either side of the optimum, the log posterior should fall by two nats.
+``normal``: along each parameter's direction, two of its sds to either side of the optimum, the log posterior should fall by two nats.
 Where it falls by less than half or more than twice as much, draws take the normal's place: adaptive multiple importance sampling (J.-M. Cornuet, J.-M. Marin, A.
 Mira, C. Robert 2012, "Adaptive Multiple Importance Sampling", Scand. J. Stat. 39, https://arxiv.org/abs/0907.1254). The first
 batch comes in equal parts from the widened normal and from the prior; later ones from a normal with the weighted draws' moments, widened, and to a fifth from the
@@ -16,10 +16,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.inference.gaussian_search import log_normal
 from sipe_bayes.inference.state import State
 from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior
@@ -39,7 +39,7 @@ Target = Callable[[FloatArray], FloatArray]
 
 
 def cost(size: int) -> int:
-    """Points that ``probe`` looks at in ``size`` dimensions, at most."""
+    """Points that ``normal`` looks at in ``size`` dimensions, at most."""
     return 1 + 2 * size
 
 
@@ -77,10 +77,8 @@ def draw(state: State, target: Target, found: GaussianMixture, prior: Posterior,
         mean, covariance = _moments(state, found, prior)
     else:
         mean, covariance, share = found.means.numpy()[0], _FIRST_WIDER**2 * found.covariances.numpy()[0], _FIRST_SHARE
-    proposal, rng = (
-        GaussianMixture([0.0], mean[None], covariance[None], found.space),
-        np.random.default_rng([seed, done]),
-    )
+    proposal = GaussianMixture([0.0], mean[None], covariance[None], found.space)
+    rng = np.random.default_rng([seed, done])
     generator, count = torch.Generator().manual_seed(int(rng.integers(2**31))), int(rng.binomial(size, share))
     drawn = [one.sample((n,), generator=generator) for one, n in ((proposal, size - count), (prior, count))]
     points = torch.cat(drawn).numpy()
@@ -100,20 +98,13 @@ def weights(state: State, prior: Posterior) -> FloatArray:
     base = prior.log_prob(torch.from_numpy(points)).numpy()
     batches = (state[f"draws_{name}"] for name in ("share", "mass", "mean", "covariance"))
     for share, mass, mean, covariance in zip(*batches, strict=True):
-        own = _log_normal(points, mean, covariance) - mass
+        own = log_normal(points, mean, covariance) - mass
         terms.append(np.logaddexp(np.log1p(-share) + own, np.log(share) + base))
     ratios = state["draws_values"] - np.logaddexp.reduce(terms, axis=0)
     if not np.isfinite(ratios.max()):
         return np.zeros(len(ratios))
     relative = np.exp(ratios - ratios.max())
     return np.asarray(relative / relative.sum())
-
-
-def _log_normal(points: FloatArray, mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    factor = np.linalg.cholesky(covariance)
-    white = scipy.linalg.solve_triangular(factor, (points - mean).T, lower=True)
-    constant = float(np.log(np.diag(factor)).sum()) + 0.5 * len(mean) * np.log(2 * np.pi)
-    return np.asarray(-0.5 * (white**2).sum(0) - constant)
 
 
 def effective(weight: FloatArray) -> float:
@@ -126,9 +117,8 @@ def kernels(state: State, weight: FloatArray, space: ParameterSpace, seed: int) 
     points, n = state["draws_points"], len(space)
     mean = weight @ points
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
-    width = _NARROWER * (4 / (effective(weight) * (n + 2))) ** (
-        1 / (n + 4)
-    )  # of the sds: Silverman's rule, narrower for the bounds' sake
+    silverman = (4 / (effective(weight) * (n + 2))) ** (1 / (n + 4))  # of the sds
+    width = _NARROWER * silverman  # for the bounds' sake
     shrunk = mean + np.sqrt(1 - width**2) * (points - mean)
     order = np.argsort((points - mean) @ np.linalg.eigh(covariance)[1][:, -1], kind="stable")
     comb = (np.arange(_KERNELS) + np.random.default_rng([seed, 0, 1]).random()) / _KERNELS
@@ -136,9 +126,7 @@ def kernels(state: State, weight: FloatArray, space: ParameterSpace, seed: int) 
     which, counts = np.unique(picked, return_counts=True)
     spread = width**2 * covariance + _JITTER * np.diag(np.diag(covariance))
     means, spreads = shrunk[which], np.tile(spread, (len(which), 1, 1))
-    masses = GaussianMixture(
-        np.log(counts), means, spreads, space
-    ).log_masses.numpy()  # one at a bound weighs as much as others
+    masses = GaussianMixture(np.log(counts), means, spreads, space).log_masses.numpy()  # at a bound not whole
     return GaussianMixture(np.log(counts) - masses, means, spreads, space)
 
 

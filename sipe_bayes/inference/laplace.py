@@ -133,10 +133,7 @@ class Laplace(Estimator):
         kept = distinct_modes(state)
         found, n = self._normals(state, kept), len(self.space)
         state = importance.draw(state, self._target(windows, state, kept[0]), found, self.prior, self.seed)
-        batches, effective = (
-            len(state["draws_share"]),
-            importance.effective(importance.weights(state, self.prior)),
-        )
+        batches, effective = len(state["draws_share"]), importance.effective(importance.weights(state, self.prior))
         hopeless = batches >= _LEAST_BATCHES and effective < batches
         room = windows.rollouts + importance.batch(n) * len(windows.trajectories) <= windows.budget
         done = effective >= importance.ENOUGH or batches >= importance.MOST or hopeless or not room

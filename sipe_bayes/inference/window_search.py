@@ -435,9 +435,8 @@ def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArra
     """Precision and gradient of plain least squares when the residuals' covariance gives ``middle``."""
     shift = np.linalg.pinv(arrow.precision, rcond=1e-12, hermitian=True) @ arrow.gradient
     precision = arrow.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ arrow.precision
-    eigenvalues, axes = np.linalg.eigh(
-        0.5 * (precision + precision.T)
-    )  # rounding leaves some of an open direction negative
+    # rounding leaves some of an open direction negative
+    eigenvalues, axes = np.linalg.eigh(0.5 * (precision + precision.T))
     precision = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
     return precision, precision @ shift
 

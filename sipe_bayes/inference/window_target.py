@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from sipe_bayes.inference.state import State
 from sipe_bayes.inference.window_noise import beyond_rounding, free_noise
 from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Moments, Noise, Pulls, eliminate, estimate_noise, restricted
+from sipe_bayes.marginal import marginal
+from sipe_bayes.noise import Moments, Noise, Pulls, estimate_noise
 from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]
@@ -67,27 +68,23 @@ class WindowTarget:
         good = np.flatnonzero(valid)
         prior = self.prior.log_prob(torch.from_numpy(theta)).numpy()
         for k in good:
-            moments = self._moments(residuals[k], self.fit["jacobian"])
-            out[inside[k]] = prior[k] + self._integrated(moments, starts[k])[0]
+            out[inside[k]] = prior[k] + self._integrated(residuals[k], self.fit["jacobian"], starts[k])[0]
         return np.where(np.isnan(out), -np.inf, out)
 
-    def _moments(self, residual: FloatArray, jacobian: FloatArray) -> Moments:
-        white = self.windows.settings.noise == "white"
-        return Moments(residual, jacobian, 0, self.windows.sequences, white)
-
-    def _integrated(self, moments: Moments, starts: FloatArray) -> tuple[float, Noise]:
-        """Log-likelihood of a residual at ``starts`` (W, D), up to a constant, and the noise that fits best there."""
+    def _integrated(self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray) -> tuple[float, FloatArray]:
+        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), up to a constant, with the noise that fits best there, and the best
+        change of the starts."""
         windows, nothing = self.windows, np.zeros(0)
-        pull = -windows.start_precision * starts
-        context = Pulls(np.zeros((0, 0)), nothing, windows.start_precision, pull, np.zeros(0, bool))
+        moments = Moments(residual, jacobian, 0, windows.sequences, windows.settings.noise == "white")
         noise = self.noise
         if len(free_noise(windows)):
+            pull = -windows.start_precision * starts
+            context = Pulls(np.zeros((0, 0)), nothing, windows.start_precision, pull, np.zeros(0, bool))
             shortest, longest = float(windows.dt.min()), windows.trajectories.longest
             coloured = windows.settings.noise == "ar1"
             noise = estimate_noise(moments, noise, context, windows.fixed_sd, coloured, shortest, longest)
         noise = Noise(np.maximum(noise.sd, self.least_sd), noise.tau)
-        weight = float((starts**2 @ windows.start_precision).sum())
-        return restricted(moments, noise, context) - 0.5 * weight, noise
+        return marginal(moments, noise, starts, windows.start_precision)
 
     @property
     def check_cost(self) -> int:
@@ -99,8 +96,6 @@ class WindowTarget:
         starts, value = self.starts(point[None])[0], -np.inf
         for _ in range(2):
             found = self.windows.linearise(point, starts, with_theta=False)
-            moments = self._moments(found.residual, found.jacobian)
-            value, noise = self._integrated(moments, starts)
-            pull = -self.windows.start_precision * starts
-            starts = starts + eliminate(moments.normal(noise), 0, self.windows.start_precision, pull).start_offset
+            value, move = self._integrated(found.residual, found.jacobian, starts)
+            starts = starts + move
         return value + float(self.prior.log_prob(torch.from_numpy(point)))
