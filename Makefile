@@ -25,6 +25,7 @@ test: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -c "import arviz" # writes its note of the day, which two processes at once can not
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile # a process for each core, one thread each
 
 bench: $(READY)
