@@ -267,6 +267,10 @@ def calibrate(
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
+    if not method.uncertain:
+        method.doubt(
+            f"the spread of {method.name} is that of its search, not an uncertainty: use laplace or mcmc, or Recalibrated"
+        )
 
     def tell(what: str) -> None:
         if progress is not None:
@@ -305,6 +309,7 @@ def calibrate(
         train=scores["train"],
         holdout=held,
         warnings=_alarms(lacking, outside) + _warnings(problem, method, summaries, dead, found, conflict, telling),
+        doubts=method.doubts,
         signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
         residuals=residuals,
         ridges=found,

@@ -32,6 +32,7 @@ from sipe_bayes.units import convert
 
 FloatArray = NDArray[np.float64]
 
+_SLOW = 1.0  # s from row to row: no robot is logged so slowly without its being meant
 REGULAR = 0.1
 """A clock is regular when its samples are within this fraction of a period of the grid."""
 GAP_PERIODS = 5.0
@@ -128,6 +129,11 @@ def _read_log(config: Config, log: LogEntry) -> _Raw:
     _check_clock(log, clock.column, time)
     time = convert(time, clock.unit, "time")
     time = time - time[0]
+    if "unit" not in clock.model_fields_set and np.median(np.diff(time)) >= _SLOW:
+        raise LogError(
+            f"log {log.name!r}: read in seconds, {clock.column!r} is {np.median(np.diff(time)):g} s from row to row; name its unit, such as "
+            '`columns.time.unit = "ms"`, or "s" if that is right'
+        )
     part = _span(log, time)
 
     def signal(entry: Command | Measurement) -> FloatArray:

@@ -488,6 +488,16 @@ def test_state_space_leaves_out_what_does_not_apply_and_says_so(tmp_path: Path, 
     assert refused.stderr.count("\n") == 1
 
 
+def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame) -> None:
+    config = write_case(tmp_path, log)
+    result = call(config, "--estimator", "cem", "--budget", 200, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    assert "No value may be trusted within its interval" in result.stdout
+    found = strict_json((tmp_path / "out" / "result.json").read_text())
+    assert any("spread of cem is that of its search" in said for said in found["doubts"])
+    assert set(found["doubts"]) <= set(found["warnings"])
+
+
 def test_what_the_model_lacks_is_a_warning(tmp_path: Path, log: pd.DataFrame) -> None:
     """A torque that is 0.2 N m stronger than logged."""
     config = write_case(tmp_path, log.assign(torque=log["torque"] - 0.2))

@@ -282,6 +282,21 @@ def test_parquet_dates_are_seconds(tmp_path: Path) -> None:
     assert trajectory.dt == pytest.approx(0.01)
 
 
+def test_a_clock_of_seconds_that_are_milliseconds_is_refused(tmp_path: Path) -> None:
+    columns = regular(100)
+    columns["t"] = 1e3 * columns["t"]
+    write(tmp_path / "log.csv", columns)
+    configure(tmp_path, "log.csv")
+    said = (tmp_path / "run.toml").read_text()
+    (tmp_path / "run.toml").write_text(said.replace('column = "t", unit = "s"', 'column = "t"'))
+    config = load_config(tmp_path / "run.toml")
+    with pytest.raises(LogError, match=r"read in seconds, 't' is 10 s from row to row; name its unit"):
+        load_log(config, config.logs[0])
+    (tmp_path / "run.toml").write_text(said)  # named, it is taken at its word
+    config = load_config(tmp_path / "run.toml")
+    assert load_log(config, config.logs[0])[0].dt == pytest.approx(10)
+
+
 def test_units_signs_and_span(tmp_path: Path) -> None:
     columns = regular(100)
     columns["t"] = 1e3 * columns["t"] + 5e6

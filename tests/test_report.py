@@ -495,6 +495,17 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert report.headline([good]).tone == "good"
     assert report.headline([weak, weak]).tone == "bad"
     assert report.headline([nuisance]).tone == "fair"
+    doubted = report.headline([good, weak], doubts=["the chains have not mixed", "another"])
+    assert doubted == report.Verdict(
+        "bad", "No value may be trusted within its interval yet: the chains have not mixed."
+    )
+
+
+def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> None:
+    found = dataclasses.replace(with_chains(calibration, 1.4), comparison=BETTER, doubts=["the chains have not mixed"])
+    texts = [v.text for v in report.verdicts(found)]
+    assert texts[0].endswith("yet: the chains have not mixed.")
+    assert not any("NOT mixed" in text for text in texts)
 
 
 # The page

@@ -170,6 +170,26 @@ def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], wo
     assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "given.csv: "),
+        ("time,torque\n0,0\n1,0\n", "no column 'force'; it has ['time', 'torque']"),
+        ("time,force\n0,0\n1,\n", "'force' holds what is no number"),
+        ("time,force\n0,0\n1,50\n", "goes from 0 to 50, beyond the control range of"),
+    ],
+)
+def test_given_commands_are_checked(config: Path, tmp_path: Path, text: str, words: str) -> None:  # noqa: F811
+    model = config.parent / "cart.xml"
+    model.write_text(model.read_text().replace('name="motor"', 'name="motor" ctrllimited="true" ctrlrange="-3 3"'))
+    (tmp_path / "given.csv").write_text(text)
+    result = call(config, "--given", tmp_path / "given.csv", "--out", tmp_path / "best.csv")
+    assert result.exit_code == 2, result.output
+    assert words in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "best.csv").exists()
+
+
 def test_what_the_configuration_reads_is_not_written_over(config: Path) -> None:  # noqa: F811
     """Its own logs, its model, itself."""
     problem = prepare(config, 1)

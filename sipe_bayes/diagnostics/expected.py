@@ -10,7 +10,8 @@ A parameter of one log (a zero error) says nothing of the planned one, which has
 uniform prior, and the old ones learn nothing. What is determined is judged by the sd that is left, beside a uniform prior's.
 
 Deviations: the noise's own uncertainty is left out; the expectation is linear in theta at each draw, so that contacts that are made or
-missed between draws show only in their average.
+missed between draws show only in their average. What is known is a normal: along a ridge, each draw's
+open direction differs a little from the normal's, so that some contraction of a ridge's members is promised that no experiment brings.
 """
 
 from __future__ import annotations

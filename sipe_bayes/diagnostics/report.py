@@ -133,14 +133,18 @@ def improvement(scores: Iterable[ChannelScore]) -> float:
     return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
 
 
-def headline(parameters: Sequence[ParameterSummary], ridges: Sequence[Ridge] = ()) -> Verdict:
-    """Which of the parameters, nuisance ones aside, may be trusted."""
+def headline(
+    parameters: Sequence[ParameterSummary], ridges: Sequence[Ridge] = (), doubts: Sequence[str] = ()
+) -> Verdict:
+    """Which of the parameters, nuisance ones aside, may be trusted; none while the method has ``doubts``."""
     wanted = [p for p in parameters if "nuisance" not in p.flags]
     good = [p.name for p in wanted if parameter_verdict(p, ridges).tone == "good"]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
+    if doubts:
+        return Verdict("bad", f"No value may be trusted within its interval yet: {doubts[0]}.")
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
         return Verdict("good", f"{text}.")
@@ -227,10 +231,11 @@ def mixing_verdict(calibration: Calibration) -> Verdict | None:
 def verdicts(calibration: Calibration) -> list[Verdict]:
     """The sentences at the top of the report; the first says so where the calibration does not help."""
     predicted = prediction(calibration.holdout, calibration.comparison)
-    first = [headline(calibration.parameters, calibration.ridges), predicted]
+    first = [headline(calibration.parameters, calibration.ridges, calibration.doubts), predicted]
     if predicted.tone == "bad":
         first.reverse()
-    return [v for v in (*first, lack(calibration), mixing_verdict(calibration)) if v]
+    mixing = None if calibration.doubts else mixing_verdict(calibration)
+    return [v for v in (*first, lack(calibration), mixing) if v]
 
 
 # Rows of the tables

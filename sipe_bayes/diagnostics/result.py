@@ -122,7 +122,7 @@ def _finite(value: Any) -> Any:
 
 @dataclass
 class Calibration:
-    """The outcome of ``sipe calibrate``. comparison: of the held-out errors, None without any; misfit: None where the residuals could
+    """The outcome of ``sipe calibrate``. doubts: the warnings for which no interval is to be trusted; comparison: of the held-out errors, None without any; misfit: None where the residuals could
     not be looked at; outside: one for each training log; noise: channel -> {"sd", "tau" (s), "unit"}; mixing: {"rhat", "ess", ...}
     of mcmc or None; logs: what was read and what was done to it; left_out: sentences about parts that do not apply; run:
     configuration, versions, seed, checksums."""
@@ -135,6 +135,7 @@ class Calibration:
     train: list[ChannelScore]
     holdout: list[ChannelScore]
     warnings: list[str]
+    doubts: list[str] = field(default_factory=list)
     signals: list[Signal] = field(default_factory=list)
     residuals: list[Residual] = field(default_factory=list)
     ridges: list[Ridge] = field(default_factory=list)
@@ -161,6 +162,7 @@ class Calibration:
             "outside_prior": [asdict(o) for o in self.outside],
             "ridges": [asdict(r) for r in self.ridges],
             "warnings": list(self.warnings),
+            "doubts": list(self.doubts),
             "left_out": list(self.left_out),
             "noise": self.noise,
             "logs": self.logs,

@@ -128,22 +128,39 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
 def _read(problem: Problem, files: list[Path], dt: float) -> list[Plan]:
     """Commands of CSV files, in the configuration's columns and units, on the logs' grid."""
     import numpy as np
-    import pandas as pd
 
     from sipe_bayes.diagnostics.expected import Plan
+    from sipe_bayes.tables import read_table
     from sipe_bayes.units import to_si
 
     config, plans = problem.config, []
+    clock, model = config.columns.time, problem.simulator.model
     for file in files:
-        table = pd.read_csv(file)
-        clock = config.columns.time
-        missing = [c for c in (clock.column, *(c.column for c in config.commands)) if c not in table]
-        if missing:
-            raise ValueError(f"--given {file}: no column {missing[0]!r}; it has {list(table.columns)}")
-        seconds = (table[clock.column].to_numpy(float) - float(table[clock.column].iloc[0])) * to_si(clock.unit)[0]
+        table = read_table(file)
+
+        def column(name: str, file: Path = file, table: Any = table) -> Any:
+            if name not in table:
+                raise ValueError(f"--given {file}: no column {name!r}; it has {list(table)}")
+            try:
+                values = np.asarray(table[name], float)
+            except ValueError:
+                values = np.full(1, np.nan)
+            if not np.isfinite(values).all():
+                raise ValueError(f"--given {file}: column {name!r} holds what is no number; fill it in")
+            return values
+
+        seconds = (column(clock.column) - column(clock.column)[0]) * to_si(clock.unit)[0]
         grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
         held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
-        columns = [c.sign * to_si(c.unit)[0] * table[c.column].to_numpy(float)[held] for c in config.commands]
+        columns = [c.sign * to_si(c.unit)[0] * column(c.column)[held] for c in config.commands]
+        for command, values in zip(config.commands, columns, strict=True):
+            actuator = model.actuator(command.actuator).id
+            low, high = model.actuator_ctrlrange[actuator]
+            if model.actuator_ctrllimited[actuator] and not low <= values.min() <= values.max() <= high:
+                raise ValueError(
+                    f"--given {file}: {command.column!r} goes from {values.min():.4g} to {values.max():.4g}, beyond the control range of "
+                    f"{command.actuator}, {low:.4g} to {high:.4g}; make it smaller"
+                )
         plans.append(Plan(np.stack(columns, axis=1), dt, name=str(file)))
     return plans
 

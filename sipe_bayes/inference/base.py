@@ -88,13 +88,14 @@ class Estimator(ABC):
                     self.warn(f"{lost} of {len(state['cost'])} simulations {self.simulator.failure} and do not count")
                 return Dirac(state["theta"][state["cost"].argmin()], self.space)
 
-    ``warn`` adds to ``warnings``, ``digest`` tells trajectories apart.
+    ``warn`` adds to ``warnings``, ``doubt`` to those for which no interval is to be trusted (``doubts``), ``digest`` tells trajectories apart.
     """
 
     name: ClassVar[str]
     amortised: ClassVar[bool] = False
     searches: ClassVar[bool] = False  # takes ``restarts`` and ``candidates``
     uses_prior: ClassVar[bool] = True
+    uncertain: ClassVar[bool] = True  # False: the spread is that of a search, not an uncertainty
     default_budget: ClassVar[int] = 1000
     checkpoint_seconds: float = 1.0
 
@@ -137,6 +138,7 @@ class Estimator(ABC):
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts = 0
         self.warnings: list[str] = []
+        self._doubtful: set[str] = set()
         self.diagnostics: dict[str, Any] = {}
         self._state: State | None = None
         self._bound: tuple[Trajectories, Windows] | None = None
@@ -174,10 +176,11 @@ class Estimator(ABC):
         state = None
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)
-            self._recall(state)
         saved, resumed = time.monotonic(), state is not None
         try:
-            if state is None:
+            if state is not None:
+                self._recall(state)
+            else:
                 state = self._counted(self.start(batch), batch)
             while not state["done"]:
                 state = self._counted(self.step(state, batch), batch)
@@ -264,6 +267,16 @@ class Estimator(ABC):
         if sentence is not None and sentence not in self.warnings:
             self.warnings.append(sentence)
 
+    def doubt(self, sentence: str) -> None:
+        """Warn of something for which no interval is to be trusted."""
+        self.warn(sentence)
+        self._doubtful.add(sentence)
+
+    @property
+    def doubts(self) -> list[str]:
+        """The warnings for which no interval is to be trusted."""
+        return [said for said in self.warnings if said in self._doubtful]
+
     def describe(self, state: State) -> str:
         """What is being done, in a few words, for the progress bar."""
         return self.name
@@ -280,11 +293,13 @@ class Estimator(ABC):
         if self._bound is not None:
             self.rollouts = self._bound[1].rollouts
         said = json.dumps(self.diagnostics)
-        return {**state, "rollouts": self.rollouts, "warnings": list(self.warnings), "diagnostics": said}
+        words = {"warnings": list(self.warnings), "doubts": self.doubts}
+        return {**state, "rollouts": self.rollouts, **words, "diagnostics": said}
 
     def _recall(self, state: State) -> None:
         """Count, warnings and diagnostics as they were when ``state`` was made: an estimate in between adds its own."""
         self.rollouts, self.warnings = int(state["rollouts"]), list(state["warnings"])
+        self._doubtful |= set(state["doubts"])
         self.diagnostics = json.loads(state["diagnostics"])
 
     def settings(self) -> dict[str, Any]:

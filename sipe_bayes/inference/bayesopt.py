@@ -325,40 +325,40 @@ class BayesOpt(Estimator):
             "lengthscale": process.lengthscale.tolist(),
             "noise_sd": process.noise_sd,
         }
-        doubts = []
+        remarks = []
         if not same_logs:
-            doubts.append("the costs are those of other trajectories than these: the posterior is theirs")
+            self.doubt("the costs are those of other trajectories than these: the posterior is theirs")
         if not starts_known:
-            doubts.append(
+            remarks.append(
                 "the trajectories have no recorded states: errors of the windows' estimated starts are not in the posterior; "
                 "compare it with laplace or mcmc"
             )
         at = [n for n, x in zip(self.space.names, found.best.tolist(), strict=True) if min(x, 1 - x) < _AT_BOUND]
         if at:
-            doubts.append(
+            remarks.append(
                 f"the best point has {', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds"
             )
         if diverged:
-            doubts.append(
+            remarks.append(
                 f"{diverged} of {count} simulations {self.simulator.failure} and count as the worst finite cost: narrow the bounds"
             )
         if mixing["rhat"] > _MIXED_RHAT or mixing["ess"] < _MIXED_ESS:
-            doubts.append(
+            self.doubt(
                 f"the draws have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective): evaluate more "
                 "before you trust the intervals"
             )
         if likely < _CLEAR_ACCEPTANCE:
-            doubts.append(
+            remarks.append(
                 f"most of the posterior lies where a cost as low as epsilon is improbable ({likely:.1g}), because there is "
                 "so much room there: the intervals are about the prior's; take the mode, evaluate more, or free fewer parameters"
             )
         if found.normaliser_error > _CLEAR_ERROR:
-            doubts.append(
+            remarks.append(
                 f"the density is known up to a factor only (log normaliser +- {found.normaliser_error:.2f}): "
                 "do not compare log_prob between runs"
             )
-        for doubt in doubts:
-            self.warn(doubt)
+        for remark in remarks:
+            self.warn(remark)
 
 
 def log_improvement(z: Tensor) -> Tensor:

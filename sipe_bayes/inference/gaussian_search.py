@@ -39,6 +39,7 @@ class Search(Estimator):
     """
 
     uses_prior: ClassVar[bool] = False
+    uncertain: ClassVar[bool] = False
     begins_with_prior: ClassVar[bool] = True
 
     def fit(self, trajectories: Recorded) -> Posterior:

@@ -165,7 +165,7 @@ class Laplace(Estimator):
             noise = (state[f"mode_{name}"][kept[0]] for name in ("process", "movement", "loose"))
             self.diagnostics |= process_diagnostics(*noise)
             if not state["mode_settled"][kept[0]]:
-                self.warn("the process noise had not settled: do not rely on the intervals; more restarts may help")
+                self.doubt("the process noise had not settled: do not rely on the intervals; more restarts may help")
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         found = self._normals(state, kept)
@@ -177,7 +177,7 @@ class Laplace(Estimator):
         if effective >= importance.LEAST:
             return importance.kernels(state, weight, self.space, self.seed)
         if state["done"]:
-            self.warn(
+            self.doubt(
                 f"the posterior is no normal, and {len(weight)} draws from it came to {effective:.1f} effective ones: compare with mcmc before you "
                 "trust the intervals"
             )

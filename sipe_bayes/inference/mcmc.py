@@ -242,7 +242,7 @@ class MCMC(Estimator):
         mixing["linearisation_error"] = state["linearisation_error"]
         self.diagnostics = {"mixing": mixing, **_noise_of(state)}
         if not (mixing["rhat"] <= _MIXED_RHAT and mixing["ess"] >= self.effective / 2):
-            self.warn(
+            self.doubt(
                 f"the chains have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective draws): "
                 "raise the budget before you trust the intervals"
             )
@@ -250,7 +250,7 @@ class MCMC(Estimator):
             what, remedy = "windows' starts", "use shorter windows"
             if isinstance(self.windows(trajectories), Chain):
                 what, remedy = "states", "hold the intervals against those of laplace"
-            self.warn(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
+            self.doubt(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
         flat = np.clip(theta.reshape(-1, n), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
 

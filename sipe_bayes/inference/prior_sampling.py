@@ -88,7 +88,7 @@ class PriorSampling(Estimator):
         self.diagnostics["unlikeness"] = how_far
         if how_far > 1:
             said = "the log is unlike every simulation: widen the bounds, or correct the model, before you trust the result"
-            self.warn(said)
+            self.doubt(said)
         return self.infer(state, trajectories)
 
     def statistics(self, observations: NDArray[np.floating], trajectories: Trajectories) -> FloatArray:

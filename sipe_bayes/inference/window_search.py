@@ -222,16 +222,16 @@ def step(search: Search, windows: Windows, state: State) -> State:
     ends = unrecorded and (fit is here or _ends(windows, len(theta)))
     if settled or iteration >= _MAX_ITERATIONS or ends:
         if ends and not settled:
-            search.warn(
+            search.doubt(
                 "the budget ended before the search had settled: the estimate is the best so far, and its intervals are guessed from the way "
                 "it has come; raise the budget"
             )
         elif not settled:
-            search.warn(
+            search.doubt(
                 f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
             )
         elif fit.refused > _DRIFT:
-            search.warn(
+            search.doubt(
                 f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
                 "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
             )
@@ -359,7 +359,7 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     if around is not None:
         found["covariance"] = around.covariance
         if around.rough:
-            search.warn(
+            search.doubt(
                 "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse than its nearest "
                 "neighbours, and the search may have missed a better place; compare with npe or bayessim"
             )
