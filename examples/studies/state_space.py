@@ -2,6 +2,7 @@
 
     python examples/studies/state_space.py                                             # every cell, some hours
     python examples/studies/state_space.py --task HalfCheetahJoints --level 0.01 --seeds 0 10   # ten fits of one cell
+    python examples/studies/state_space.py --slowest 5 --threads 2   # the half-cheetah's slowest fits anew, on a quiet machine
 
 Truths are uniform in [0.1, 0.9]^N on the half-cheetah, whose logs determine all parameters far better than that, and drawn from the prior
 on the others, where a truth that keeps from the bounds would be held too often. Every observed channel gets white noise of the given share of its own spread along the log, and the
@@ -135,13 +136,17 @@ def path(task: str, level: float, steps: int, seed: int) -> Path:
     return RUNS / f"{task}-{level:g}-{steps}-{seed}.json"
 
 
+def _kept(task: str, level: float, steps: int) -> list[dict[str, Any]]:
+    files = sorted(RUNS.glob(path(task, level, steps, 0).name.replace("-0.json", "-*.json")))
+    return [json.loads(file.read_text(encoding="utf-8")) for file in files]
+
+
 def table(steps: int | None) -> None:
     """Write the summary of all fits there are."""
     cells = {}
     for task, level in CELLS:
         names, length = sipe.make_task(task).space.names, steps or STEPS[task]
-        files = sorted(RUNS.glob(path(task, level, length, 0).name.replace("-0.json", "-*.json")))
-        rows = [json.loads(f.read_text(encoding="utf-8")) for f in files]
+        rows = _kept(task, level, length)
         if len({row.get("source") for row in rows}) > 1:
             raise SystemExit(
                 f"{RUNS}: holds fits of {task} by several states of the code; delete those of the older ones"
@@ -159,6 +164,26 @@ def table(steps: int | None) -> None:
         print(cell, {k: v for k, v in row.items() if "by_parameter" not in k}, flush=True)
 
 
+def slowest(count: int, threads: int) -> None:
+    """Fit the half-cheetah logs anew that took longest, and write the seconds to results/."""
+    took = {
+        (task, level, row["seed"]): row["processor_seconds"]
+        for task in CHEETAHS
+        for level in (0.01, 0.05)
+        for row in _kept(task, level, STEPS[task])
+    }
+    rows = []
+    for task, level, seed in sorted(took, key=lambda fit: -took[fit])[:count]:
+        simulator = sipe.Simulator(sipe.make_task(task), num_threads=threads)
+        fit = one_fit(simulator, task, level, seed, STEPS[task])
+        names = ("seed", "wall_seconds", "processor_seconds", "rollouts")
+        rows.append({"task": task, "level": level, **{name: fit[name] for name in names}})
+        print(json.dumps(rows[-1]), flush=True)
+    command = f"python examples/studies/state_space.py --slowest {count} --threads {threads}"
+    text = json.dumps({"command": command, "fits": rows}, indent=2)
+    write_text(HERE / "results" / "state_space_slowest.json", text + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", nargs="*", default=[*CHEETAHS, *KNOWN], choices=[*CHEETAHS, *KNOWN])
@@ -166,7 +191,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help=f"default: all of {FITS}")
     parser.add_argument("--steps", type=int, help=f"default: {STEPS}")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--slowest", type=int, metavar="COUNT", help="time these anew instead")
     given = parser.parse_args()
+    if given.slowest:
+        slowest(given.slowest, given.threads)
+        return
     for task, level in CELLS:
         if task not in given.task or level not in given.level:
             continue
