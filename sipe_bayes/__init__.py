@@ -38,7 +38,7 @@ _PUBLIC = {
     "RandomizedEnv": "sipe_bayes.randomized_env",
     "Randomization": "sipe_bayes.rl.randomization",
     "load_randomization": "sipe_bayes.rl.randomization",
-    "prepare": "sipe_bayes.calibration",
+    "prepare": "sipe_bayes.problem",
     "calibrate": "sipe_bayes.calibration",
 }
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from sipe_bayes.atomic import replacing, write_text
 
 if TYPE_CHECKING:
-    from sipe_bayes.calibration import Problem
     from sipe_bayes.diagnostics.result import Calibration
+    from sipe_bayes.problem import Problem
 
 CHECKPOINT = "checkpoint.safetensors"
 RUN = "run.json"

@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from sipe_bayes.calibration import prepare
 from sipe_bayes.cli import app
 from sipe_bayes.diagnostics.expected import Plan
 from sipe_bayes.diagnostics.suggest import KINDS, generate, limits, rank
@@ -22,6 +21,7 @@ from sipe_bayes.likelihood import Segments
 from sipe_bayes.noise import Noise
 from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import prior
+from sipe_bayes.problem import prepare
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.trajectory import Trajectory
 from tests.pendulums import DT, pendulum

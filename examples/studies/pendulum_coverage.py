@@ -22,7 +22,7 @@ import numpy as np
 
 import sipe_bayes as sipe
 from sipe_bayes.atomic import write_text
-from sipe_bayes.calibration import Problem
+from sipe_bayes.problem import Problem
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"

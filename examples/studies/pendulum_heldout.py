@@ -20,10 +20,10 @@ import scipy.optimize
 
 import sipe_bayes as sipe
 from sipe_bayes.atomic import write_text
-from sipe_bayes.calibration import Problem
 from sipe_bayes.config import load_config
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.likelihood import Windows
+from sipe_bayes.problem import Problem
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"

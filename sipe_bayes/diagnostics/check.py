@@ -344,8 +344,8 @@ def study_of_config(
 ) -> Study:
     """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs: autoregressive, or with a
     ``StateSpace`` white, and process noise."""
-    from sipe_bayes.calibration import method_of, prepare
     from sipe_bayes.inference.recalibrated import fitted_noise
+    from sipe_bayes.problem import method_of, prepare
 
     problem = prepare(path, threads)
     method = method_of(problem, estimator, seed, budget)

@@ -11,10 +11,10 @@ from sipe_bayes.checks import positive, whole
 from sipe_bayes.refusing import refusing
 
 if TYPE_CHECKING:
-    from sipe_bayes.calibration import Problem
     from sipe_bayes.diagnostics.expected import Plan
     from sipe_bayes.noise import Noise
     from sipe_bayes.posterior import Posterior
+    from sipe_bayes.problem import Problem
 
 _SHOWN = 10
 
@@ -47,9 +47,9 @@ def suggest(
     with refusing():
         import numpy as np
 
-        from sipe_bayes.calibration import prepare
         from sipe_bayes.diagnostics import suggest as suggestions
         from sipe_bayes.output import to_json
+        from sipe_bayes.problem import prepare
 
         whole("--candidates", candidates, 0)
         whole("--seed", seed, 0)

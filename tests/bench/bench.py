@@ -28,9 +28,9 @@ import numpy as np
 import transfer
 
 import sipe_bayes.inference.laplace as laplace_module
-from sipe_bayes.calibration import prepare
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Segments, Windows
+from sipe_bayes.problem import prepare
 from sipe_bayes.simulator import Simulator
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "simple_pendulum" / "calibrate.toml"
