@@ -147,12 +147,12 @@ def test_a_point_gets_a_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_point_that_noise_and_start_move_more_than_theta_does() -> None:
-    """Six logs of a falling pole with 5 % noise, starts not recorded: were noise and start taken for known, as they are estimated, a tenth
-    to a third of the 18 intervals would hold the truth. A right one fails once in a hundred (18 intervals of 90 %, were they independent)."""
+    """Four logs of a falling pole with 5 % noise, starts not recorded: were noise and start taken for known, as they are estimated, a third
+    of the 12 intervals would hold the truth. A right one fails once in two hundred, were the intervals, of 90 %, independent."""
     simulator = sipe.Simulator(sipe.make_task("CartPole"), num_threads=1)
-    base = sipe.get_estimator(simulator, "regression", seed=0)
+    base = sipe.get_estimator(simulator, "regression", budget=300, iterations=2000, seed=0)
     recalibrated, held = Recalibrated(base), 0
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         theta = rng.uniform(0.1, 0.9, 3)
         excitation = acting.excitation(simulator.environment, simulator.dt)
@@ -161,7 +161,8 @@ def test_a_point_that_noise_and_start_move_more_than_theta_does() -> None:
         found = recalibrated.fit(sipe.Trajectory(clean.observations + noise, clean.actions, clean.dt))
         low, high = found.quantile([0.05, 0.95]).numpy()
         held += int(((low <= theta) & (theta <= high)).sum())
-    assert held >= 13
+    print(held)
+    assert held >= 8
 
 
 def test_coloured_noise_that_the_estimator_takes_for_white() -> None:
