@@ -37,22 +37,14 @@ def _from_logs(logs: FloatArray, like: Noise) -> Noise:
     return Noise(np.exp(logs[:channels]), np.where(like.tau > 0, np.exp(logs[channels:]), 0.0))
 
 
-def by_channel(covariance: FloatArray, free: IntArray, channels: int) -> FloatArray:
-    """Covariance (C, 2, 2) of each channel's log sd and log tau, from that (F, F) of the ``free`` ones; zero where they are given."""
-    whole = np.zeros((2 * channels, 2 * channels))
-    whole[np.ix_(free, free)] = covariance
-    pair = np.arange(channels)[:, None] + np.array([0, channels])
-    return whole[pair[:, :, None], pair[:, None, :]]
-
-
 def noise_cloud(
-    moments: Moments, noise: Noise, pulls: Pulls, free: IntArray, covariance: FloatArray, longest: float
+    moments: Moments, noise: Noise, pulls: Pulls, free: IntArray, longest: float
 ) -> list[tuple[float, Noise]]:
-    """Weighted points that stand for the uncertainty of the noise: two along each principal axis of its ``covariance``, at
+    """Weighted points that stand for the uncertainty of the noise: two along each principal axis of its covariance, at
     sqrt(dimensions) sds, weighted by the restricted likelihood against its normal approximation."""
     if not len(free):
         return [(1.0, noise)]
-    d = len(free)
+    covariance, d = noise_covariance(moments, noise, pulls, free), len(free)
     eigenvalues, axes = np.linalg.eigh(covariance)
     best = restricted(moments, noise, pulls)
     centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))

@@ -38,34 +38,17 @@ def observation_noise(
     others, as white."""
     sd = noise_level(trajectories, likelihood)
     tau = np.zeros(len(sd))
-    fitted = _fitted(trajectories, likelihood, len(sd))
+    fitted = list(range(len(sd)))
+    if likelihood.fit is not None and trajectories.channels:
+        fitted = [trajectories.channels.index(name) for name in likelihood.fit]
     if len(diagnostics.get("noise_sd", ())) == len(fitted):
         sd[fitted], tau[fitted] = diagnostics["noise_sd"], diagnostics.get("noise_tau", np.zeros(len(fitted)))
     return Noise(sd, tau)
 
 
-def noise_spread(
-    diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments | StateSpace
-) -> FloatArray:
-    """How uncertain that noise is: covariance (O, 2, 2) of each channel's log sd and log tau, zero where ``diagnostics`` say nothing."""
-    count = trajectories.observations.shape[2]
-    spread, fitted = np.zeros((count, 2, 2)), _fitted(trajectories, likelihood, count)
-    if len(diagnostics.get("noise_spread", ())) == len(fitted):
-        spread[fitted] = diagnostics["noise_spread"]
-    return spread
-
-
-def _fitted(trajectories: Trajectories, likelihood: Segments | StateSpace, count: int) -> list[int]:
-    """The fitted ones of the channels."""
-    if likelihood.fit is None or not trajectories.channels:
-        return list(range(count))
-    return [trajectories.channels.index(name) for name in likelihood.fit]
-
-
 class Replicas:
-    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels), another one in each as far as it is uncertain by ``spread`` (O, 2, 2),
-    default not at all, and process noise of sd ``process`` (D,), default none, in the tangent coordinates of ``StateSpace``, whose loose jumps
-    are not repeated."""
+    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels), and process noise of sd ``process`` (D,), default none, in the
+    tangent coordinates of ``StateSpace``, whose loose jumps are not repeated."""
 
     def __init__(
         self,
@@ -73,10 +56,8 @@ class Replicas:
         trajectories: Trajectories,
         noise: Noise,
         process: FloatArray | None = None,
-        spread: FloatArray | None = None,
     ) -> None:
         self.simulator, self.trajectories, self.noise = simulator, trajectories, noise
-        self.spread = spread if spread is not None and spread.any() else None
         self.process = process if process is not None and process.any() else None
         self.starts = _starts(simulator, trajectories)
 
@@ -148,17 +129,10 @@ class Replicas:
     def _noise(self, rng: np.random.Generator) -> FloatArray:
         """Noise (R, T+1, O) of every trajectory."""
         samples = self.trajectories.observations.shape[1]
-        level = self.noise if self.spread is None else self._level(self.spread, rng)
-        noise = np.stack([_drawn(level, samples, float(dt), rng) for dt in self.trajectories.dt])
+        noise = np.stack([self._drawn(samples, float(dt), rng) for dt in self.trajectories.dt])
         if isinstance(self.simulator, CallableSimulator):
             noise[:, 0] = 0.0  # x is the second sample
         return noise
-
-    def _level(self, spread: FloatArray, rng: np.random.Generator) -> Noise:
-        """A noise that may as well be the recording's."""
-        moved = np.array([rng.multivariate_normal(np.zeros(2), one, method="eigh") for one in spread])
-        tau = np.minimum(self.noise.tau * np.exp(moved[:, 1]), self.trajectories.longest)
-        return Noise(self.noise.sd * np.exp(moved[:, 0]), tau)
 
     def _misled(self, noise: FloatArray) -> FloatArray:
         """By how much (R, S) noise (R, T+1, O) on the recording moves the estimate of its start."""
@@ -182,17 +156,16 @@ class Replicas:
             found.append((begin, estimate_states(self.simulator, begin)[0]))
         return found
 
-
-def _drawn(noise: Noise, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
-    """Noise (count, O) of samples dt seconds apart."""
-    white = rng.standard_normal((count, len(noise.sd)))
-    out = np.empty_like(white)
-    for c, (sd, tau) in enumerate(zip(noise.sd, noise.tau, strict=True)):
-        a = float(np.exp(-dt / tau)) if tau > 0 else 0.0
-        scaled = white[:, c] * np.sqrt(1 - a**2)
-        scaled[0] = white[0, c]
-        out[:, c] = sd * scipy.signal.lfilter([1.0], [1.0, -a], scaled)
-    return out
+    def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
+        """Noise (count, O) of samples dt seconds apart."""
+        white = rng.standard_normal((count, len(self.noise.sd)))
+        out = np.empty_like(white)
+        for c, (sd, tau) in enumerate(zip(self.noise.sd, self.noise.tau, strict=True)):
+            a = float(np.exp(-dt / tau)) if tau > 0 else 0.0
+            scaled = white[:, c] * np.sqrt(1 - a**2)
+            scaled[0] = white[0, c]
+            out[:, c] = sd * scipy.signal.lfilter([1.0], [1.0, -a], scaled)
+        return out
 
 
 def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:

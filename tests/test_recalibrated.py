@@ -146,8 +146,8 @@ def test_a_point_gets_a_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
     assert recalibrated.rollouts == 600 + 100  # trained once; conditioning costs a simulation
 
 
-def test_a_point_that_noise_and_start_move_more_than_theta_does() -> None:
-    """Four logs of a falling pole with 5 % noise, starts not recorded: were noise and start taken for known, as they are estimated, a third
+def test_a_point_that_the_start_moves_more_than_theta_does() -> None:
+    """Four logs of a falling pole with 5 % noise, starts not recorded: were the starts taken for known, as they are estimated, some 40 %
     of the 12 intervals would hold the truth. A right one fails once in two hundred, were the intervals, of 90 %, independent."""
     simulator = sipe.Simulator(sipe.make_task("CartPole"), num_threads=1)
     base = sipe.get_estimator(simulator, "regression", budget=300, iterations=2000, seed=0)

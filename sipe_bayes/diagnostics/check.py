@@ -30,7 +30,7 @@ from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, digest
 from sipe_bayes.inference.recalibrated import Recalibrated, fresh
 from sipe_bayes.noise import Noise
-from sipe_bayes.replicas import Replicas, observation_noise
+from sipe_bayes.replicas import Replicas
 from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
@@ -344,11 +344,10 @@ def study_of_config(
 ) -> Study:
     """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs: autoregressive, or with a
     ``StateSpace`` white, and process noise."""
-    from sipe_bayes.inference.recalibrated import fitted_noise, process_noise
+    from sipe_bayes.inference.recalibrated import fitted_noise
     from sipe_bayes.problem import method_of, prepare
 
     problem = prepare(path, threads)
     method = method_of(problem, estimator, seed, budget)
-    told, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
-    noise = observation_noise(told, problem.train, problem.likelihood)
-    return Study(str(path), method, problem.train, noise, refits, seed, process_noise(told))
+    noise, process, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
+    return Study(str(path), method, problem.train, noise, refits, seed, process)

@@ -112,7 +112,6 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
 
     from sipe_bayes.inference.recalibrated import fitted_noise
     from sipe_bayes.noise import Noise
-    from sipe_bayes.replicas import observation_noise
 
     channels = list(problem.simulator.environment.channels)
     fitted = list(problem.segments.fit or channels)
@@ -121,8 +120,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
         noise = json.loads(record.read_text(encoding="utf-8"))["noise"]
         if set(fitted) <= set(noise):
             return Noise(*(np.array([noise[c][what] for c in fitted]) for what in ("sd", "tau")))
-    told, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior)
-    every = observation_noise(told, problem.train, problem.likelihood)
+    every, *_ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior)
     chosen = [channels.index(c) for c in fitted]
     return Noise(every.sd[chosen], every.tau[chosen])
 

@@ -161,8 +161,6 @@ class Laplace(Estimator):
             "noise_sd": state["mode_sd"][kept[0]].tolist(),
             "noise_tau": state["mode_tau"][kept[0]].tolist(),
         }
-        if "mode_noise_spread" in state:
-            self.diagnostics["noise_spread"] = state["mode_noise_spread"][kept[0]].tolist()
         if "mode_process" in state:
             noise = (state[f"mode_{name}"][kept[0]] for name in ("process", "movement", "loose"))
             self.diagnostics |= process_diagnostics(*noise)

@@ -271,7 +271,7 @@ def _noise_of(state: State) -> dict[str, Any]:
     """The noise of the laplace fit."""
     found = {"noise_sd": state["fit_sd"].tolist(), "noise_tau": state["fit_tau"].tolist()}
     if "fit_process" not in state:
-        return found | {"noise_spread": state["fit_noise_spread"].tolist()}
+        return found
     return found | process_diagnostics(*(state[f"fit_{name}"] for name in ("process", "movement", "loose")))
 
 

@@ -25,8 +25,8 @@ times the sd of what was learned, about its mean. The last regression leaves out
 Deviations. Issue and textbook name regression of truth on estimate; here estimate on truth, turned round by Bayes' rule, so that the
 width of the neighbourhood is not a second prior. One mode: estimates that jump between several make V wide. Uniform priors are
 normals of sd 10 about the cube's centre, flat within it to half a percent. Replicas have first-order autoregressive noise as
-``laplace`` finds it in a measured log, whatever noise the estimator believes in, and each its own within that fit's uncertainty, and start as far
-from the log's estimated start as noise leaves that: a linear regression on single steps follows noise and start more than it does theta. Where states are recorded, the noise that the estimator
+``laplace`` finds it in a measured log, whatever noise the estimator believes in, and start as far
+from the log's estimated start as noise leaves that: a linear regression on single steps follows the start more than it does theta. Where states are recorded, the noise that the estimator
 infers, and for those that infer none, or where a function makes its own, as ``noise_level`` says. With a ``StateSpace`` their states are
 shaken by the process noise that the fit of the log inferred, but for jumps that it let go; that is never inferred to be zero, so that
 where there is none the result is somewhat too wide. A model that is wrong is not mended by
@@ -56,7 +56,7 @@ from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, Segments
 from sipe_bayes.noise import Noise
 from sipe_bayes.posterior import GaussianMixture, Posterior
-from sipe_bayes.replicas import Replicas, noise_spread, observation_noise
+from sipe_bayes.replicas import Replicas, observation_noise
 from sipe_bayes.simulator import Simulator
 from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
@@ -130,14 +130,13 @@ class Recalibrated(Estimator):
         base, posterior = self._base(trajectories)
         mean, covariance = posterior.mean.numpy(), posterior.covariance.numpy()
         self.rollouts = base.rollouts
-        told, n = self._noise(base, mean, trajectories), len(mean)
-        noise = observation_noise(told, trajectories, self.likelihood)
+        noise = self._noise(base, mean, trajectories)
+        n = len(mean)
         return {
             "estimate": mean,
             "own_sd": np.sqrt(np.maximum(np.diag(covariance), 0.0)),
             "noise_sd": noise.sd,
             "noise_tau": noise.tau,
-            "noise_spread": noise_spread(told, trajectories, self.likelihood),
             "process": process_noise(base.diagnostics),
             "theta": np.empty((0, n)),
             "estimates": np.empty((0, n)),
@@ -214,13 +213,13 @@ class Recalibrated(Estimator):
         same = isinstance(self.estimator, Laplace) and self.likelihood.noise == "ar1"
         return not same and noise_is_unknown(self.simulator, self.likelihood, batch)
 
-    def _noise(self, base: Estimator, theta: FloatArray, trajectories: Trajectories) -> dict[str, Any]:
-        """Diagnostics that tell it."""
+    def _noise(self, base: Estimator, theta: FloatArray, trajectories: Trajectories) -> Noise:
+        """Of all O channels."""
         if self._looks_for_noise(trajectories):
-            told, rollouts = fitted_noise(self.simulator, self.likelihood, trajectories, self.prior, theta)
+            noise, _, rollouts = fitted_noise(self.simulator, self.likelihood, trajectories, self.prior, theta)
             self.rollouts += rollouts
-            return told
-        return base.diagnostics
+            return noise
+        return observation_noise(base.diagnostics, trajectories, self.likelihood)
 
     def _bound_budget(self, trajectories: Trajectories) -> None:
         if self._asked is None:
@@ -269,8 +268,7 @@ class Recalibrated(Estimator):
     def _simulated(self, state: State, trajectories: Trajectories) -> Replicas:
         if self._replicas is None or self._replicas[0] is not trajectories:
             noise = Noise(state["noise_sd"], state["noise_tau"])
-            made = Replicas(self.simulator, trajectories, noise, state["process"], state["noise_spread"])
-            self._replicas = (trajectories, made)
+            self._replicas = (trajectories, Replicas(self.simulator, trajectories, noise, state["process"]))
         return self._replicas[1]
 
     def _rounds(self) -> tuple[int, ...]:
@@ -321,13 +319,13 @@ def fitted_noise(
     prior: Posterior,
     theta: FloatArray | None = None,
     budget: int = NOISE_BUDGET,
-) -> tuple[dict[str, Any], int]:
-    """Diagnostics, which tell the noise, of a fit of ``laplace``, from theta (N,) where given, with autoregressive noise or a
-    ``StateSpace``; and its rollouts."""
+) -> tuple[Noise, FloatArray, int]:
+    """Noise of all O channels by a fit of ``laplace``, from theta (N,) where given: autoregressive, or that of the measurement with a
+    ``StateSpace``; its process noise (D,), else none; and the fit's rollouts."""
     coloured = replace(likelihood, noise="ar1") if isinstance(likelihood, Segments) else likelihood
     fit = Laplace(simulator, likelihood=coloured, prior=prior, initial=theta, budget=budget)
     fit.fit(trajectories)
-    return fit.diagnostics, fit.rollouts
+    return observation_noise(fit.diagnostics, trajectories, likelihood), process_noise(fit.diagnostics), fit.rollouts
 
 
 def fresh(estimator: Estimator) -> Estimator:

@@ -46,7 +46,7 @@ from sipe_bayes.inference.window_noise import (
 )
 from sipe_bayes.likelihood import BudgetExhausted, Linearisation, Windows
 from sipe_bayes.noise import Arrow, Moments, Noise, eliminate, restricted
-from sipe_bayes.noise_spread import by_channel, noise_cloud, noise_covariance, sandwich
+from sipe_bayes.noise_spread import noise_cloud, sandwich
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -82,7 +82,6 @@ def start(search: Search, windows: Windows) -> State:
         "mode_covariance": np.empty((0, n, n)),
         "mode_sd": np.empty((0, c)),
         "mode_tau": np.empty((0, c)),
-        "mode_noise_spread": np.empty((0, c, 2, 2)),
         "mode_evidence": np.empty(0),
         "mode_guessed": np.empty(0, bool),
     }
@@ -330,9 +329,8 @@ def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
     if sandwiched:
         noise = updated_noise(windows, moments, noise, theta, starts, prior, coloured=True)
     mean, covariance = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
-    centres, free = [], free_noise(windows)
-    noise_spread = noise_covariance(moments, noise, here, free)
-    for weight, point in noise_cloud(moments, noise, here, free, noise_spread, windows.trajectories.longest):
+    centres = []
+    for weight, point in noise_cloud(moments, noise, here, free_noise(windows), windows.trajectories.longest):
         if sandwiched:
             middle = sandwich(optimum.jacobian, arrow.start_slope, white, windows.sequences, point)
             centre, spread = search.normal(theta, *_sandwiched(arrow, middle))
@@ -346,8 +344,7 @@ def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
     for weight, centre in centres:
         covariance += weight * np.outer(centre - mean, centre - mean)
     found = {"theta": theta, "starts": starts, "slope": arrow.start_slope, "mean": mean, "covariance": covariance}
-    found |= {"sd": noise.sd, "tau": noise.tau, "noise_spread": by_channel(noise_spread, free, len(noise.sd))}
-    return {**found, "evidence": np.array(evidence)}
+    return {**found, "sd": noise.sd, "tau": noise.tau, "evidence": np.array(evidence)}
 
 
 def _sandwiches(windows: Windows) -> bool:

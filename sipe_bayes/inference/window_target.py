@@ -27,7 +27,7 @@ from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]
 
-_NAMES = ("theta", "starts", "slope", "sd", "tau", "noise_spread")
+_NAMES = ("theta", "starts", "slope", "sd", "tau")
 
 
 def at_optimum(windows: Windows, mode: State) -> State:
