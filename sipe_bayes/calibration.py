@@ -57,7 +57,7 @@ def calibrate(
     posterior = method.fit(problem.train)
     if not method.uncertain:
         method.doubt(
-            f"the spread of {method.name} is that of its search, not an uncertainty: use laplace or mcmc, or Recalibrated"
+            f"the spread of {method.name} is that of its search, not an uncertainty: use laplace or mcmc, or in Python sipe.Recalibrated"
         )
 
     def tell(what: str) -> None:
@@ -97,7 +97,7 @@ def calibrate(
         train=scores["train"],
         holdout=held,
         warnings=_alarms(lacking, outside) + _warnings(problem, method, summaries, dead, found, conflict, telling),
-        doubts=method.doubts,
+        doubts=[*method.doubts, *(look.text for look in outside if look.alarm)],
         signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
         residuals=residuals,
         ridges=found,

@@ -220,7 +220,7 @@ def print_calibration(found: Calibration) -> None:
     for p in found.parameters:
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
-        verdict = parameter_verdict(p, found.ridges)
+        verdict = parameter_verdict(p, found.ridges, found.doubts)
         # brackets of a name are not markup
         table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     console.print(table)

@@ -32,7 +32,7 @@ from sipe_bayes.units import convert
 
 FloatArray = NDArray[np.float64]
 
-_SLOW = 1.0  # s from row to row: no robot is logged so slowly without its being meant
+_SLOW = 0.25  # s from row to row: no robot is logged so slowly without its being meant
 REGULAR = 0.1
 """A clock is regular when its samples are within this fraction of a period of the grid."""
 GAP_PERIODS = 5.0

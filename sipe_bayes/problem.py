@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from sipe_bayes.config import Config, ConfigError, LogEntry, check_dimensions, load_config, overlap
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
@@ -27,8 +26,6 @@ from sipe_bayes.simulator import Simulator
 from sipe_bayes.state_space import StateSpace
 from sipe_bayes.trajectory import Trajectories
 from sipe_bayes.units import find_unit, to_si
-
-FloatArray = NDArray[np.float64]
 
 _FLAT_SD = 1e3  # stands for a uniform prior beside an earlier posterior
 _SCORED = 0.5  # s, windows over which logs are scored and drawn where the likelihood has none
@@ -79,7 +76,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
                 raise ConfigError(
                     f"{config.path}: log {held_log.name!r} is held out, but {held_log.file} is a copy of {log.file}, which trains; hold out another log"
                 )
-    prior, doubts = _prior(config, environment.space, reports[: len(train_logs)])
+    prior, remarks = _prior(config, environment.space, reports[: len(train_logs)])
     return Problem(
         config,
         environment,
@@ -89,7 +86,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
         Trajectories.stack(trajectories[: len(train_logs)]),
         Trajectories.stack(held) if held else None,
         reports,
-        doubts,
+        remarks,
     )
 
 
@@ -181,15 +178,15 @@ def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) ->
         slope[k], shift[k] = ends[1] - ends[0], ends[0]
     mean[new] = shift + slope * old_mean[old]
     covariance[np.ix_(new, new)] = slope[:, None] * old_covariance[np.ix_(old, old)] * slope
-    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space), _doubts(config, earlier, train)
+    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space), _remarks(config, earlier, train)
 
 
-def _doubts(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> tuple[str, ...]:
+def _remarks(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> tuple[str, ...]:
     """What is to be said of an earlier posterior as the prior."""
     assert config.prior is not None
-    doubts = []
+    remarks = []
     if isinstance(earlier, GaussianMixture) and len(earlier.means) > 1:
-        doubts.append(
+        remarks.append(
             f"the earlier posterior is a mixture of {len(earlier.means)} normals; one with its mean and covariance stands for it"
         )
     record = Path(config.prior.source).parent / RUN
@@ -197,10 +194,10 @@ def _doubts(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> t
         before = set(json.loads(record.read_text(encoding="utf-8")).get("logs_sha256", {}).values())
         again = [report.name for report in train if report.sha256 in before]
         if again:
-            doubts.append(
+            remarks.append(
                 f"the earlier posterior has seen {', '.join(again)} already: counted twice, the intervals come out too narrow"
             )
-    return tuple(doubts)
+    return tuple(remarks)
 
 
 def method_of(

@@ -28,7 +28,7 @@ from sipe_bayes.trajectory import Trajectories, Trajectory
 
 FloatArray = NDArray[np.float64]
 
-_BEGINNING = 0.2  # s of a log on which the estimate of its start depends, and more
+_BEGINNING, _LEAST_STEPS = 0.2, 4  # s and steps of a log on which the estimate of its start depends, and more
 
 
 def observation_noise(
@@ -151,7 +151,7 @@ class Replicas:
         assert isinstance(self.simulator, Simulator)
         found = []
         for recorded in self.trajectories:
-            steps = min(len(recorded), math.ceil(_BEGINNING / recorded.dt))
+            steps = min(len(recorded), max(_LEAST_STEPS, math.ceil(_BEGINNING / recorded.dt)))
             begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
             found.append((begin, estimate_states(self.simulator, begin)[0]))
         return found

@@ -183,6 +183,25 @@ def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: P
         get_estimator(simulator, name, **settings).fit(trajectory)
 
 
+def test_a_doubt_survives_an_interruption(tmp_path: Path) -> None:
+    class Doubting(type(get_estimator(pendulum(), "cem"))):  # type: ignore[misc]
+        def step(self, state: Any, trajectories: Any) -> Any:
+            self.doubt("nothing is certain")
+            return super().step(state, trajectories)
+
+    def fitted() -> Any:
+        doubting = Doubting(pendulum(), checkpoint=tmp_path / "checkpoint.safetensors", **quick("cem"))
+        doubting.fit(log(pendulum(), TRUTH, 1, steps=100))
+        return doubting
+
+    first, again = fitted(), fitted()  # the second one only reads
+    assert again.doubts == first.doubts == ["nothing is certain"]
+    first.checkpoint = None
+    first.step = super(Doubting, first).step
+    first.fit(log(pendulum(), TRUTH, 1, steps=100))
+    assert not first.doubts
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_trajectories_of_another_environment_are_refused(name: str) -> None:
     other = Trajectory(np.zeros((101, 3)), np.zeros((100, 1)), 0.01)

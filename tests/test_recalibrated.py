@@ -143,7 +143,7 @@ def test_a_point_gets_a_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
     print(off, ratio, recalibrated.warnings)
     assert off.abs().max() < 1
     assert ((ratio > 0.7) & (ratio < 1.6)).all()
-    assert recalibrated.rollouts == 600 + 100  # trained once; conditioning costs a simulation
+    assert recalibrated.rollouts == 600 + 200  # trained once; conditioning costs a simulation
 
 
 def test_a_point_that_the_start_moves_more_than_theta_does() -> None:

@@ -480,10 +480,7 @@ def test_what_the_model_lacks_is_among_the_first_sentences(calibration: Calibrat
     assert "something small" in small.text
     assert report.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, p=0.2))) is None
     strange = dataclasses.replace(calibration, outside=[OutsidePrior(0.01, "train_0", "angle_0", 1.0)], misfit=LACKS)
-    found = report.lack(strange)
-    assert found is not None
-    assert "train_0" in found.text
-    assert "misfit" in strange.to_dict()
+    assert strange.to_dict()["outside_prior"][0]["log"] == "train_0"
     assert strange.to_dict()["misfit"]["matters"]
 
 
@@ -495,10 +492,12 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert report.headline([good]).tone == "good"
     assert report.headline([weak, weak]).tone == "bad"
     assert report.headline([nuisance]).tone == "fair"
-    doubted = report.headline([good, weak], doubts=["the chains have not mixed", "another"])
-    assert doubted == report.Verdict(
-        "bad", "No value may be trusted within its interval yet: the chains have not mixed."
-    )
+    for values in ([good, weak], [weak]):
+        doubted = report.headline(values, doubts=["the chains have not mixed", "another", "a third"])
+        words = "the chains have not mixed; another; and 1 more, among the warnings"
+        assert doubted == report.Verdict("bad", f"No value may be trusted within its interval yet: {words}.")
+    assert report.parameter_verdict(good).tone == "good"
+    assert report.parameter_verdict(good, doubts=["another"]).tone == "fair"
 
 
 def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> None:
@@ -506,6 +505,9 @@ def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> 
     texts = [v.text for v in report.verdicts(found)]
     assert texts[0].endswith("yet: the chains have not mixed.")
     assert not any("NOT mixed" in text for text in texts)
+    texts = [v.text for v in report.verdicts(dataclasses.replace(found, doubts=["another"]))]
+    assert any("NOT mixed" in text for text in texts)
+    assert "but see the doubt above" in report.render(found, [])
 
 
 # The page

@@ -176,7 +176,8 @@ def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], wo
         ("", "given.csv: "),
         ("time,torque\n0,0\n1,0\n", "no column 'force'; it has ['time', 'torque']"),
         ("time,force\n0,0\n1,\n", "'force' holds what is no number"),
-        ("time,force\n0,0\n1,50\n", "goes from 0 to 50, beyond the control range of"),
+        ("time,force\n1,0\n0,0\n", "times that increase; sort the rows"),
+        ("time,force\n0,0\n1,50\n", "makes motor go from 0 to 50, beyond its control range, -3 to 3"),
     ],
 )
 def test_given_commands_are_checked(config: Path, tmp_path: Path, text: str, words: str) -> None:  # noqa: F811

@@ -31,7 +31,7 @@ prior's."""
 ALIKE = 1.05
 """Errors within this factor of one another count as the same."""
 _ONE = "The one value may be trusted within its interval"
-_NAMED = 6  # parameters that a sentence lists
+_NAMED, _DOUBTS = 6, 2  # parameters and doubts that a sentence lists
 MIXED = 1.05
 """R-hat above which chains are called not mixed."""
 
@@ -106,9 +106,9 @@ class Verdict:
     text: str
 
 
-def parameter_verdict(parameter: ParameterSummary, ridges: Sequence[Ridge] = ()) -> Verdict:
+def parameter_verdict(parameter: ParameterSummary, ridges: Sequence[Ridge] = (), doubts: Sequence[str] = ()) -> Verdict:
     """What to think of one parameter: what is wrong with it, else how far the logs determine it. One that is poorly determined but
-    belongs to one of the ``ridges`` is determined with the others of it."""
+    belongs to one of the ``ridges`` is determined with the others of it. None is good while the method has ``doubts``."""
     others = [n for r in ridges if parameter.name in r.parameters for n in r.parameters if n != parameter.name]
     shared = bool(others) and parameter.contraction < WELL_DETERMINED and "no_effect" not in parameter.flags
     told = {flag: text for flag, text in _PROBLEMS.items() if not (shared and flag == "not_determined")}
@@ -121,7 +121,8 @@ def parameter_verdict(parameter: ParameterSummary, ridges: Sequence[Ridge] = ())
         return Verdict("fair", "a point without uncertainty")
     partly = "; part of its range changes nothing" if "dead_range" in parameter.flags else ""
     if parameter.contraction >= WELL_DETERMINED:
-        return Verdict("fair" if partly else "good", "determined" + partly)
+        doubted = "; but see the doubt above" if doubts else ""
+        return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
     return Verdict("fair", "weakly determined" + partly)
 
 
@@ -141,10 +142,13 @@ def headline(
     good = [p.name for p in wanted if parameter_verdict(p, ridges).tone == "good"]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
+    if doubts:
+        others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
+        return Verdict(
+            "bad", f"No value may be trusted within its interval yet: {'; '.join(doubts[:_DOUBTS])}{others}."
+        )
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
-    if doubts:
-        return Verdict("bad", f"No value may be trusted within its interval yet: {doubts[0]}.")
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
         return Verdict("good", f"{text}.")
@@ -196,13 +200,7 @@ def _margin(comparison: Comparison) -> str:
 
 
 def lack(calibration: Calibration) -> Verdict | None:
-    """What the model lacks, where that matters, and logs outside the prior; the warnings say more."""
-    outside = [o.log for o in calibration.outside if o.alarm]
-    if outside:
-        return Verdict(
-            "bad",
-            f"Simulations of the prior give no logs like {listed(outside)}: widen the bounds, or correct the model.",
-        )
+    """What the model lacks, where that matters; the warnings say more."""
     found = calibration.misfit
     if found is None or not found.alarm:
         return None
@@ -234,7 +232,9 @@ def verdicts(calibration: Calibration) -> list[Verdict]:
     first = [headline(calibration.parameters, calibration.ridges, calibration.doubts), predicted]
     if predicted.tone == "bad":
         first.reverse()
-    mixing = None if calibration.doubts else mixing_verdict(calibration)
+    mixing = mixing_verdict(calibration)
+    if mixing is not None and mixing.tone == "bad" and any("not mixed" in said for said in calibration.doubts):
+        mixing = None  # said already
     return [v for v in (*first, lack(calibration), mixing) if v]
 
 
@@ -252,8 +252,8 @@ def _values(summary: ParameterSummary, parameter: Parameter) -> dict[str, str]:
     return texts | {"sd": significant(summary.sd, summary.sd, scale) if summary.sd > 0 else ""}
 
 
-def _parameter_row(summary: ParameterSummary, parameter: Parameter, ridges: Sequence[Ridge]) -> dict[str, Any]:
-    verdict = parameter_verdict(summary, ridges)
+def _parameter_row(summary: ParameterSummary, parameter: Parameter, calibration: Calibration) -> dict[str, Any]:
+    verdict = parameter_verdict(summary, calibration.ridges, calibration.doubts)
     return {
         "name": summary.name,
         "unit": plots.unit_text(summary.unit),
@@ -385,7 +385,7 @@ def pictures(calibration: Calibration) -> list[Picture]:
 
 def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, Any]:
     space = calibration.posterior.space
-    rows = [(p, _parameter_row(p, space[space.index(p.name)], calibration.ridges)) for p in calibration.parameters]
+    rows = [(p, _parameter_row(p, space[space.index(p.name)], calibration)) for p in calibration.parameters]
     sentences = verdicts(calibration)
     tones = {v.tone for v in sentences}
     sections: dict[str, list[Picture]] = {}

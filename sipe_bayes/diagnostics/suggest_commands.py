@@ -65,7 +65,8 @@ def suggest(
         dt = float(problem.train.dt[0])
         bounds = suggestions.limits(problem.simulator, np.concatenate([log.actions for log in problem.train]))
         band = (low or 1 / duration, high or min(5.0, 0.2 / dt))
-        plans = suggestions.generate(candidates, duration, dt, bounds, band, seed) + _read(problem, given or [], dt)
+        plans = suggestions.generate(candidates, duration, dt, bounds, band, seed)
+        plans += [_read(problem, file, dt) for file in given or []]
         if not plans:
             raise ValueError("--candidates: expected at least 1, or --given; got none")
         known = _known(problem, posterior)
@@ -125,44 +126,48 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
     return Noise(every.sd[chosen], every.tau[chosen])
 
 
-def _read(problem: Problem, files: list[Path], dt: float) -> list[Plan]:
-    """Commands of CSV files, in the configuration's columns and units, on the logs' grid."""
+def _read(problem: Problem, file: Path, dt: float) -> Plan:
+    """Commands of a table, in the configuration's columns and units, on the logs' grid."""
     import numpy as np
 
     from sipe_bayes.diagnostics.expected import Plan
     from sipe_bayes.tables import read_table
     from sipe_bayes.units import to_si
 
-    config, plans = problem.config, []
-    clock, model = config.columns.time, problem.simulator.model
-    for file in files:
-        table = read_table(file)
+    clock, commands, model = problem.config.columns.time, problem.config.commands, problem.simulator.model
+    table, names = read_table(file), [clock.column, *(c.column for c in commands)]
+    for name in names:
+        if name not in table:
+            raise ValueError(f"--given {file}: no column {name!r}; it has {list(table)}")
+    seconds, *series = (_numbers(file, name, table[name]) for name in names)
+    seconds = (seconds - seconds[0]) * to_si(clock.unit)[0]
+    if any(len(values) != len(seconds) for values in series) or not (np.diff(seconds) > 0).all():
+        raise ValueError(f"--given {file}: expected a command for each time, and times that increase; sort the rows")
+    grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
+    held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
+    columns = [c.sign * to_si(c.unit)[0] * values[held] for c, values in zip(commands, series, strict=True)]
+    for command, values in zip(commands, columns, strict=True):
+        actuator = model.actuator(command.actuator).id
+        low, high = model.actuator_ctrlrange[actuator]
+        slack = 1e-6 * (high - low)
+        if model.actuator_ctrllimited[actuator] and not low - slack <= values.min() <= values.max() <= high + slack:
+            raise ValueError(
+                f"--given {file}: {command.column!r} makes {command.actuator} go from {values.min():.4g} to {values.max():.4g}, beyond its "
+                f"control range, {low:.4g} to {high:.4g}, in the model's unit; make it smaller"
+            )
+    return Plan(np.stack(columns, axis=1), dt, name=str(file))
 
-        def column(name: str, file: Path = file, table: Any = table) -> Any:
-            if name not in table:
-                raise ValueError(f"--given {file}: no column {name!r}; it has {list(table)}")
-            try:
-                values = np.asarray(table[name], float)
-            except ValueError:
-                values = np.full(1, np.nan)
-            if not np.isfinite(values).all():
-                raise ValueError(f"--given {file}: column {name!r} holds what is no number; fill it in")
-            return values
 
-        seconds = (column(clock.column) - column(clock.column)[0]) * to_si(clock.unit)[0]
-        grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
-        held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
-        columns = [c.sign * to_si(c.unit)[0] * column(c.column)[held] for c in config.commands]
-        for command, values in zip(config.commands, columns, strict=True):
-            actuator = model.actuator(command.actuator).id
-            low, high = model.actuator_ctrlrange[actuator]
-            if model.actuator_ctrllimited[actuator] and not low <= values.min() <= values.max() <= high:
-                raise ValueError(
-                    f"--given {file}: {command.column!r} goes from {values.min():.4g} to {values.max():.4g}, beyond the control range of "
-                    f"{command.actuator}, {low:.4g} to {high:.4g}; make it smaller"
-                )
-        plans.append(Plan(np.stack(columns, axis=1), dt, name=str(file)))
-    return plans
+def _numbers(file: Path, name: str, column: Any) -> Any:
+    import numpy as np
+
+    try:
+        values = np.asarray(column, float)
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
+    if not np.isfinite(values).all():
+        raise ValueError(f"--given {file}: column {name!r} holds what is no number; fill it in")
+    return values
 
 
 def _write(problem: Problem, plan: Plan, out: Path) -> None:

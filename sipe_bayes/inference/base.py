@@ -173,6 +173,7 @@ class Estimator(ABC):
         batch = self._given.stack(self._recorded(trajectories), anew=True)
         fingerprint = self._fingerprint(batch)
         self.warnings, self.diagnostics, self.rollouts, self._bound = [], {}, 0, None
+        self._doubtful = set()
         state = None
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_state(self.checkpoint, fingerprint)

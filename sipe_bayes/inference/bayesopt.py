@@ -329,7 +329,7 @@ class BayesOpt(Estimator):
         if not same_logs:
             self.doubt("the costs are those of other trajectories than these: the posterior is theirs")
         if not starts_known:
-            remarks.append(
+            self.doubt(
                 "the trajectories have no recorded states: errors of the windows' estimated starts are not in the posterior; "
                 "compare it with laplace or mcmc"
             )

@@ -56,6 +56,7 @@ FloatArray = NDArray[np.float64]
 _LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 _SHARP = 10 * SHORTEST  # an sd that the look around the optimum may have set
 _LEAST_BATCHES = 6  # of importance draws for which the budget must have room, and before they are called hopeless
+UNSETTLED = "the process noise had not settled: do not rely on the intervals; more restarts may help"
 
 
 class Laplace(Estimator):
@@ -165,7 +166,10 @@ class Laplace(Estimator):
             noise = (state[f"mode_{name}"][kept[0]] for name in ("process", "movement", "loose"))
             self.diagnostics |= process_diagnostics(*noise)
             if not state["mode_settled"][kept[0]]:
-                self.doubt("the process noise had not settled: do not rely on the intervals; more restarts may help")
+                self.doubt(UNSETTLED)
+        for reason in (state["mode_reason"][k] for k in kept if "mode_reason" in state):
+            if reason:
+                self.doubt(reason)
         if len(kept) > 1:
             self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
         found = self._normals(state, kept)

@@ -26,7 +26,7 @@ from sipe_bayes.checks import whole
 from sipe_bayes.inference import state_space_target, window_target
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.chain_state import process_diagnostics
-from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.laplace import UNSETTLED, Laplace
 from sipe_bayes.inference.optima import distinct_modes
 from sipe_bayes.inference.state import State
 from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
@@ -97,12 +97,13 @@ class MCMC(Estimator):
                 f"{self.budget} rollouts did not suffice for the laplace fit that comes first"
             ) from None
         windows.rollouts += first.rollouts
-        for sentence in first.warnings:
-            if sentence != first._spent() and "compare with mcmc" not in sentence:  # of its share of the budget
-                self.warn(sentence)
         assert first._state is not None
+        for sentence in first._state["warnings"]:  # of the search; those of its posterior do not hold of the chains
+            self.warn(sentence)
         best = distinct_modes(first._state)[0]
         mode = {k[5:]: v[best] for k, v in first._state.items() if k.startswith("mode_")}
+        if not mode.get("settled", True):
+            self.doubt(UNSETTLED)  # the chains hold that noise
         at_optimum = (state_space_target if isinstance(windows, Chain) else window_target).at_optimum
         picked, proposal = at_optimum(windows, mode), found
         if "draws_share" in first._state:  # kernels, which are slow to draw from
@@ -250,7 +251,7 @@ class MCMC(Estimator):
             what, remedy = "windows' starts", "use shorter windows"
             if isinstance(self.windows(trajectories), Chain):
                 what, remedy = "states", "hold the intervals against those of laplace"
-            self.doubt(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
+            self.warn(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
         flat = np.clip(theta.reshape(-1, n), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
 

@@ -37,8 +37,6 @@ class Search(Protocol):
 
     def warn(self, sentence: str | None) -> None: ...
 
-    def doubt(self, sentence: str) -> None: ...
-
     def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of the quadratic model of data and prior at theta."""
 

@@ -81,7 +81,9 @@ class PriorSampling(Estimator):
     def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
         self._check(trajectories)
         state = state if state["trained"] else self._trained(state, self._simulated(state, trajectories))
-        self.warn(unlike_experiment(state, trajectories, noise_level(trajectories, self.likelihood)))
+        other = unlike_experiment(state, trajectories, noise_level(trajectories, self.likelihood))
+        if other is not None:
+            self.doubt(other)
         log = self._looks(trajectories.observations[None], trajectories)
         alike = np.array_equal(np.isfinite(trajectories.observations).all(-1), state["seen_where"])
         how_far = max(unlikeness(state[name], log[name][0]) for name in log) if alike else float("nan")

@@ -18,7 +18,7 @@ Cost: ``refits`` times that of a fit, or, of an amortised estimator, which only 
 ``cost`` states it before anything is done.
 
 The neighbourhood is found in up to three rounds: twice the estimator's own sd and at least 0.02 of the range (a point: 0.1), of an amortised
-estimator, whose refits cost next to nothing and whose estimate may be far off, twice the prior's; then 1.5
+estimator, whose refits cost next to nothing and whose estimate may be far off, twice the prior's about its mean; half the range at most; then 1.5
 times the sd of what was learned, about its mean. The last regression leaves out truths outside the last neighbourhood's
 99.9 % ellipsoid, since the line is only local.
 
@@ -76,8 +76,8 @@ _LOST = 0.1  # of the refits: more failures are a warning
 class Recalibrated(Estimator):
     """A GaussianMixture around what ``estimator`` finds; see the module's docstring.
 
-    estimator: any; one that is amortised and trained is not trained again. refits: logs simulated and fitted, default 100 or 8 for each
-    parameter and two. budget: rollouts in all, default ``cost``. seed: of the simulations. checkpoint, progress: as every estimator's;
+    estimator: any; one that is amortised and has been trained is not trained again. refits: logs simulated and fitted, default 100 or 8 for each
+    parameter and two, twice that of an amortised one. budget: rollouts in all, default ``cost``. seed: of the simulations. checkpoint, progress: as every estimator's;
     a refit that is done is never done again.
     """
 
@@ -107,7 +107,7 @@ class Recalibrated(Estimator):
         )
         self.likelihood = estimator.likelihood  # checked there, a StateSpace too
         n = len(self.space)
-        default = max(_FEWEST, _PER_PARAMETER * (n + 2))
+        default = max(_FEWEST, _PER_PARAMETER * (n + 2)) * (1 + estimator.amortised)
         self.refits = whole("refits", default if refits is None else refits, 3 * n + 10)
         self.estimator, self._asked = estimator, budget
         self._fitted: tuple[Trajectories, Estimator, Posterior] | None = None
@@ -141,6 +141,8 @@ class Recalibrated(Estimator):
             "theta": np.empty((0, n)),
             "estimates": np.empty((0, n)),
             "tried": 0,
+            "round_tried": 0,  # and found before the present neighbourhood
+            "round_found": 0,
             "centre": self.prior.mean.numpy() if base.amortised else mean,
             "neighbourhood": _first_neighbourhood(self.prior.covariance.numpy() if base.amortised else covariance),
             "done": False,
@@ -162,7 +164,8 @@ class Recalibrated(Estimator):
         state = {**state, "tried": tried + 1, "done": tried + 1 >= self.refits}
         if tried + 1 in self._rounds() and len(state["theta"]) > 2 * len(theta) + 3:
             centre, covariance = self._learned(state)
-            state = {**state, "centre": centre, "neighbourhood": _AGAIN**2 * covariance}
+            begun = {"round_tried": tried + 1, "round_found": len(state["theta"])}
+            state = {**state, **begun, "centre": centre, "neighbourhood": _AGAIN**2 * covariance}
         self._seconds = time.monotonic() - began
         return state
 
@@ -174,7 +177,8 @@ class Recalibrated(Estimator):
                 f"refits: {len(theta)} of {state['tried']} gave an estimate, {2 * n + 4} are the least for {n} parameters; raise "
                 "refits or budget, or narrow the bounds"
             )
-        lost = 1 - len(state["theta"]) / state["tried"]
+        tried = state["tried"] - state["round_tried"]
+        lost = 1 - (len(state["theta"]) - state["round_found"]) / max(1, tried)
         if lost > _LOST:
             self.warn(
                 f"{lost:.0%} of the replicas diverged or could not be fitted: the recalibrated intervals speak of the others only"
@@ -243,10 +247,14 @@ class Recalibrated(Estimator):
                 own = self.checkpoint.with_name(f"{self.checkpoint.stem}-{base.name}{self.checkpoint.suffix}")
             base.checkpoint = own
             found = base.fit(trajectories)
-            for said in base.warnings:
-                self.warn(said)
             self._fitted = (trajectories, base, found)
-        return self._fitted[1:]
+        _, base, found = self._fitted
+        for said in base.warnings:  # an amortised one doubts the log, others their own widths, which are mended here
+            if base.amortised and said in base.doubts:
+                self.doubt(said)
+            else:
+                self.warn(said)
+        return base, found
 
     def _estimate(self, base: Estimator, replica: Trajectories) -> FloatArray | None:
         """Mean (N,) of the estimator's posterior of a replica; None where it finds none."""
@@ -295,7 +303,7 @@ class Recalibrated(Estimator):
 
     def _learned(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Mean (N,), within the cube, and covariance (N, N), no wider than the prior, of the best line's normal alone."""
-        line = Line.fit(state["theta"], state["estimates"])
+        line = Line.fit(*_local(state))
         _, mean, covariance = line.inverted(line.coefficients, line.scatter, state["estimate"], self._before)
         sd = np.sqrt(np.diag(covariance))
         shrink = np.minimum(sd, self.prior.stddev.numpy()) / sd
@@ -332,7 +340,8 @@ def fresh(estimator: Estimator) -> Estimator:
     """A copy that shares what the estimator has learned, but neither files nor progress nor what was said."""
     again = copy.copy(estimator)
     again.checkpoint = again.progress = None
-    again.warnings, again.diagnostics, again._given, again._bound = [], {}, Given(), None
+    again.warnings, again._doubtful, again.diagnostics = [], set(), {}
+    again._given, again._bound = Given(), None
     return again
 
 

@@ -84,6 +84,7 @@ def start(search: Search, windows: Windows) -> State:
         "mode_tau": np.empty((0, c)),
         "mode_evidence": np.empty(0),
         "mode_guessed": np.empty(0, bool),
+        "mode_reason": [],
     }
 
 
@@ -221,17 +222,16 @@ def step(search: Search, windows: Windows, state: State) -> State:
     }
     ends = unrecorded and (fit is here or _ends(windows, len(theta)))
     if settled or iteration >= _MAX_ITERATIONS or ends:
+        reason = ""
         if ends and not settled:
-            search.doubt(
+            reason = (
                 "the budget ended before the search had settled: the estimate is the best so far, and its intervals are guessed from the way "
                 "it has come; raise the budget"
             )
         elif not settled:
-            search.doubt(
-                f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
-            )
+            reason = f"the search had not settled after {iteration} steps: look at the residuals before you trust the intervals"
         elif fit.refused > _DRIFT:
-            search.doubt(
+            reason = (
                 f"at the optimum the linearisation still foretold a gain of {fit.refused:.1f} nats that no step found: the "
                 "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the intervals"
             )
@@ -240,7 +240,10 @@ def step(search: Search, windows: Windows, state: State) -> State:
         guess = float(np.sqrt((gone**2).mean())) * min(1.0, left)
         doubtful = not windows.num_start and ((ends and not settled) or fit.refused > _DRIFT)
         return _finish(
-            search, windows, state, _Optimum(theta, starts, noise, moments, linearisation.jacobian, guess, doubtful)
+            search,
+            windows,
+            state,
+            _Optimum(theta, starts, noise, moments, linearisation.jacobian, guess, doubtful, reason),
         )
     return _next(windows, state) if not (state["polls"] or state["long"]) and known(state) else state
 
@@ -315,6 +318,7 @@ class _Optimum:
     jacobian: FloatArray
     guess: float
     doubtful: bool
+    reason: str
 
 
 def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
@@ -356,14 +360,21 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
     theta, found, white = optimum.theta, _summary(search, windows, optimum), optimum.noise
     searched = Noise(white.sd, np.zeros(len(white.sd))) if _sandwiches(windows) else white
     around = _around(search, windows, theta, searched, found["covariance"])
+    reason = optimum.reason
     if around is not None:
         found["covariance"] = around.covariance
         if around.rough:
-            search.doubt(
+            reason = (
                 "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse than its nearest "
                 "neighbours, and the search may have missed a better place; compare with npe or bayessim"
             )
-    elif state["polls"]:  # the budget ends: at least as wide as the optimum before, which this one betters
+    elif not windows.num_start:
+        reason = reason or (
+            "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow"
+        )
+    if (
+        around is None and state["polls"]
+    ):  # the budget ends: at least as wide as the optimum before, which this one betters
         found["covariance"] = found["covariance"] + state["mode_covariance"][-1]
     found["guessed"] = np.array(optimum.doubtful or (around is not None and around.rough))
     if found["guessed"]:
@@ -373,7 +384,7 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
         return {**state, "theta": further, "centred": True, "moved": True, **_AFRESH}
     before = len(state["mode_evidence"]) - (state["polls"] > 0 or state["long"])  # one that a poll has bettered is none
     modes = {f"mode_{k}": np.concatenate([state[f"mode_{k}"][:before], v[None]]) for k, v in found.items()}
-    state, polls = {**state, **modes}, state["polls"]
+    state, polls = {**state, **modes, "mode_reason": [*state["mode_reason"][:before], reason]}, state["polls"]
     if not state["long"] and windows.least_steps(theta).any():
         return {**state, "long": True, "moved": True, "iteration": 0, **_AFRESH}
     if around is not None and around.other is not None and len(state["points"]) < _MOST_POINTS:
@@ -390,9 +401,6 @@ def _around(search: Search, windows: Windows, theta: FloatArray, noise: Noise, c
     if windows.num_start:
         return None
     if windows.rollouts + cost(len(theta)) * len(windows.trajectories) >= windows.budget:
-        search.warn(
-            "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow"
-        )
         return None
     starts, prior = windows.no_starts(), search.quadratic_prior
 
