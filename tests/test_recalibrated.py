@@ -146,6 +146,22 @@ def test_a_point_gets_a_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
     assert recalibrated.rollouts == 600 + 200  # trained once; conditioning costs a simulation
 
 
+@pytest.mark.parametrize(("amortised", "doubts"), [(True, 1), (False, 0)])
+def test_what_an_amortised_estimator_doubts_of_the_log_stays_in_doubt(amortised: bool, doubts: int) -> None:
+    """Not what it says of replicas; one that is fitted anew doubts its widths, which are mended."""
+
+    class Doubting(Planted):
+        def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+            self.doubt(f"unlike {trajectories.observations[0, 1].tolist()}")
+            return super().posterior(state, trajectories)
+
+    recalibrated = Recalibrated(Doubting(amortised=amortised), refits=20)
+    for _ in range(2):
+        recalibrated.fit(OBSERVED)
+        assert len(recalibrated.doubts) == doubts
+        assert sum("unlike" in said for said in recalibrated.warnings) == 1
+
+
 def test_a_point_that_the_start_moves_more_than_theta_does() -> None:
     """Four logs of a falling pole with 5 % noise, starts not recorded: were the starts taken for known, as they are estimated, some 40 %
     of the 12 intervals would hold the truth. A right one fails once in two hundred, were the intervals, of 90 %, independent."""

@@ -113,6 +113,7 @@ class Recalibrated(Estimator):
         self._fitted: tuple[Trajectories, Estimator, Posterior] | None = None
         self._replicas: tuple[Trajectories, Replicas] | None = None
         self._proposals: tuple[tuple[bytes, bytes], FloatArray] | None = None
+        self._said: tuple[list[str], list[str]] = [], []  # warnings and doubts of its fit
         self._seconds: float | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -236,25 +237,26 @@ class Recalibrated(Estimator):
 
     def _base(self, trajectories: Trajectories) -> tuple[Estimator, Posterior]:
         """The estimator fitted to the log itself, and what it found; after an interruption from its own checkpoint."""
-        if self._fitted is None and self.estimator.amortised and (self.estimator._state or {}).get("done"):
-            trained = fresh(self.estimator)
-            self._fitted = (trajectories, trained, trained.get_parameter_estimate(trajectories))
         if self._fitted is None or self._fitted[0] is not trajectories:
             base = fresh(self.estimator)
-            base.progress = self.progress
-            own = self.estimator.checkpoint
-            if own is None and self.checkpoint is not None:
-                own = self.checkpoint.with_name(f"{self.checkpoint.stem}-{base.name}{self.checkpoint.suffix}")
-            base.checkpoint = own
-            found = base.fit(trajectories)
-            self._fitted = (trajectories, base, found)
-        _, base, found = self._fitted
-        for said in base.warnings:  # an amortised one doubts the log, others their own widths, which are mended here
-            if base.amortised and said in base.doubts:
-                self.doubt(said)
+            if base.amortised and (base._state or {}).get("done"):
+                found = base.get_parameter_estimate(trajectories)
             else:
-                self.warn(said)
-        return base, found
+                base.progress = self.progress
+                own = self.estimator.checkpoint
+                if own is None and self.checkpoint is not None:
+                    own = self.checkpoint.with_name(f"{self.checkpoint.stem}-{base.name}{self.checkpoint.suffix}")
+                base.checkpoint = own
+                found = base.fit(trajectories)
+            self._fitted = (trajectories, base, found)
+            # before it sees replicas; one that is not amortised doubts its widths, which are mended here
+            self._said = list(base.warnings), base.doubts if base.amortised else []
+        for sentence in self._said[0]:
+            if sentence in self._said[1]:
+                self.doubt(sentence)
+            else:
+                self.warn(sentence)
+        return self._fitted[1:]
 
     def _estimate(self, base: Estimator, replica: Trajectories) -> FloatArray | None:
         """Mean (N,) of the estimator's posterior of a replica; None where it finds none."""

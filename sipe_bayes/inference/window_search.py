@@ -374,7 +374,7 @@ def _finish(search: Search, windows: Windows, state: State, optimum: _Optimum) -
         )
     if (
         around is None and state["polls"]
-    ):  # the budget ends: at least as wide as the optimum before, which this one betters
+    ):  # the budget ends: no narrower than the optimum before, which this one betters
         found["covariance"] = found["covariance"] + state["mode_covariance"][-1]
     found["guessed"] = np.array(optimum.doubtful or (around is not None and around.rough))
     if found["guessed"]:
