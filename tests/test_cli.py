@@ -22,6 +22,7 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli import app, main
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.randomization import Randomization, load_randomization
 
@@ -496,6 +497,14 @@ def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame
     found = strict_json((tmp_path / "out" / "result.json").read_text())
     assert any("spread of cem is that of its search" in said for said in found["doubts"])
     assert set(found["doubts"]) <= set(found["warnings"])
+
+
+def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
+    outside = OutsidePrior(0.01, "log", "angle", 1.0)
+    monkeypatch.setattr("sipe_bayes.calibration.outside_prior", lambda *_, **__: [outside])
+    result = call(write_case(tmp_path, log), "--out", tmp_path / "out")
+    assert "within its interval yet: log log is unlike simulations of the prior" in " ".join(result.stdout.split())
+    assert strict_json((tmp_path / "out" / "result.json").read_text())["doubts"] == [outside.text]
 
 
 def test_what_the_model_lacks_is_a_warning(tmp_path: Path, log: pd.DataFrame) -> None:
