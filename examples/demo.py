@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sipe_bayes.calibration import run
-from sipe_bayes.cli import Progress, print_calibration
+from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.calibration.run import run
+from sipe_bayes.cli.progress import Progress, print_calibration
+from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.diagnostics.result import Calibration
-from sipe_bayes.likelihood import Windows
-from sipe_bayes.output import OutputError
-from sipe_bayes.problem import prepare
+from sipe_bayes.likelihood.windows import Windows
 
 CONFIG = Path(__file__).parent / "simple_pendulum" / "calibrate.toml"
 OUT = Path("runs")

@@ -31,7 +31,7 @@ def compiled(spec: Any) -> Any:
 
 
 def edited(path: str, factors: dict[str, float]) -> Any:
-    """MjSpec of ``path`` with the geoms of ``factors`` longer, as sipe_bayes.envs.links says; masses and densities written
+    """MjSpec of ``path`` with the geoms of ``factors`` longer, as sipe_bayes.envs.tasks.links says; masses and densities written
     out, so that nothing is scaled to a total mass."""
     spec, model = read(path), compiled(read(path))
     plain = read(path)

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
 
 CENTRE = np.array([0.45, 0.6, 0.5, 0.4, 0.55])
 SD = 0.08  # of the function's noise

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 
 XML = """
 <mujoco>

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes.inference import gaussian_search, get_estimator
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.search import gaussian_search
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import log, pendulum
 
 VALUES = [0.45, 0.16]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.models.gaussian_process import GaussianProcess
-from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior import IndependentPrior, SurrogatePosterior
 
 

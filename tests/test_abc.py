@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes.inference.abc import ABC
-from sipe_bayes.likelihood import Segments
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.amortised.abc import ABC
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.posterior import Particles, load_posterior
-from sipe_bayes.trajectory import Trajectories
 from tests.pendulums import log, pendulum
 from tests.test_npe import exact, linear, seen
 

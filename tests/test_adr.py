@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.adr import ADR, centred_ranks, policy_gradients, stein_direction
+from sipe_bayes.inference.search.adr import ADR, centred_ranks, policy_gradients, stein_direction
 from tests.searches import (
     check_contract,
     check_divergence,

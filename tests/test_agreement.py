@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimate, compare_logs, disagreement
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.parameters import Parameter, ParameterSpace
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.likelihood.settings import Segments
 from tests.pendulums import log, pendulum
 
 SEEDS = range(12)

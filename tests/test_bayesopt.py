@@ -13,13 +13,13 @@ import pytest
 import scipy.stats
 import torch
 
-from sipe_bayes.inference import bayesopt
-from sipe_bayes.inference.bayesopt import BayesOpt, independent_residuals, log_improvement
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.inference.search import bayesopt
+from sipe_bayes.inference.search.bayesopt import BayesOpt, independent_residuals, log_improvement
 from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
-from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import SurrogatePosterior, load_posterior, uniform
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import DT, log, pendulum
 from tests.surrogates import bowl, example_surrogate
 

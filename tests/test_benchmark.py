@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from sipe_bayes import atomic
 from sipe_bayes.benchmark import bank, cells, frame, measure, records, run, spent
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import NINE, SUITES, Cell, matches, select, suite
+from sipe_bayes.benchmark.executors.pool import Inline
 from sipe_bayes.benchmark.log import recorded
-from sipe_bayes.benchmark.pool import Inline
 from sipe_bayes.benchmark.records import Record, load_all, posterior_path, record_path
 from sipe_bayes.benchmark.report_contents import contents
 from sipe_bayes.benchmark.status import lines, summary
-from sipe_bayes.cli import app
-from sipe_bayes.inference.prior_sampling import PriorSampling
+from sipe_bayes.cli.app import app
+from sipe_bayes.core import files
+from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
 
 SMALL = ["--suite", "all", "--budget", "60", "--steps", "20"]
@@ -247,7 +247,7 @@ def test_status_finds_cells_that_do_not_compare(undisturbed: Path, tmp_path: Pat
 def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
     """SIGKILL at random moments: after its plan is there, when it simulates, and after the first and the third record."""
     out, rng = tmp_path / "out", random.Random(6)
-    command = [sys.executable, "-m", "sipe_bayes.cli", "benchmark", "run", *SMALL, *PENDULUM, "--out", str(out)]
+    command = [sys.executable, "-m", "sipe_bayes.cli.app", "benchmark", "run", *SMALL, *PENDULUM, "--out", str(out)]
     seen: dict[Path, int] = {}
     for least in (0, 1, 3):
         process = subprocess.Popen([*command, "--jobs", "1"], stdout=subprocess.DEVNULL)
@@ -463,7 +463,7 @@ def test_full_disk_loses_nothing(
     room_for: int, kept: int, monkeypatch: pytest.MonkeyPatch, undisturbed: Path, tmp_path: Path
 ) -> None:
     """After some files, plan and times among them, there is no room: what is there is whole, and the same command goes on."""
-    room, replacing = [room_for], atomic.replacing
+    room, replacing = [room_for], files.replacing
 
     @contextmanager
     def full(path: Path) -> Iterator[Path]:
@@ -473,11 +473,11 @@ def test_full_disk_loses_nothing(
             if room[0] < 0:
                 raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(atomic, "replacing", full)
+    monkeypatch.setattr(files, "replacing", full)
     refused(measured(tmp_path, *PENDULUM), "no space left", "free some space")
     assert len(list(tmp_path.glob("records/P*.json"))) == kept
     assert not list(tmp_path.rglob(".*.[a-z]*"))  # no half-written file
-    monkeypatch.setattr(atomic, "replacing", replacing)
+    monkeypatch.setattr(files, "replacing", replacing)
     assert measured(tmp_path, *PENDULUM).exit_code == 0
     assert what_counts(tmp_path) == what_counts(undisturbed)
 
@@ -503,7 +503,7 @@ def test_shards_merge_resume_and_verify(tmp_path: Path) -> None:
     assert bank.place(PENDULUM_BANK, tmp_path / "a") == bank.known_place(PENDULUM_BANK, tmp_path / "a")
     assert [u.arguments["blocks"] for u in units] == [[(4, 50), (5, 50), (6, 50), (7, 50)], [(8, 30)]]
     for name, data in [*units[0]().files, *units[1]().files]:  # made elsewhere
-        atomic.write_bytes(tmp_path / "b" / name, data)
+        files.write_bytes(tmp_path / "b" / name, data)
     (made,) = (tmp_path / "b" / bank.FOLDER).iterdir()
     for path in made.iterdir():
         (tmp_path / "a" / bank.FOLDER / made.name / path.name).write_bytes(path.read_bytes())

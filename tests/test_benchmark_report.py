@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 import sipe_bayes as sipe
 from sipe_bayes.benchmark import figures, findings, report_contents, report_html, report_latex, spent, tables
 from sipe_bayes.benchmark.cells import suite
-from sipe_bayes.benchmark.commands import report
 from sipe_bayes.benchmark.records import Record, RecordError, plan
+from sipe_bayes.cli.benchmark import report
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.posterior import Dirac, Posterior, prior
 

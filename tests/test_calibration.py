@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes.diagnostics.calibration import (
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.diagnostics.coverage import (
     LEVELS,
     CalibrationCheck,
     _mass,
@@ -22,7 +23,6 @@ from sipe_bayes.diagnostics.calibration import (
     uniformity,
 )
 from sipe_bayes.models.sbi_tools import import_sbi
-from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior
 
 SPACE = ParameterSpace([Parameter("mass", 1.0, 2.0, unit="kg"), Parameter("damping", 0.1, 1.0)])

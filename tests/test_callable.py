@@ -12,11 +12,12 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import ESTIMATORS
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.inference.window_search import screen
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.window_search import screen
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
 from tests.quick import SMALL
 
 SPACE = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=2.0), sipe.Parameter("b", low=-1.0, high=1.0)])
@@ -92,8 +93,10 @@ def test_outputs_as_small_as_rounding_are_named() -> None:
 
 def test_an_output_that_never_varies_is_left_out_and_all_invalid_is_no_scale() -> None:
     simulator = sipe.CallableSimulator(lambda v: np.column_stack([v[:, 0], np.full(len(v), 7.0), 0 * v[:, 0]]), SPACE)
-    windows = sipe.Segments(None, starts="recorded").bind(
-        simulator, sipe.Trajectories.stack(simulator.trajectory([1.0, 7.0, 0.0]))
+    windows = bind(
+        sipe.Segments(None, starts="recorded"),
+        simulator,
+        sipe.Trajectories.stack(simulator.trajectory([1.0, 7.0, 0.0])),
     )
     first = simulate(windows, np.random.default_rng(0).random((50, 2)))
     scale = channel_scale(windows, first)

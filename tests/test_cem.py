@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.cem import CEM, elite_moments
+from sipe_bayes.inference.search.cem import CEM, elite_moments
 from tests.searches import (
     check_contract,
     check_divergence,

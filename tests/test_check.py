@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sipe_bayes.cli import app
-from sipe_bayes.diagnostics import check as checks
-from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.calibration import check as checks
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.registry import ESTIMATORS
-from sipe_bayes.inference.state import State
+from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories
 
 MODEL = """
 <mujoco><option timestep="0.02" gravity="0 0 0" integrator="Euler"/>
@@ -136,7 +136,7 @@ def test_an_interrupted_check_goes_on(config: Path, tmp_path: Path, monkeypatch:
 def test_an_amortised_estimator_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A task, its method trained once and conditioned on every log."""
     trained: list[int] = []
-    from sipe_bayes.inference.abc import ABC
+    from sipe_bayes.inference.amortised.abc import ABC
 
     train = ABC.train
     monkeypatch.setattr(ABC, "train", lambda self, *given: (trained.append(1), train(self, *given))[1])

@@ -21,7 +21,7 @@ from safetensors import safe_open
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli import app, main
+from sipe_bayes.cli.app import app, main
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.randomization import Randomization, load_randomization
@@ -313,7 +313,7 @@ def test_wrong_input_of_the_installed_command(tmp_path: Path, log: pd.DataFrame)
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "sipe_bayes.cli", "calibrate", *map(str, arguments)]
+    return [sys.executable, "-m", "sipe_bayes.cli.app", "calibrate", *map(str, arguments)]
 
 
 def environment() -> dict[str, str]:
@@ -370,7 +370,7 @@ def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
 
 
 def test_numbers_that_are_not_finite_are_null() -> None:
-    from sipe_bayes.output import to_json
+    from sipe_bayes.core.files import to_json
 
     assert strict_json(to_json({"a": float("nan"), "b": [1.0, float("inf")]})) == {"a": None, "b": [1.0, None]}
 
@@ -501,7 +501,7 @@ def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame
 
 def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     outside = OutsidePrior(0.01, "log", "angle", 1.0)
-    monkeypatch.setattr("sipe_bayes.calibration.outside_prior", lambda *_, **__: [outside])
+    monkeypatch.setattr("sipe_bayes.calibration.run.outside_prior", lambda *_, **__: [outside])
     result = call(write_case(tmp_path, log), "--out", tmp_path / "out")
     assert "within its interval yet: log log is unlike simulations of the prior" in " ".join(result.stdout.split())
     assert strict_json((tmp_path / "out" / "result.json").read_text())["doubts"] == [outside.text]
@@ -526,7 +526,7 @@ def test_a_check_that_fails_is_one_warning(
     def fail(*_: Any, **__: Any) -> Any:
         raise ValueError("the simulation diverges")
 
-    monkeypatch.setattr(f"sipe_bayes.calibration.{part}", fail)
+    monkeypatch.setattr(f"sipe_bayes.calibration.run.{part}", fail)
     found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
     assert [w.endswith("is unknown: the simulation diverges") for w in found["warnings"]] == [True]
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sipe_bayes.config import (
+from sipe_bayes.calibration.config import (
     Config,
     ConfigError,
     MeasurementTarget,
@@ -19,7 +19,7 @@ from sipe_bayes.config import (
     load_config,
     parse_measurement_target,
 )
-from sipe_bayes.units import UNITS, convert, find_unit, to_si
+from sipe_bayes.core.units import UNITS, convert, find_unit, to_si
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

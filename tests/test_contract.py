@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
+from sipe_bayes.core.checkpoint import CheckpointError
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference import ESTIMATORS, get_estimator
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.registry import estimator_class
-from sipe_bayes.inference.state import CheckpointError
-from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import IndependentPrior, Posterior, load_posterior, uniform
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import log, pendulum
 from tests.quick import FORM
 

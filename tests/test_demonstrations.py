@@ -15,16 +15,16 @@ import pytest
 from rich.console import Console
 
 import sipe_bayes as sipe
-from sipe_bayes import demonstration
-from sipe_bayes.acting import smooth_actions
-from sipe_bayes.demonstration import Given
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.datasets import demonstrations as demonstration
+from sipe_bayes.datasets.acting import smooth_actions
+from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.envs.registry import TASKS
 from sipe_bayes.envs.task import Task
 from sipe_bayes.inference import get_estimator
+from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import Dirac
-from sipe_bayes.rl.policy import Policy
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import log, pendulum
 
 SNIPPET = Path(__file__).parents[1] / "examples" / "paper_snippet.py"

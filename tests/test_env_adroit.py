@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.envs.adroit import Adroit, door, relocate
 from sipe_bayes.envs.task import Transition
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.envs.tasks.adroit import Adroit, door, relocate
+from sipe_bayes.simulation.simulator import Simulator
 
 STEPS = 100
 NO_WARMSTART = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)

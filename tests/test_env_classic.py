@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.envs.classic import CART_POLE, PENDULUM, rod_length
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.envs.task import Task, Transition
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.envs.tasks.classic import CART_POLE, PENDULUM, rod_length
+from sipe_bayes.simulation.simulator import Simulator
 from tests.lengthened import compiled, differences, read
 
 TASKS = {"Pendulum": ("rod", "hinge", PENDULUM), "CartPole": ("pole", "slider", CART_POLE)}

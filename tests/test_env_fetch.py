@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sipe_bayes.envs.fetch import _euler
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.envs.tasks.fetch import _euler
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 
@@ -116,7 +117,7 @@ def test_states_tell_the_controllers_memory(simulator: Simulator) -> None:
     environment looks there before it has moved."""
     start, goals, actions = drive(simulator, 12, lanes=1)
     (motion,) = simulator.rollout([[0.3, 0.7]], actions, start, goals=goals)
-    chain = StateSpace(starts="recorded").bind(simulator, Trajectories.stack(motion))
+    chain = bind(StateSpace(starts="recorded"), simulator, Trajectories.stack(motion))
     states, physics = motion.states, simulator.engine.physics_size
     assert states is not None
     forgotten = states.copy()

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.envs.half_cheetah import HalfCheetah, gymnasium_asset
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.envs.tasks.half_cheetah import HalfCheetah, gymnasium_asset
+from sipe_bayes.simulation.simulator import Simulator
 from tests.lengthened import compiled, differences, edited, read
 
 TASKS = ("HalfCheetahLinks", "HalfCheetahJoints", "HalfCheetahAllJoints")

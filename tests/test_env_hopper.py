@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.envs.half_cheetah import gymnasium_asset
-from sipe_bayes.envs.hopper import Hopper
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Transition
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.envs.tasks.half_cheetah import gymnasium_asset
+from sipe_bayes.envs.tasks.hopper import Hopper
+from sipe_bayes.simulation.simulator import Simulator
 from tests.lengthened import compiled, differences, edited
 
 XML = str(gymnasium_asset("hopper.xml"))

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sipe_bayes.envs.humanoid import Humanoid, humanoid_file
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.targets import body_frame_inertia
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.envs.tasks.humanoid import Humanoid, humanoid_file
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.envs.half_cheetah import gymnasium_asset
-from sipe_bayes.envs.links import Links
 from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.tasks.half_cheetah import gymnasium_asset
+from sipe_bayes.envs.tasks.links import Links
 from tests.lengthened import compiled, differences, edited, read
 
 ARM = """

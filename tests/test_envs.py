@@ -17,13 +17,13 @@ from gymnasium.utils.env_checker import check_env
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli import app
+from sipe_bayes.cli.app import app
 from sipe_bayes.diagnostics import catalogue
 from sipe_bayes.diagnostics.sensitivity import sensitivity
-from sipe_bayes.envs.fetch import Fetch
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Task
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.envs.tasks.fetch import Fetch
+from sipe_bayes.simulation.simulator import Simulator
 
 gymnasium.register_envs(sipe.gym)  # another test may have imported sipe_bayes before gymnasium
 STEPS = 12

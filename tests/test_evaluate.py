@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import _jackknifed, channel_scores, compare_errors, errors
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood import Segments, Windows
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import XML, log, pendulum
 
 

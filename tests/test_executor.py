@@ -11,9 +11,9 @@ import pytest
 
 from sipe_bayes.benchmark import measure, run
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.pool import Inline, Pool
+from sipe_bayes.benchmark.executors.pool import Inline, Pool
+from sipe_bayes.benchmark.executors.work import Done, Unit
 from sipe_bayes.benchmark.records import Record, load_all
-from sipe_bayes.benchmark.work import Done, Unit
 from tests.test_benchmark import what_counts
 from tests.workers import gave_up, told
 
@@ -58,7 +58,7 @@ def test_ray_cluster_loses_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
-    from sipe_bayes.benchmark.ray_executor import RayExecutor
+    from sipe_bayes.benchmark.executors.ray_executor import RayExecutor
 
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     out = tmp_path / "ray"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.diagnostics.expected import Plan, contraction, expect, informations
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.noise import Noise
-from sipe_bayes.parameters import Parameter
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, prior
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import DT, log, pendulum
 
 CART = """

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 import sipe_bayes as sipe
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.task import Solved, Task, Transition, scaled
-from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.trainer import Trainer

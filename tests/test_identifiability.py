@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.parameters import Parameter, ParameterSpace
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import Segments
 from tests.pendulums import log, pendulum
 
 SPACE = ParameterSpace([Parameter("mass", 0.1, 2.0), Parameter("length", 0.1, 2.0), Parameter("other", -1.0, 1.0)])
@@ -107,7 +108,7 @@ def test_dead_parameters_and_ranges_are_found() -> None:
         Parameter("wind", 0.0, 5.0, targets=("option.wind_x",)),
     )
     trajectory = log(simulator, [0.6, 0.05, 0.0, 0.0], 1)
-    windows = Segments(0.5).bind(simulator, Trajectories.stack(trajectory))
+    windows = bind(Segments(0.5), simulator, Trajectories.stack(trajectory))
     dead = dead_ranges(windows, np.array([0.4, 0.3, 0.5, 0.5]))
     assert dead == {"wind": [(0.0, 1.0)]}
 

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.inference import importance
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import default_prior
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.inference.window_target import WindowTarget, at_optimum
+from sipe_bayes.inference.laplace import importance
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.window_target import WindowTarget, at_optimum
+from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.posterior import GaussianMixture
-from sipe_bayes.trajectory import Trajectories
 from tests.pendulums import log as pendulum_log
 from tests.pendulums import pendulum
 
@@ -152,7 +153,7 @@ def test_unknown_noise_of_a_log_is_integrated_out() -> None:
     np.testing.assert_allclose(found.T, wanted, atol=0.08)
     assert estimator._state is not None
     mode = {k[5:]: v[0] for k, v in estimator._state.items() if k.startswith("mode_")}
-    windows = likelihood.bind(simulator, Trajectories.stack([log]))
+    windows = bind(likelihood, simulator, Trajectories.stack([log]))
     values = WindowTarget(estimator.prior, windows, at_optimum(windows, mode))(points)
     expected = -0.5 * len(log) * np.log(squares).sum(1)
     np.testing.assert_allclose(values - values.max(), expected - expected.max(), atol=5e-3)

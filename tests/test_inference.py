@@ -9,11 +9,12 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import BudgetTooSmall, Segments
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import coloured, log, pendulum
 
 CART = """
@@ -144,9 +145,9 @@ def test_wrong_input() -> None:
         ),
         (lambda: Segments(0.0), ValueError, "seconds above zero"),
         (lambda: Segments(noise="pink"), ValueError, "expected 'ar1'"),
-        (lambda: Segments(5.0).bind(simulator, Trajectories.stack(trajectory)), ValueError, "shorter than one window"),
+        (lambda: bind(Segments(5.0), simulator, Trajectories.stack(trajectory)), ValueError, "shorter than one window"),
         (
-            lambda: Segments(0.5, fit=("speed",)).bind(simulator, Trajectories.stack(trajectory)),
+            lambda: bind(Segments(0.5, fit=("speed",)), simulator, Trajectories.stack(trajectory)),
             ValueError,
             "unknown channels",
         ),

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.inference import known_start_search
-from sipe_bayes.inference.growing_horizon import grown
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace import known_start_search
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.growing_horizon import grown
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.simulation.simulator import Simulator
 
 KNOWN = StateSpace(starts="recorded")
 

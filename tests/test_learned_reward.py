@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes.discrepancy import simulate
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.state import load_state, save_state
-from sipe_bayes.learned_reward import LearnedReward
-from sipe_bayes.likelihood import Segments, Windows
+from sipe_bayes.inference.search.learned_reward import LearnedReward
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.discrepancy import simulate
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.models.discriminator import Discriminator, Training
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import XML, log, pendulum
 
 TRUTH = np.array([[0.3, 0.6]])
@@ -30,13 +32,13 @@ def whole_state(seeds: Iterable[int] = (3,)) -> Windows:
     simulator = Simulator(environment, num_threads=1)
     values = simulator.space.values(TRUTH)[0].tolist()
     logs = [log(simulator, values, seed, str(seed), steps=400, sd=0.0) for seed in seeds]
-    return Segments(noise_sd=(0.0, 0.0)).bind(simulator, Trajectories.stack(logs))
+    return bind(Segments(noise_sd=(0.0, 0.0)), simulator, Trajectories.stack(logs))
 
 
 def windows(sd: float = 0.0, likelihood: Segments | None = None) -> Windows:
     simulator = pendulum()
     trajectory = log(simulator, simulator.space.values(TRUTH)[0].tolist(), 3, steps=400, sd=sd)
-    return (likelihood or Segments(noise_sd=(sd,))).bind(simulator, Trajectories.stack(trajectory))
+    return bind(likelihood or Segments(noise_sd=(sd,)), simulator, Trajectories.stack(trajectory))
 
 
 def trained(reward: LearnedReward, features: np.ndarray, rounds: int) -> dict:
@@ -149,6 +151,6 @@ def test_a_log_without_whole_steps_says_so() -> None:
     simulator = pendulum()
     trajectory = log(simulator, [0.6, 0.1], 3, steps=100)
     trajectory.observations[1::2] = np.nan
-    bound = Segments().bind(simulator, Trajectories.stack(trajectory))
+    bound = bind(Segments(), simulator, Trajectories.stack(trajectory))
     with pytest.raises(ValueError, match="state_difference"):
         LearnedReward(bound)

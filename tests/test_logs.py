@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sipe_bayes.config import Config, ConfigError, load_config
-from sipe_bayes.logs import LogReport, count_clipped, load_log
-from sipe_bayes.tables import LogError, read_table
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.calibration.config import Config, ConfigError, load_config
+from sipe_bayes.calibration.logs import LogReport, count_clipped, load_log
+from sipe_bayes.calibration.tables import LogError, read_table
+from sipe_bayes.core.trajectory import Trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

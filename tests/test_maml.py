@@ -7,12 +7,12 @@ import torch
 from torch.func import functional_call
 
 import sipe_bayes as sipe
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.maml import MAML
-from sipe_bayes.inference.prior_sampling import recorded_steps
+from sipe_bayes.inference.amortised.maml import MAML
+from sipe_bayes.inference.amortised.prior_sampling import recorded_steps
 from sipe_bayes.models.training import restore
 from sipe_bayes.models.transitions import control_steps
-from sipe_bayes.trajectory import Trajectories
 from tests.pendulums import log, pendulum
 from tests.quick import FORM
 from tests.test_regression import MATRIX, SPACE

@@ -8,19 +8,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misspecification import Misfit, _Residuals, misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.least_squares import QuadraticPrior
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.noise import Moments, Noise
-from sipe_bayes.parameters import Parameter
+from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Moments, Noise
+from sipe_bayes.likelihood.replicas import Replicas
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, prior
-from sipe_bayes.replicas import Replicas
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import XML, log, pendulum
 
 FRICTION = Parameter("coulomb", 0.0, 0.1, targets=("joint:hinge.frictionloss",))
@@ -32,7 +33,7 @@ def found(recorded: Trajectory, seed: int = 0) -> Misfit:
     simulator = pendulum()
     method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
     posterior = method.fit(recorded)
-    windows = method.likelihood.bind(simulator, Trajectories.stack(recorded))
+    windows = bind(method.likelihood, simulator, Trajectories.stack(recorded))
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
     return misfit(windows, posterior.mode.numpy(), noise, seed=seed, simulated=39)
 
@@ -98,7 +99,7 @@ def residuals(rho: float) -> _Residuals:
     gap = one.observations.copy()
     gap[60:63] = np.nan
     logs = Trajectories.stack([Trajectory(gap, one.actions, one.dt, name="one", channels=one.channels), two])
-    windows = Segments(0.5).bind(simulator, logs)
+    windows = bind(Segments(0.5), simulator, logs)
     theta = simulator.space.normalise(np.array([0.6, 0.08]))
     noise = Noise(np.array([0.01]), np.array([0.0 if rho == 0 else -0.01 / np.log(rho)]))
     flat = QuadraticPrior(theta, np.zeros((2, 2)))
@@ -162,7 +163,7 @@ def of_mass_and_damping(recorded: Trajectory, high: float = 1.0, believed: float
         simulator, "laplace", likelihood=Segments(0.5, noise="white"), restarts=1, candidates=0, prior=belief
     )
     posterior = method.fit(recorded)
-    windows = method.likelihood.bind(simulator, Trajectories.stack(recorded))
+    windows = bind(method.likelihood, simulator, Trajectories.stack(recorded))
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
     print(posterior.mode, noise)
     return misfit(windows, posterior.mode.numpy(), noise, prior=QuadraticPrior.of(method.prior), simulated=39)
@@ -208,7 +209,7 @@ def test_a_burst_of_noise_is_placed_in_time() -> None:
 
 def outside(*logs: Trajectory) -> list[OutsidePrior]:
     simulator = pendulum()
-    windows = get_estimator(simulator, "laplace").likelihood.bind(simulator, Trajectories.stack(list(logs)))
+    windows = bind(get_estimator(simulator, "laplace").likelihood, simulator, Trajectories.stack(list(logs)))
     return outside_prior(windows, prior(simulator.space), Noise(np.array([0.01]), np.zeros(1)))
 
 

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 XML = """<mujoco><worldbody>
   <body name="rod"><joint name="hinge" axis="0 1 0" damping="0.1"/>

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sipe_bayes.marginal import marginal
-from sipe_bayes.noise import (
+from sipe_bayes.likelihood.marginal import marginal
+from sipe_bayes.likelihood.noise import (
     Moments,
     Noise,
     Pulls,
@@ -25,7 +25,7 @@ from sipe_bayes.noise import (
     restricted_slopes,
     whiten,
 )
-from sipe_bayes.sequences import sequences
+from sipe_bayes.likelihood.sequences import sequences
 
 N, D = 3, 2
 SIGMAS = 5.0

@@ -12,13 +12,13 @@ import torch
 from scipy import stats
 
 import sipe_bayes as sipe
-from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.inference.npe import NPE
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.amortised.npe import NPE
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import Flow, IndependentPrior, load_posterior
 from sipe_bayes.posterior.flow import spline_flow, to_cube, to_line
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from tests import quick
 from tests.pendulums import log, pendulum
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import sipe_bayes
-from sipe_bayes.config import (
+from sipe_bayes.calibration.config import (
     Columns,
     Command,
     Config,
@@ -29,10 +29,10 @@ from sipe_bayes.config import (
     Table,
     TimeColumn,
 )
+from sipe_bayes.core.units import UNITS
 from sipe_bayes.diagnostics.catalogue import tasks
 from sipe_bayes.envs.targets import _ATTRIBUTES
 from sipe_bayes.inference import ESTIMATORS, estimator_class
-from sipe_bayes.units import UNITS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sipe_bayes"
@@ -71,9 +71,9 @@ def alone(blocks):
     "code",
     [
         "import sipe_bayes as sipe; dir(sipe)",
-        "import sys; from sipe_bayes.cli import main; sys.argv = ['sipe', '--help']\n"
+        "import sys; from sipe_bayes.cli.app import main; sys.argv = ['sipe', '--help']\n"
         "try: main()\nexcept SystemExit: pass",
-        "import sys; from sipe_bayes.cli import main; sys.argv = ['sipe', 'calibrate', '--help']\n"
+        "import sys; from sipe_bayes.cli.app import main; sys.argv = ['sipe', 'calibrate', '--help']\n"
         "try: main()\nexcept SystemExit: pass",
     ],
     ids=["import", "help", "calibrate help"],
@@ -148,7 +148,10 @@ def test_version_is_the_project_s() -> None:
     assert project["version"] == sipe_bayes.__version__
 
 
-ORDERS = ("import gymnasium, sipe_bayes", "import sipe_bayes, gymnasium; gymnasium.register_envs(sipe_bayes.gym)")
+ORDERS = (
+    "import gymnasium, sipe_bayes",
+    "import sipe_bayes, gymnasium; gymnasium.register_envs(sipe_bayes.simulation.gym)",
+)
 
 
 @pytest.mark.parametrize("imports", ORDERS)

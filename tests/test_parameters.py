@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sipe_bayes.parameters import Parameter, ParameterSpace
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 
 moderate = st.floats(-1e6, 1e6, allow_nan=False)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.envs.adroit import Adroit
+from sipe_bayes.envs.tasks.adroit import Adroit
 from sipe_bayes.rl import planning
 from sipe_bayes.rl.planning import OUTLINES, Plan, Search, Synergies, plan
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 TASKS = tuple(OUTLINES)
 

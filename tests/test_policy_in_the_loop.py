@@ -13,16 +13,16 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.core.checkpoint import CheckpointError
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.task import Solved, Task
 from sipe_bayes.inference import ESTIMATORS
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.state import CheckpointError
 from sipe_bayes.posterior import Dirac
 from sipe_bayes.rl.loop_run import LoopRun, Plan, solves
 from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, LoopResult, train_in_the_loop
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 from tests.quick import FORM
 from tests.test_rl import contents
 

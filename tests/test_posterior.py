@@ -18,7 +18,7 @@ import torch
 from scipy import stats
 from scipy.special import log_ndtr
 
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import (
     FAMILIES,
     Dirac,

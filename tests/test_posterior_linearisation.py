@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.posterior_linearisation import linearise
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import Chain, StateSpace
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace.posterior_linearisation import linearise
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.simulation.simulator import Simulator
 
 STEP = 0.01
 
@@ -26,7 +28,7 @@ def sliding(spring: float = 10.0, limited: str = "false") -> Chain:
     parameters = [Parameter("stiffness", 0, 40, targets=("joint:x.stiffness",))]
     simulator = Simulator(sipe.MjcfEnvironment.build(xml, parameters, ["m"], ["joint:x.position"]), num_threads=1)
     log = Trajectory(np.array([[0.0], [0.1], [0.1]]), np.zeros((2, 1)), STEP)
-    return StateSpace().bind(simulator, Trajectories.stack([log]))
+    return bind(StateSpace(), simulator, Trajectories.stack([log]))
 
 
 def states(positions: list[float]) -> np.ndarray:

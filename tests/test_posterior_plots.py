@@ -10,11 +10,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import sipe_bayes as sipe
-from sipe_bayes.diagnostics import check_plots, posterior_plots
-from sipe_bayes.diagnostics.calibration import check_calibration
-from sipe_bayes.diagnostics.drawing import png
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.diagnostics.coverage import check_calibration
 from sipe_bayes.posterior import Dirac, GaussianMixture, IndependentPrior, Particles, Posterior, uniform
+from sipe_bayes.report import check_plots, posterior_plots
+from sipe_bayes.report.drawing import png
 
 SPACE = ParameterSpace(
     [

@@ -13,9 +13,9 @@ import pandas as pd
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.calibration import run
-from sipe_bayes.config import ConfigError
-from sipe_bayes.diagnostics import report
+from sipe_bayes.calibration.config import ConfigError
+from sipe_bayes.calibration.run import run
+from sipe_bayes.report import page as report
 
 MODEL = """
 <mujoco>

@@ -11,16 +11,16 @@ import torch
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli import app
-from sipe_bayes.output import to_json
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.files import to_json
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.models.policy import load_policy
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, prior, uniform
-from sipe_bayes.rl.policy import load_policy
 from sipe_bayes.rl.randomization import Draws, Randomization, load_randomization
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import train
 from sipe_bayes.rl.trainer import Trainer
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 TASK = sipe.make_task("Pendulum")
 SPACE = TASK.space

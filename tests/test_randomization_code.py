@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.randomization_code import sources, write_randomization
-from sipe_bayes.parameters import Parameter
 
 XML = """
 <mujoco><worldbody>

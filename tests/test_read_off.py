@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import Chain, StateSpace
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.simulation.simulator import Simulator
 
 
 def swing(truth: np.ndarray, seed: int, steps: int = 100, level: float = 0.01) -> tuple[Simulator, Trajectory]:
@@ -32,14 +33,14 @@ def test_an_angle_is_read_off_its_cosine_and_sine() -> None:
     """Within four sds of the noise, all round the circle, without jumps; recorded states are left aside."""
     for seed in range(4):
         simulator, log = swing(np.full(3, 0.5), seed)
-        chain = Chain(StateSpace(), simulator, Trajectories.stack(replace(log, states=None)))
+        chain = bind(StateSpace(), simulator, Trajectories.stack(replace(log, states=None)))
         angle, true = chain.reference[:, 1], np.asarray(log.states)[:, 1]
         turns = np.round((angle - true) / (2 * np.pi))
         np.testing.assert_array_equal(turns, turns[0])
         assert np.abs(angle - true - 2 * np.pi * turns).max() < 4 * 0.01
         assert chain.placed.all()
         assert (chain.rollouts, chain.prepared > 30) == (0, True)
-        given = Chain(StateSpace(), simulator, Trajectories.stack(log))
+        given = bind(StateSpace(), simulator, Trajectories.stack(log))
         np.testing.assert_array_equal(given.reference, chain.reference)
 
 
@@ -65,9 +66,7 @@ def test_an_angle_that_is_not_unique_is_not_read_off(links: int, seen: str, told
     motion = simulator.rollout(np.array([0.5]), actions, start, dt=0.01)
     assert motion.states is not None
     noise = 0.001 * np.random.default_rng(0).standard_normal(motion.observations[0].shape)
-    chain = Chain(
-        StateSpace(), simulator, Trajectories.stack(Trajectory(motion.observations[0] + noise, actions, 0.01))
-    )
+    chain = bind(StateSpace(), simulator, Trajectories.stack(Trajectory(motion.observations[0] + noise, actions, 0.01)))
     assert chain.placed[0] == told
     if told:
         np.testing.assert_allclose(chain.reference[:, 1], motion.states[0, :, 1], atol=0.05)
@@ -81,7 +80,7 @@ def test_what_no_channel_depends_on_stays_where_it_is() -> None:
     task = sipe.make_task("HalfCheetahJoints")
     simulator = Simulator(task, num_threads=1)
     log = replace(sipe.demonstrations(task, count=1, steps=20, seed=0)[0], states=None)
-    chain = Chain(StateSpace(), simulator, Trajectories.stack(log))
+    chain = bind(StateSpace(), simulator, Trajectories.stack(log))
     assert (chain.reference[:, 1] == simulator.default_state()[1]).all()
     assert chain.placed.all()
 

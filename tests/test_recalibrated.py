@@ -14,18 +14,17 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes import acting
-from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.diagnostics.calibration import check_calibration
+from sipe_bayes.core.checkpoint import CheckpointError, State
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets import acting
+from sipe_bayes.diagnostics.coverage import check_calibration
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.recalibrated import Recalibrated
-from sipe_bayes.inference.state import CheckpointError, State
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Posterior
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from tests.pendulums import log, pendulum
 from tests.test_state_space import HIGH, LOW, PROCESS, spring, spring_logs
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.regression import Regression, _Linear
+from sipe_bayes.inference.amortised.regression import Regression, _Linear
 
 SPACE = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=2.0), sipe.Parameter("b", low=-1.0, high=1.0)])
 MATRIX = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, -1.0]])

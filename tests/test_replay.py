@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sipe_bayes.episodes import Step
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.rl.replay import Batch, Replay, ReplayError
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.episodes import Step
 
 G, DISCOUNT = 1, 0.5
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.noise import Noise
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.replicas import Replicas
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.replicas import Replicas
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import XML
 from tests.test_state_space import HIGH, LOW, PROCESS, spring, spring_logs, spring_step
 

@@ -14,21 +14,14 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes import atomic
-from sipe_bayes.diagnostics import plots, report
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.misspecification import Misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
-from sipe_bayes.diagnostics.result import (
-    Calibration,
-    ChannelScore,
-    Comparison,
-    ParameterSummary,
-    Residual,
-    Ridge,
-    Signal,
-)
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Ridge, Signal
+from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, prior
+from sipe_bayes.report import calibration_plots as plots
+from sipe_bayes.report import page as report
 
 BETTER = Comparison(3.1, 2.6, 3.7, 1e-6, 10)
 LACKS = Misfit(
@@ -647,7 +640,7 @@ def test_an_interrupted_write_keeps_the_old_report(
     tmp_path: Path, images: list[report.Picture], monkeypatch: Any
 ) -> None:
     (tmp_path / "report.html").write_text("old")
-    replace = atomic.os.replace
+    replace = files.os.replace
 
     def interrupted(source: Any, target: Any) -> None:
         if Path(target).name == "report.html":
@@ -655,7 +648,7 @@ def test_an_interrupted_write_keeps_the_old_report(
         replace(source, target)
 
     monkeypatch.setattr(report, "pictures", lambda _: images)
-    monkeypatch.setattr(atomic.os, "replace", interrupted)
+    monkeypatch.setattr(files.os, "replace", interrupted)
     with pytest.raises(OSError, match="disk full"):
         report.write_report(make_calibration(), tmp_path)
     assert (tmp_path / "report.html").read_text() == "old"

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sipe_bayes.calibration import calibrate
+from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.calibration.run import calibrate
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
-from sipe_bayes.problem import prepare
 
 FloatArray = NDArray[np.float64]
 

@@ -17,12 +17,12 @@ from torch import nn
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli import app
+from sipe_bayes.cli.app import app
+from sipe_bayes.models.policy import Policy, PolicyError, load_policy
 from sipe_bayes.posterior import prior
 from sipe_bayes.rl.ddpg import Agent
 from sipe_bayes.rl.evaluation import AGENTS, beside, check_agents, evaluate, install, write_card
 from sipe_bayes.rl.normaliser import Normaliser
-from sipe_bayes.rl.policy import Policy, PolicyError, load_policy
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.replay import Batch
 from sipe_bayes.rl.settings import Settings

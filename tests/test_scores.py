@@ -13,9 +13,9 @@ import torch
 from scipy import stats
 from torch.distributions import Distribution
 
+from sipe_bayes.core.files import to_json
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.scores import c2st, crps, energy_score, nats, score
-from sipe_bayes.output import to_json
-from sipe_bayes.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, SurrogatePosterior, prior, uniform
 from tests.surrogates import example_surrogate
 

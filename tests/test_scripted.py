@@ -10,13 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli import app
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.posterior import Dirac, prior
 from sipe_bayes.rl import scripted
 from sipe_bayes.rl.demonstrate import demonstrate, facts_of, record
 from sipe_bayes.rl.randomization import Draws
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 
 
 @pytest.mark.parametrize(("task", "least"), [("FetchPush", 0.7), ("FetchPickAndPlace", 0.9), ("FetchSlide", 0.2)])

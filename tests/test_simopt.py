@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.gaussian_search import draw_in_cube, gaussian_kl, log_normal
-from sipe_bayes.inference.simopt import SimOpt, fitted, reps_temperature, reps_weights
+from sipe_bayes.inference.search.gaussian_search import draw_in_cube, gaussian_kl, log_normal
+from sipe_bayes.inference.search.simopt import SimOpt, fitted, reps_temperature, reps_weights
 from sipe_bayes.posterior import GaussianMixture
 from tests.searches import (
     check_contract,

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import torch
 
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations, describe_invalid
-from sipe_bayes.likelihood import first_states
+from sipe_bayes.likelihood.windows import first_states
 from sipe_bayes.models.mixture_density import MixtureDensity, RandomFourier
 from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.training import Training
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.posterior import GaussianMixture, prior
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import DT, log, pendulum
 from tests.quick import FORM
 

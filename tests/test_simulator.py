@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sipe_bayes.engine import Engine
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.engine import Engine
+from sipe_bayes.simulation.simulator import Simulator
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 HORIZON = 24
@@ -199,7 +199,7 @@ def test_one_step_windows_make_the_whole_horizon(name: str) -> None:
 def test_many_chunks_are_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, theta, actions, starts = draw(CASES["arm"])
     whole = simulator.rollout(theta, actions, starts)
-    monkeypatch.setattr("sipe_bayes.simulator._POOL", 3 * mujoco.mj_sizeModel(simulator.model))
+    monkeypatch.setattr("sipe_bayes.simulation.simulator._POOL", 3 * mujoco.mj_sizeModel(simulator.model))
     small = Simulator(simulator.environment, 1)
     cut = small.rollout(theta, actions, starts)
     np.testing.assert_array_equal(cut.observations, whole.observations)

@@ -16,9 +16,9 @@ from rich.console import Console
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark import cells
-from sipe_bayes.diagnostics import sipe_plot as plot
 from sipe_bayes.diagnostics.scores import crps, score
 from sipe_bayes.posterior import Dirac, prior
+from sipe_bayes.report import sipe_plot as plot
 
 SPACE = sipe.ParameterSpace([sipe.Parameter(f"p{k}", 0.0, 1.0) for k in range(3)])
 TRUTH = np.array([0.2, 0.7, 0.9])

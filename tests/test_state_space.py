@@ -14,21 +14,23 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.core.checkpoint import CheckpointError, load_state, save_state
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.smoother import Point, descend, first_noise, infer_noise, sound
+from sipe_bayes.inference.laplace.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.inference.mcmc import MCMC
-from sipe_bayes.inference.smoother import Point, descend, first_noise, infer_noise, sound
-from sipe_bayes.inference.state import CheckpointError, load_state, save_state
-from sipe_bayes.inference.state_space_target import ChainTarget, at_optimum
-from sipe_bayes.likelihood import START_SD
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import KNOWN_SD, Chain, StateSpace
-from sipe_bayes.trajectory import Trajectories, Trajectory
-from sipe_bayes.tridiagonal import (
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.block_tridiagonal import (
     ChainNoise,
     eliminate,
     log_likelihood,
 )
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.state_space import KNOWN_SD, Chain
+from sipe_bayes.likelihood.windows import START_SD
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import log as pendulum_log
 from tests.pendulums import pendulum
 
@@ -107,7 +109,7 @@ def kalman(
 
 def spring_chain() -> tuple[Chain, list[Trajectory], np.ndarray]:
     logs = spring_logs()
-    chain = StateSpace(noise_sd=(SD,)).bind(spring(), Trajectories.stack(logs))
+    chain = bind(StateSpace(noise_sd=(SD,)), spring(), Trajectories.stack(logs))
     return chain, logs, chain.reference[chain.first][:, 1:3]
 
 
@@ -129,8 +131,8 @@ def test_a_recorded_start_is_believed_and_the_other_states_are_not() -> None:
     for log in logs:
         assert log.states is not None
         log.states[0] = 0.0, 0.3, 0.0
-    chain = StateSpace(noise_sd=(SD,), starts="recorded").bind(spring(), Trajectories.stack(logs))
-    measured = StateSpace(noise_sd=(SD,)).bind(spring(), Trajectories.stack(spring_logs())).reference
+    chain = bind(StateSpace(noise_sd=(SD,), starts="recorded"), spring(), Trajectories.stack(logs))
+    measured = bind(StateSpace(noise_sd=(SD,)), spring(), Trajectories.stack(spring_logs())).reference
     np.testing.assert_array_equal(chain.reference[~chain.first], measured[~chain.first])
     found = chain.linearise(np.array([0.35]), chain.reference)
     assert found is not None
@@ -205,7 +207,7 @@ def test_a_budget_that_ends_early_leaves_a_wide_posterior() -> None:
 
 def test_noise_that_rounding_cannot_bear_is_raised() -> None:
     """The process noise that ``sound`` returns is the least of a few that the equations can be solved with, and no other is touched."""
-    chain = StateSpace().bind(hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))
+    chain = bind(StateSpace(), hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))
     found = chain.linearise(np.array([0.4]), chain.reference)
     assert found is not None
     fair = ChainNoise(np.array([0.01]), np.full(4, 1e-4))
@@ -221,7 +223,7 @@ def test_noise_that_rounding_cannot_bear_is_raised() -> None:
 
 
 def _flat(n: int):  # type: ignore[no-untyped-def]
-    from sipe_bayes.inference.least_squares import QuadraticPrior
+    from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 
     return QuadraticPrior(np.full(n, 0.5), np.zeros((n, n)))
 
@@ -234,7 +236,7 @@ def test_laplace_and_mcmc_find_the_kalman_filters_posterior() -> None:
         "mcmc": MCMC(spring(), likelihood=StateSpace()),
     }
     posteriors = {name: e.fit(logs) for name, e in estimators.items()}
-    chain = StateSpace().bind(spring(), Trajectories.stack(logs))
+    chain = bind(StateSpace(), spring(), Trajectories.stack(logs))
     firsts = chain.reference[chain.first][:, 1:3]
     state = estimators["laplace"]._state
     assert state is not None
@@ -363,7 +365,7 @@ def test_through_contacts_from_positions_and_velocities_alone() -> None:
 
 
 def cheetah_log(simulator: Simulator, steps: int) -> tuple[np.ndarray, Trajectory]:
-    from sipe_bayes import acting
+    from sipe_bayes.datasets import acting
 
     rng, truths = (
         np.random.default_rng(0),
@@ -404,7 +406,7 @@ def test_quaternions_stay_of_length_one() -> None:
     np.testing.assert_allclose(lengths, 1.0, atol=1e-9)
     print(float(posterior.mean[0]), float(posterior.stddev[0]))
     assert abs(float(posterior.mean[0]) - 0.3) < 4 * float(posterior.stddev[0]) < 0.2
-    chain = StateSpace().bind(simulator, Trajectories.stack(log))
+    chain = bind(StateSpace(), simulator, Trajectories.stack(log))
     tangent = 0.3 * rng.standard_normal((len(chain.log), chain.num_start))  # well below a turn of pi
     there = chain.moved(clean.states[0], tangent)  # type: ignore[index]
     np.testing.assert_allclose(chain.difference(there, clean.states[0]), tangent, atol=1e-9)  # type: ignore[index]
@@ -466,7 +468,7 @@ def test_given_noise_is_kept_and_process_noise_shrinks_where_the_model_is_right(
     """Without process noise in the log the inferred one falls to less than a tenth of the measurement's effect."""
     simulator = pendulum()
     log = pendulum_log(simulator, [0.6, 0.1], 3, steps=120, sd=0.01)
-    chain = StateSpace(noise_sd=(0.01,)).bind(simulator, Trajectories.stack(log))
+    chain = bind(StateSpace(noise_sd=(0.01,)), simulator, Trajectories.stack(log))
     theta = simulator.space.normalise(np.array([0.6, 0.1]))
     found = chain.linearise(theta, chain.reference)
     assert found is not None
@@ -493,7 +495,7 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
         log = replace(log, observations=log.observations + share * np.sin(np.arange(201)[:, None] * 0.4))
         estimator = Laplace(simulator, likelihood=StateSpace(), restarts=1, candidates=0)
         estimator.fit(log)
-        chain = Chain(StateSpace(), simulator, Trajectories.stack(log))
+        chain = bind(StateSpace(), simulator, Trajectories.stack(log))
         said[name] = chain.lacking(*(np.array(estimator.diagnostics[k]) for k in ("process_noise", "movement")))
     print(said)
     assert "The model follows the logs closely." in said["right"]
@@ -505,20 +507,22 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
     ("call", "words"),
     [
         (lambda: sipe.get_estimator(spring(), "abc", likelihood=StateSpace()), "StateSpace is for laplace and mcmc"),
-        (lambda: StateSpace(fit=("speed",)).bind(spring(), Trajectories.stack(spring_logs())), "unknown channels"),
+        (lambda: bind(StateSpace(fit=("speed",)), spring(), Trajectories.stack(spring_logs())), "unknown channels"),
         (
-            lambda: StateSpace().bind(
-                sipe.CallableSimulator(lambda v: v, pendulum().space, likelihood=0.1), Trajectories.stack(spring_logs())
+            lambda: bind(
+                StateSpace(),
+                sipe.CallableSimulator(lambda v: v, pendulum().space, likelihood=0.1),
+                Trajectories.stack(spring_logs()),
             ),
             "needs a MuJoCo simulator",
         ),
         (
-            lambda: StateSpace().bind(Simulator(sipe.make_task("FetchPush")), Trajectories.stack(spring_logs())),
+            lambda: bind(StateSpace(), Simulator(sipe.make_task("FetchPush")), Trajectories.stack(spring_logs())),
             "no controller's memory, as Fetch has one, in measurements; use starts='recorded'",
         ),
         (lambda: StateSpace(starts="known"), "expected 'estimated' or 'recorded', got 'known'"),
         (
-            lambda: StateSpace(starts="recorded").bind(spring(), Trajectories.stack(spring_logs())),
+            lambda: bind(StateSpace(starts="recorded"), spring(), Trajectories.stack(spring_logs())),
             "needs trajectories with states",
         ),
         (lambda: Laplace(spring(), likelihood=StateSpace(), budget=5).fit(spring_logs()), "raise the budget|raise it"),

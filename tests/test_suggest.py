@@ -12,18 +12,18 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from sipe_bayes.cli import app
+from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.expected import Plan
 from sipe_bayes.diagnostics.suggest import KINDS, generate, limits, rank
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.noise import Noise
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import prior
-from sipe_bayes.problem import prepare
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.pendulums import DT, pendulum
 from tests.test_check import config  # noqa: F401
 from tests.test_expected import CART

@@ -18,12 +18,13 @@ import pytest
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes import acting, demonstration, trajectory_sets
-from sipe_bayes.cli import app
-from sipe_bayes.generation import generate
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
-from sipe_bayes.trajectory_sets import MANIFEST, SHIPPED, SetName, TrajectorySetError
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets import acting, trajectory_sets
+from sipe_bayes.datasets import demonstrations as demonstration
+from sipe_bayes.datasets.generation import generate
+from sipe_bayes.datasets.trajectory_sets import MANIFEST, SHIPPED, SetName, TrajectorySetError
+from sipe_bayes.simulation.simulator import Simulator
 from tests.test_demonstrations import agent
 
 STEPS = 15
@@ -169,7 +170,7 @@ def test_a_stored_set_is_taken_where_it_fits(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_task_with_other_defaults_is_another(tmp_path: Path) -> None:
-    from sipe_bayes.envs.adroit import door
+    from sipe_bayes.envs.tasks.adroit import door
 
     one_set(tmp_path, "Door", variant="default", steps=2)
     assert len(sipe.demonstrations("Door", "random", steps=2, folder=tmp_path)) == 5

@@ -17,11 +17,17 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import sipe_bayes as sipe_package
-from sipe_bayes.benchmark import transfer, transfer_figures, transfer_measure
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.measure import POLICIES, _netcdf
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path, record_path
-from sipe_bayes.benchmark.transfer import (
+from sipe_bayes.benchmark.transfer import figures as transfer_figures
+from sipe_bayes.benchmark.transfer import measure as transfer_measure
+from sipe_bayes.benchmark.transfer import study as transfer
+from sipe_bayes.benchmark.transfer.figures import bars, curves
+from sipe_bayes.benchmark.transfer.report import table
+from sipe_bayes.benchmark.transfer.rows import WORDS, Contrast, by_quality, contrasts, in_order, label, relative, rows
+from sipe_bayes.benchmark.transfer.run import believed, load, qualities, stale, summary
+from sipe_bayes.benchmark.transfer.study import (
     SETTING,
     SUITES,
     TransferRecord,
@@ -32,14 +38,10 @@ from sipe_bayes.benchmark.transfer import (
     trained_as,
     varied,
 )
-from sipe_bayes.benchmark.transfer_figures import bars, curves
-from sipe_bayes.benchmark.transfer_report import table
-from sipe_bayes.benchmark.transfer_rows import WORDS, Contrast, by_quality, contrasts, in_order, label, relative, rows
-from sipe_bayes.benchmark.transfer_run import believed, load, qualities, stale, summary
-from sipe_bayes.cli import app
+from sipe_bayes.cli.app import app
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.posterior import Dirac, Particles, Posterior, prior
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 SMALL = ["--suite", "quick", "--training", "600", "--budget", "60", "--steps", "20"]
 TWO = ["--select", "pendulum/truth", "--select", "pendulum/laplace"]
@@ -227,7 +229,7 @@ def test_killed_twice_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "sipe_bayes.cli",
+        "sipe_bayes.cli.app",
         "transfer",
         "run",
         *SMALL,

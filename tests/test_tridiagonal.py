@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.least_squares import QuadraticPrior
-from sipe_bayes.inference.loose_jumps import rarity, tightening
-from sipe_bayes.inference.smoother import border
-from sipe_bayes.tridiagonal import (
+from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
+from sipe_bayes.inference.laplace.loose_jumps import rarity, tightening
+from sipe_bayes.inference.laplace.smoother import border
+from sipe_bayes.likelihood.block_tridiagonal import (
     ChainLinearisation,
     ChainNoise,
     eliminate,

@@ -2,7 +2,7 @@
 
 import os
 
-from sipe_bayes.benchmark.work import ONE_THREAD, Done
+from sipe_bayes.benchmark.executors.work import ONE_THREAD, Done
 
 
 def told(what: str) -> Done:

@@ -24,12 +24,12 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes import acting
-from sipe_bayes.atomic import write_text
-from sipe_bayes.demonstration import behaviour_of
-from sipe_bayes.diagnostics.calibration import check_calibration
+from sipe_bayes.core.files import write_text
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets import acting
+from sipe_bayes.datasets.demonstrations import behaviour_of
+from sipe_bayes.diagnostics.coverage import check_calibration
 from sipe_bayes.posterior import Particles, prior
-from sipe_bayes.trajectory import Trajectories
 
 HERE = Path(__file__).parent
 STEPS, NOISE, LEVEL, DRAWS = {"FetchPush": 50}, 0.01, 0.9, 2000

@@ -37,9 +37,8 @@ from mujoco.sysid.tests.test_integration import ARM_XML
 from numpy.typing import NDArray
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
+from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.output import to_json
 from sipe_bayes.posterior import GaussianMixture
 
 FloatArray = NDArray[np.float64]

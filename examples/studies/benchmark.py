@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from sipe_bayes.atomic import write_text
 from sipe_bayes.benchmark.report_contents import Contents, Picture, Section, contents
 from sipe_bayes.benchmark.tables import Entry, Table
+from sipe_bayes.core.files import write_text
 
 OFTEN = 10  # cells
 READING = (

@@ -26,13 +26,12 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
-from sipe_bayes.diagnostics.drawing import CHAINS, _figure, _styled
-from sipe_bayes.output import to_json
+from sipe_bayes.core.files import to_json, write_text
+from sipe_bayes.report.drawing import CHAINS, _figure, _styled
+from sipe_bayes.report.show import _save
 from sipe_bayes.rl.evaluation import evaluate
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import _EVALUATION_SEED, read_curve, train
-from sipe_bayes.show import _save
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "ddpg_curves"

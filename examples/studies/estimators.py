@@ -26,11 +26,12 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes import acting
-from sipe_bayes.atomic import write_text
+from sipe_bayes.core.files import write_text
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets import acting
 from sipe_bayes.diagnostics.scores import score
+from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.posterior import Dirac, Posterior, prior
-from sipe_bayes.trajectory import Trajectories
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "estimators"
@@ -96,7 +97,7 @@ def _scored(posterior: Posterior, truth: np.ndarray) -> dict[str, Any]:
 
 
 def _cache(name: str, task: str, seed: int) -> dict[str, Any]:
-    from sipe_bayes.inference.prior_sampling import PriorSampling
+    from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
     from sipe_bayes.inference.registry import estimator_class
 
     return {"cache": RUNS / "simulations"} if issubclass(estimator_class(name), PriorSampling) else {}
@@ -186,7 +187,7 @@ def _overview(records: list[dict[str, Any]], determined: dict[tuple[str, int], l
 def is_determined(task: str, seed: int) -> np.ndarray:
     """Which parameters (N,) the log determines; see the module's docstring."""
     simulator, truth, trajectories = recorded(task, seed)
-    windows = sipe.Segments(simulator.dt, noise="white", starts="recorded").bind(simulator, trajectories)
+    windows = bind(sipe.Segments(simulator.dt, noise="white", starts="recorded"), simulator, trajectories)
     jacobian = windows.linearise(truth, windows.no_starts()).jacobian
     spread = trajectories.observations[0].std(0)
     sd = 1e-3 * np.maximum(spread, 1e-3 * np.median(spread[spread > 0]))

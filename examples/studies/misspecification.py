@@ -27,12 +27,13 @@ import numpy as np
 from _kept import fits, keep
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
+from sipe_bayes.core.files import write_text
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.misspecification import LEVEL, SIMULATED, misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.noise import Noise
-from sipe_bayes.parameters import Parameter
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Noise
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "misspecification"
@@ -104,7 +105,7 @@ def one(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -
     method = sipe.get_estimator(engine, "laplace", seed=seed)
     posterior = method.fit(log)
     noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
-    windows = method.likelihood.bind(engine, Trajectories.stack(log))
+    windows = bind(method.likelihood, engine, Trajectories.stack(log))
     found = misfit(windows, posterior.mode.numpy(), noise, seed=seed)
     return {"seed": seed, "cpu_seconds": round(time.process_time() - began, 2), **asdict(found)}
 

@@ -36,12 +36,12 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
-from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.inference.npe import NPE
-from sipe_bayes.likelihood import Segments
+from sipe_bayes.core.files import write_text
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.inference.amortised.npe import NPE
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 HERE = Path(__file__).parent
 SPACE = ParameterSpace([Parameter("theta_1", -1.0, 1.0), Parameter("theta_2", -1.0, 1.0)])

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
-from sipe_bayes.problem import Problem
+from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.files import write_text
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"

@@ -19,11 +19,11 @@ import numpy as np
 import scipy.optimize
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
-from sipe_bayes.config import load_config
+from sipe_bayes.calibration.config import load_config
+from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.files import write_text
 from sipe_bayes.diagnostics.evaluate import errors
-from sipe_bayes.likelihood import Windows
-from sipe_bayes.problem import Problem
+from sipe_bayes.likelihood.windows import Windows
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"

@@ -6,7 +6,7 @@
 
 A cell is method/seed. The reference is the in-distribution variant; each of ten updates takes one trajectory of 100 control steps
 from it, and the estimator has 1,000 rollouts in all. The agent is that of the
-transfer study (``sipe_bayes.benchmark.transfer.settings``). The paper's rule: a seed counts only if its policy solves the environment, here simulators drawn from
+transfer study (``sipe_bayes.benchmark.transfer.study.settings``). The paper's rule: a seed counts only if its policy solves the environment, here simulators drawn from
 the last estimate (see ``sipe_bayes.rl.policy_in_the_loop``); the seeds that do are counted, and all are shown beside them.
 """
 
@@ -27,10 +27,9 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
-from sipe_bayes.benchmark.transfer import settings as agent
+from sipe_bayes.benchmark.transfer.study import settings as agent
+from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.diagnostics.scores import score
-from sipe_bayes.output import to_json
 from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.rl.policy_in_the_loop import train_in_the_loop
 

@@ -19,9 +19,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.atomic import write_text
-from sipe_bayes.diagnostics.check import RESULT, run, study_of_task
-from sipe_bayes.output import to_json
+from sipe_bayes.calibration.check import RESULT, run, study_of_task
+from sipe_bayes.core.files import to_json, write_text
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "sbc"

@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 
 import sipe_bayes as sipe
-from sipe_bayes import acting
-from sipe_bayes.atomic import write_text
 from sipe_bayes.benchmark.frame import source
-from sipe_bayes.demonstration import behaviour_of
+from sipe_bayes.core.files import write_text
+from sipe_bayes.datasets import acting
+from sipe_bayes.datasets.demonstrations import behaviour_of
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "state_space"

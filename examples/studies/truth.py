@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_text
+from sipe_bayes.core.files import write_text
 from sipe_bayes.diagnostics.scores import c2st
 from sipe_bayes.posterior import Particles, Posterior
 

@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 
 import sipe_bayes as sipe
-from sipe_bayes.atomic import write_bytes, write_text
-from sipe_bayes.output import to_json
+from sipe_bayes.core.files import to_json, write_bytes, write_text
 from sipe_bayes.posterior import prior
 
 HERE = Path(__file__).parent
@@ -59,9 +58,9 @@ def trained(name: str, seed: int, steps: int, runs: Path) -> dict[str, Any]:
     """An agent's returns in the target: at the end, and along its training."""
     import torch
 
-    from sipe_bayes.benchmark.transfer import settings
+    from sipe_bayes.benchmark.transfer.study import settings
+    from sipe_bayes.models.policy import load_policy
     from sipe_bayes.rl.evaluation import evaluate
-    from sipe_bayes.rl.policy import load_policy
     from sipe_bayes.rl.train import read_curve, train
 
     torch.set_num_threads(1)
@@ -94,7 +93,7 @@ def draw(found: list[dict[str, Any]], posterior: sipe.Posterior) -> bytes:
     """Left: the posterior's mass and length. Middle: returns in the target along the training. Right: at the end."""
     from matplotlib.figure import Figure
 
-    from sipe_bayes.diagnostics.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, png
+    from sipe_bayes.report.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, png
 
     colours = dict(zip(NAMES, (MEASURED, CHAINS[0], CHAINS[1], PRIOR, DEFAULT), strict=True))
     figure = Figure(figsize=(9.6, 3.2), layout="constrained")

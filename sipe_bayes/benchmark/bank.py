@@ -17,16 +17,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
+from sipe_bayes.benchmark.executors.work import Done, Unit
 from sipe_bayes.benchmark.log import recorded
-from sipe_bayes.benchmark.work import Done, Unit
-from sipe_bayes.checks import whole
+from sipe_bayes.core.files import to_json
+from sipe_bayes.core.validation import whole
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Variant
-from sipe_bayes.inference.simulations import BLOCK, Cache, Simulations
-from sipe_bayes.likelihood import first_states
-from sipe_bayes.output import to_json
+from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations
+from sipe_bayes.likelihood.windows import first_states
 from sipe_bayes.posterior import prior
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 FOLDER = "simulations"
 SHARD = 4  # blocks

@@ -33,12 +33,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from sipe_bayes.acting import Split
-from sipe_bayes.demonstration import default_steps
+from sipe_bayes.datasets.acting import Split
+from sipe_bayes.datasets.demonstrations import default_steps
+from sipe_bayes.datasets.trajectory_sets import TASKS as NINE
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Variant
 from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
-from sipe_bayes.trajectory_sets import TASKS as NINE
 
 BASELINES = ("prior", "prior_mean")
 PAPER = ("regression", "bayesopt", "maml", "simopt", "adr", "bayessim")

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
 from sipe_bayes.benchmark.records import Record
 from sipe_bayes.benchmark.tables import order_estimators, order_tasks
-from sipe_bayes.diagnostics.drawing import CHAINS, MEASURED, POSTERIOR, PRIOR, _figure, _line, _short, _styled, _ticks
-from sipe_bayes.diagnostics.posterior_plots import MARKERS
+from sipe_bayes.report.drawing import CHAINS, MEASURED, POSTERIOR, PRIOR, _figure, _line, _short, _styled, _ticks
+from sipe_bayes.report.posterior_plots import MARKERS
 
 FloatArray = NDArray[np.float64]
 Points = Mapping[float, Sequence[float]]  # x -> a score of each seed

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 
 import sipe_bayes
 from sipe_bayes.benchmark.cells import Cell
+from sipe_bayes.benchmark.executors.work import Done
 from sipe_bayes.benchmark.records import Record
-from sipe_bayes.benchmark.work import Done
 
 R = TypeVar("R", bound=Record)
 Files = tuple[tuple[str, bytes], ...]

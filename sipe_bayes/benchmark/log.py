@@ -16,14 +16,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.acting import Split
-from sipe_bayes.demonstration import demonstrations
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets.acting import Split
+from sipe_bayes.datasets.demonstrations import demonstrations
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Variant
-from sipe_bayes.likelihood import Segments
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import prior
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 
@@ -66,7 +67,7 @@ def one_step(simulator: Simulator) -> Segments:
 
 def determined(simulator: Simulator, truth: FloatArray, trajectories: Trajectories) -> NDArray[np.bool_]:
     """Which parameters (N,) the trajectories determine; see the module's docstring."""
-    windows = one_step(simulator).bind(simulator, trajectories)
+    windows = bind(one_step(simulator), simulator, trajectories)
     jacobian = windows.linearise(truth, windows.no_starts()).jacobian
     spread = np.concatenate([t.observations for t in trajectories]).std(0)
     sd = _NOISE * np.maximum(spread, _NOISE * np.median(spread[spread > 0]))

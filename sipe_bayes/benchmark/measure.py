@@ -15,17 +15,17 @@ import torch
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
+from sipe_bayes.benchmark.executors.work import Done
 from sipe_bayes.benchmark.frame import Files, blank, failed, measured
 from sipe_bayes.benchmark.log import Log, one_step, recorded
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path
-from sipe_bayes.benchmark.work import Done
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.envs.registry import make_task
+from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.base import Estimator, digest
-from sipe_bayes.inference.prior_sampling import PriorSampling
 from sipe_bayes.inference.registry import estimator_class, get_estimator
 from sipe_bayes.posterior import Dirac, Posterior, prior
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 POLICIES, CHECKPOINTS = "policies", "checkpoint"  # a checkpoint holds a replay buffer, which nothing needs at the end
 _ALONG = (0.1, 0.25, 0.5)  # of the budget, where the history looks at an estimate
@@ -72,7 +72,7 @@ def blank_record(cell: Cell, command: str) -> Record:
     """A cell's record before it is measured."""
     if not cell.with_policy:
         return blank(Record, cell, command)
-    from sipe_bayes.benchmark.transfer import agent_of
+    from sipe_bayes.benchmark.transfer.study import agent_of
 
     return blank(Record, cell, command, training=cell.training, agent=agent_of(cell).deviations())
 
@@ -169,7 +169,7 @@ def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
 
 
 def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
-    from sipe_bayes.benchmark.transfer import agent_of, demonstrations_of
+    from sipe_bayes.benchmark.transfer.study import agent_of, demonstrations_of
     from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, train_in_the_loop
 
     own = folder / POLICIES / file_name(cell.id)

@@ -12,8 +12,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
-from sipe_bayes.atomic import write_text
-from sipe_bayes.output import OutputError, to_json
+from sipe_bayes.core.files import OutputError, to_json, write_text
 
 RECORDS = "records"
 PLAN = "plan.json"

@@ -33,7 +33,7 @@ from sipe_bayes.benchmark.tables import (
     sweep_rows,
     warning_counts,
 )
-from sipe_bayes.diagnostics.sipe_plot import COMPARED, settings_plot, sipe_plot
+from sipe_bayes.report.sipe_plot import COMPARED, settings_plot, sipe_plot
 
 SETTINGS = {
     "direct": "Direct estimation",

@@ -12,8 +12,8 @@ import jinja2
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents
 from sipe_bayes.benchmark.tables import Table
-from sipe_bayes.diagnostics.drawing import png
-from sipe_bayes.diagnostics.sipe_plot import two_lines
+from sipe_bayes.report.drawing import png
+from sipe_bayes.report.sipe_plot import two_lines
 
 
 def render(contents: Contents) -> str:

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import jinja2
 
-from sipe_bayes.atomic import write_bytes, write_text
 from sipe_bayes.benchmark import report_html
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents, Picture
 from sipe_bayes.benchmark.tables import Entry, Table
+from sipe_bayes.core.files import write_bytes, write_text
 
 _COLUMNS = 5  # of a table, side by side on A4
 _SPECIAL = {

@@ -16,13 +16,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from sipe_bayes.atomic import write_bytes
 from sipe_bayes.benchmark import bank, measure, spent
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
+from sipe_bayes.benchmark.executors.work import Done, Executor, Unit
 from sipe_bayes.benchmark.records import Record, plan
-from sipe_bayes.benchmark.work import Done, Executor, Unit
-from sipe_bayes.output import OutputError
+from sipe_bayes.core.files import OutputError, write_bytes
 
 _LOCK = ".lock"
 Report = Callable[[str], None]
@@ -151,7 +150,7 @@ def unit(kind: ModuleType, cell: Cell, folder: Path, command: str, needs: Iterab
 
 def _bank(cell: Cell) -> Bank | None:
     """The simulations that a cell shares with others."""
-    from sipe_bayes.inference.prior_sampling import PriorSampling
+    from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
     from sipe_bayes.inference.registry import estimator_class
 
     alone = cell.estimator in BASELINES or cell.with_policy or cell.split != "reference"

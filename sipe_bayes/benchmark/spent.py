@@ -8,9 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.atomic import write_text
 from sipe_bayes.benchmark.records import Record
-from sipe_bayes.output import OutputError, to_json
+from sipe_bayes.core.files import OutputError, to_json, write_text
 
 LOG = "runs.json"
 _ELSEWHERE = {"simulate": "sipe simulate", "transfer": "sipe transfer"}

@@ -19,12 +19,11 @@ import scipy.optimize
 import scipy.stats
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.parameters import ParameterSpace
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 

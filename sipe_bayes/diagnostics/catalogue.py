@@ -7,7 +7,7 @@ from typing import Any
 from sipe_bayes.diagnostics.sensitivity import LEVELS, Sensitivity, sensitivity
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Task
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 
 def tasks() -> list[dict[str, Any]]:

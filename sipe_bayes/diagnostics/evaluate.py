@@ -16,10 +16,10 @@ import scipy.stats
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.diagnostics.result import ChannelScore, Comparison, Residual, Signal
-from sipe_bayes.likelihood import Windows
-from sipe_bayes.marginal import marginal
-from sipe_bayes.noise import Noise, whiten
+from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
+from sipe_bayes.likelihood.marginal import marginal
+from sipe_bayes.likelihood.noise import Noise, whiten
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]

@@ -23,14 +23,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.identifiability import ridges
-from sipe_bayes.diagnostics.result import Ridge
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.noise import Noise, eliminate
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.diagnostics.records import Ridge
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Noise, eliminate
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 
@@ -88,7 +89,7 @@ def information(
     log = Trajectory(
         motion.observations[0], plan.actions, plan.dt, motion.states[0], plan.name, simulator.environment.channels
     )
-    windows = likelihood.bind(simulator, Trajectories.stack(log))
+    windows = bind(likelihood, simulator, Trajectories.stack(log))
     found = windows.linearise(theta, windows.no_starts())
     if not found.valid:
         return None

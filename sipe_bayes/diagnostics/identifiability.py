@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.diagnostics.result import Ridge
-from sipe_bayes.likelihood import Windows
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.diagnostics.records import Ridge
+from sipe_bayes.likelihood.windows import Windows
 
 FloatArray = NDArray[np.float64]
 

@@ -31,11 +31,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.evaluate import best_starts
-from sipe_bayes.inference.least_squares import QuadraticPrior
-from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
+from sipe_bayes.likelihood.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
+from sipe_bayes.likelihood.windows import Windows
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.misspecification import LEVEL
-from sipe_bayes.likelihood import Windows
-from sipe_bayes.noise import Noise
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.replicas import Replicas
+from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.replicas import Replicas
-from sipe_bayes.state_space import Chain
 
 FloatArray = NDArray[np.float64]
 

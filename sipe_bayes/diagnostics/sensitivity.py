@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.envs.task import Task
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 

@@ -25,10 +25,10 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
-from sipe_bayes.likelihood import Segments
-from sipe_bayes.noise import Noise
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 

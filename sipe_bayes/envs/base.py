@@ -1,7 +1,7 @@
 """The Environment contract: what a simulator needs to know about a robot, and nothing that it does.
 
 An Environment is an immutable, picklable description. It compiles a MuJoCo model, says how theta is written into it
-in place, how actions become controls and how states become observations. The engine (``sipe_bayes.simulator``) owns
+in place, how actions become controls and how states become observations. The engine (``sipe_bayes.simulation.simulator``) owns
 batching, threads, model pools and the flagging of diverged rollouts.
 
 To add one: subclass, set ``space``, ``channels`` and ``num_actions``, and define the abstract methods below as pure
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 
 FloatArray = NDArray[np.float64]
 _CONTROL = 1 << 6  # mjSTATE_CTRL, without importing mujoco here

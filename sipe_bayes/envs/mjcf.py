@@ -19,9 +19,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.targets import Target, TargetError, bind, check_inertia, named, restore_inertia, split
-from sipe_bayes.parameters import Parameter, ParameterSpace
 
 FloatArray = NDArray[np.float64]
 _CHANNEL = re.compile(

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.atomic import write_text
+from sipe_bayes.core.files import write_text
 from sipe_bayes.envs.mjcf import MjcfEnvironment, compile_spec, load_spec
 from sipe_bayes.envs.targets import split
 

@@ -10,19 +10,19 @@ if TYPE_CHECKING:
     from sipe_bayes.envs.task import Task
 
 TASKS = {
-    "FetchPush": ("sipe_bayes.envs.fetch", "push"),
-    "FetchSlide": ("sipe_bayes.envs.fetch", "slide"),
-    "FetchPickAndPlace": ("sipe_bayes.envs.fetch", "pick_and_place"),
-    "Relocate": ("sipe_bayes.envs.adroit", "relocate"),
-    "Door": ("sipe_bayes.envs.adroit", "door"),
-    "HalfCheetahLinks": ("sipe_bayes.envs.half_cheetah", "links"),
-    "HalfCheetahJoints": ("sipe_bayes.envs.half_cheetah", "joints"),
-    "HalfCheetahAllJoints": ("sipe_bayes.envs.half_cheetah", "all_joints"),
-    "HumanoidLinks": ("sipe_bayes.envs.humanoid", "links"),
-    "HumanoidJoints": ("sipe_bayes.envs.humanoid", "joints"),
-    "Hopper": ("sipe_bayes.envs.hopper", "hopper"),
-    "CartPole": ("sipe_bayes.envs.classic", "cart_pole"),
-    "Pendulum": ("sipe_bayes.envs.classic", "pendulum"),
+    "FetchPush": ("sipe_bayes.envs.tasks.fetch", "push"),
+    "FetchSlide": ("sipe_bayes.envs.tasks.fetch", "slide"),
+    "FetchPickAndPlace": ("sipe_bayes.envs.tasks.fetch", "pick_and_place"),
+    "Relocate": ("sipe_bayes.envs.tasks.adroit", "relocate"),
+    "Door": ("sipe_bayes.envs.tasks.adroit", "door"),
+    "HalfCheetahLinks": ("sipe_bayes.envs.tasks.half_cheetah", "links"),
+    "HalfCheetahJoints": ("sipe_bayes.envs.tasks.half_cheetah", "joints"),
+    "HalfCheetahAllJoints": ("sipe_bayes.envs.tasks.half_cheetah", "all_joints"),
+    "HumanoidLinks": ("sipe_bayes.envs.tasks.humanoid", "links"),
+    "HumanoidJoints": ("sipe_bayes.envs.tasks.humanoid", "joints"),
+    "Hopper": ("sipe_bayes.envs.tasks.hopper", "hopper"),
+    "CartPole": ("sipe_bayes.envs.tasks.classic", "cart_pole"),
+    "Pendulum": ("sipe_bayes.envs.tasks.classic", "pendulum"),
 }
 
 

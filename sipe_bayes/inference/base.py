@@ -17,16 +17,17 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from sipe_bayes.callable_simulator import CallableSimulator
-from sipe_bayes.checks import path, whole
-from sipe_bayes.demonstration import Given
-from sipe_bayes.inference.state import CheckpointError, State, load_state, save_state
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Segments, Windows
+from sipe_bayes.core.checkpoint import CheckpointError, State, load_state, save_state
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.validation import path, whole
+from sipe_bayes.datasets.demonstrations import Given
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
 
 AT_BOUND = 0.02  # of the range: a posterior whose median is nearer to a bound than that sits on it
 _NARROW = 0.5  # of the prior's sd: a posterior that is wider claims nothing
@@ -59,7 +60,7 @@ class Estimator(ABC):
         import numpy as np
         import torch
 
-        from sipe_bayes.discrepancy import StateDifference, channel_scale, simulate
+        from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
         from sipe_bayes.inference.base import Estimator
         from sipe_bayes.posterior import Dirac
 
@@ -285,7 +286,7 @@ class Estimator(ABC):
     def windows(self, trajectories: Trajectories) -> Windows:
         """The trajectories bound to the likelihood, budget counted."""
         if self._bound is None or self._bound[0] is not trajectories:
-            bound = self.likelihood.bind(self.simulator, trajectories)
+            bound = bind(self.likelihood, self.simulator, trajectories)
             bound.budget, bound.rollouts = self.budget, self.rollouts
             self._bound = (trajectories, bound)
         return self._bound[1]

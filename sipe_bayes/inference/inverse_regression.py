@@ -15,7 +15,7 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.least_squares import QuadraticPrior
+from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 
 FloatArray = NDArray[np.float64]
 

@@ -22,17 +22,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.checks import whole
-from sipe_bayes.inference import state_space_target, window_target
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.chain_state import process_diagnostics
-from sipe_bayes.inference.laplace import UNSETTLED, Laplace
-from sipe_bayes.inference.optima import distinct_modes
-from sipe_bayes.inference.state import State
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Windows
+from sipe_bayes.inference.laplace import state_space_target, window_target
+from sipe_bayes.inference.laplace.chain_state import process_diagnostics
+from sipe_bayes.inference.laplace.estimator import UNSETTLED, Laplace
+from sipe_bayes.inference.laplace.optima import distinct_modes
+from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
+from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Particles
-from sipe_bayes.state_space import Chain
-from sipe_bayes.trajectory import Trajectories
 
 FloatArray = NDArray[np.float64]
 

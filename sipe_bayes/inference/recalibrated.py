@@ -46,20 +46,19 @@ import scipy.stats
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.checks import whole
-from sipe_bayes.demonstration import Given
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.validation import whole
+from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.inference.inverse_regression import Line
-from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.inference.least_squares import QuadraticPrior
-from sipe_bayes.inference.state import State
-from sipe_bayes.likelihood import BudgetExhausted, Segments
-from sipe_bayes.noise import Noise
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.replicas import Replicas, observation_noise
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, StateSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior
-from sipe_bayes.replicas import Replicas, observation_noise
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.state_space import StateSpace
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 

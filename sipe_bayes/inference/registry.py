@@ -11,17 +11,17 @@ if TYPE_CHECKING:
     from sipe_bayes.inference.base import Estimator
 
 ESTIMATORS = {
-    "regression": ("sipe_bayes.inference.regression", "Regression"),
-    "maml": ("sipe_bayes.inference.maml", "MAML"),
-    "bayessim": ("sipe_bayes.inference.bayessim", "BayesSim"),
-    "laplace": ("sipe_bayes.inference.laplace", "Laplace"),
+    "regression": ("sipe_bayes.inference.amortised.regression", "Regression"),
+    "maml": ("sipe_bayes.inference.amortised.maml", "MAML"),
+    "bayessim": ("sipe_bayes.inference.amortised.bayessim", "BayesSim"),
+    "laplace": ("sipe_bayes.inference.laplace.estimator", "Laplace"),
     "mcmc": ("sipe_bayes.inference.mcmc", "MCMC"),
-    "bayesopt": ("sipe_bayes.inference.bayesopt", "BayesOpt"),
-    "npe": ("sipe_bayes.inference.npe", "NPE"),
-    "abc": ("sipe_bayes.inference.abc", "ABC"),
-    "simopt": ("sipe_bayes.inference.simopt", "SimOpt"),
-    "adr": ("sipe_bayes.inference.adr", "ADR"),
-    "cem": ("sipe_bayes.inference.cem", "CEM"),
+    "bayesopt": ("sipe_bayes.inference.search.bayesopt", "BayesOpt"),
+    "npe": ("sipe_bayes.inference.amortised.npe", "NPE"),
+    "abc": ("sipe_bayes.inference.amortised.abc", "ABC"),
+    "simopt": ("sipe_bayes.inference.search.simopt", "SimOpt"),
+    "adr": ("sipe_bayes.inference.search.adr", "ADR"),
+    "cem": ("sipe_bayes.inference.search.cem", "CEM"),
 }
 
 
@@ -39,7 +39,7 @@ def estimator_class(name: str) -> type[Estimator]:
 def get_estimator(simulator: Any, name: str, **settings: Any) -> Estimator:
     """The estimator called ``name`` on ``simulator``, or on the simulator of a benchmark's task: its name, the Task, or the
     Gymnasium environment of ``sipe.make``; settings as the class's own (budget, seed, prior, ...)."""
-    from sipe_bayes.demonstration import is_environment, simulator_of
+    from sipe_bayes.datasets.demonstrations import is_environment, simulator_of
 
     engine = simulator_of(simulator)[0] if is_environment(simulator) else simulator
     found = estimator_class(name)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from sipe_bayes.checks import at_least, positive, share, whole
+from sipe_bayes.core.validation import at_least, positive, share, whole
 
 Loss = Callable[[Tensor], Tensor]
 """Losses (b,) of the rows (b,) whose indices are given."""

@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -16,8 +16,8 @@ from pyro.distributions import TorchDistribution
 from torch import Generator, Tensor
 from torch.distributions import constraints
 
-from sipe_bayes.checks import at_least, whole
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.validation import at_least, whole
 from sipe_bayes.posterior.storage import write_pair
 
 REFERENCE_DRAWS = 20_000
@@ -72,6 +72,12 @@ def _drawn(name: str, given: Mapping[str, Any] | None, theta: Tensor) -> dict[st
     return arrays
 
 
+class DrawsFamily(Protocol):
+    """Makes a posterior of draws (n, N)."""
+
+    def __call__(self, draws: Tensor, space: ParameterSpace, /) -> Posterior: ...
+
+
 class Posterior(TorchDistribution):
     """A distribution over theta (N,) in the unit cube, with the ``space`` of its N parameters.
 
@@ -107,6 +113,8 @@ class Posterior(TorchDistribution):
                 return cls(space)
     """
 
+    of_draws: ClassVar[DrawsFamily]
+    """The family that stands for draws (n, N) of any other: ``posterior.particles`` puts its own here."""
     arg_constraints: ClassVar[dict[str, Any]] = {}
     support = constraints.independent(constraints.unit_interval, 1)
     has_rsample = False
@@ -255,25 +263,21 @@ class Posterior(TorchDistribution):
 
     def marginal(self, names: Iterable[str]) -> Posterior:
         """The posterior of some parameters, in the order given: here Particles of 8,000 fixed-seed draws."""
-        from sipe_bayes.posterior.particles import Particles
-
         columns, space = self._columns(names)
         with torch.no_grad():
             draws = self._sample(MARGINAL_DRAWS, Generator().manual_seed(0))
-        return Particles(draws[:, columns], space)
+        return self.of_draws(draws[:, columns], space)
 
     def wider(self, factor: float) -> Posterior:
         """This posterior spread ``factor`` times as far about its mean, for cautious domain randomisation: Particles of 8,000 fixed-seed
         draws, reflected where they would leave the cube. Raises ValueError for a factor below 1, and for a point, which has no spread."""
-        from sipe_bayes.posterior.particles import Particles
-
         factor = at_least("factor", factor, 1.0)
         with torch.no_grad():
             draws = self._sample(MARGINAL_DRAWS, Generator().manual_seed(0))
         if float(np.ptp(draws.numpy(), axis=0).max()) < _POINT:
             raise ValueError("wider: expected a posterior with spread, got a point; take .smoothed(bandwidth)")
         centre = draws.mean(0)
-        return Particles(1 - (1 - (centre + factor * (draws - centre)) % 2).abs(), self.space)
+        return self.of_draws(1 - (1 - (centre + factor * (draws - centre)) % 2).abs(), self.space)
 
     def values(self, n: int, generator: Generator | None = None) -> NDArray[Any]:
         """Draws (n, N) in physical units."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Generator, Tensor
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior, as_theta, check_bandwidth
 from sipe_bayes.posterior.mixture import GaussianMixture
 

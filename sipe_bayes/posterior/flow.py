@@ -24,7 +24,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Generator, Tensor
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior, as_float64
 
 MARGIN = 1e-6

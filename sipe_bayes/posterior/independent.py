@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior, as_float64
 from sipe_bayes.posterior.truncated_normal import interval_moments, interval_quantile, log_interval
 

@@ -34,7 +34,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr
 from torch import Generator, Tensor
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior, as_float64
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal, log_interval
 

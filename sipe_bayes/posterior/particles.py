@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior, as_float64, as_theta, check_bandwidth
 from sipe_bayes.posterior.mixture import GaussianMixture
 
@@ -143,6 +143,9 @@ class Particles(Posterior):
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
         stats = {name.removeprefix(_STATS): x for name, x in tensors.items() if name.startswith(_STATS)}
         return cls(tensors["theta"], space, tensors["weights"], settings["chains"], tensors.get("best"), stats)
+
+
+Posterior.of_draws = Particles
 
 
 def _normalised(weights: Any, rows: int) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 
-from sipe_bayes.parameters import ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior
 from sipe_bayes.posterior.storage import read_pair
 

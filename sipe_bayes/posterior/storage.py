@@ -16,7 +16,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from sipe_bayes.atomic import write_bytes
+from sipe_bayes.core.files import write_bytes
 
 FORMAT = "sipe_bayes.posterior/1"
 _SAVE_AGAIN = "save it again with posterior.save(path)"

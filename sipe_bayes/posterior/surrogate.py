@@ -39,8 +39,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from torch import Generator, Tensor
 
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.models.gaussian_process import GaussianProcess
-from sipe_bayes.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior, as_theta
 
 FloatArray = NDArray[np.float64]

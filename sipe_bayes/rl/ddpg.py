@@ -35,9 +35,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sipe_bayes.models.policy import Policy
 from sipe_bayes.models.training import check_device
 from sipe_bayes.rl.normaliser import Normaliser
-from sipe_bayes.rl.policy import Policy
 from sipe_bayes.rl.replay import Batch
 from sipe_bayes.rl.settings import Settings
 

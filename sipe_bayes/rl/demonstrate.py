@@ -16,18 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.atomic import write_text
-from sipe_bayes.envs.adroit import Adroit
+from sipe_bayes.core.files import to_json, write_text
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
-from sipe_bayes.episodes import Episodes
-from sipe_bayes.output import to_json
+from sipe_bayes.envs.tasks.adroit import Adroit
 from sipe_bayes.rl import planning, scripted
 from sipe_bayes.rl.planning import Report
 from sipe_bayes.rl.randomization import Draws
 from sipe_bayes.rl.scripted import Demonstrator
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.episodes import Episodes
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

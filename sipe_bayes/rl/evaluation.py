@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes import acting
-from sipe_bayes.atomic import replacing, write_text
+from sipe_bayes.core.files import replacing, to_json, write_text
+from sipe_bayes.datasets import acting
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
-from sipe_bayes.episodes import Episodes
-from sipe_bayes.output import to_json
-from sipe_bayes.rl.policy import Controller, load_policy
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.models.policy import Controller, load_policy
+from sipe_bayes.simulation.episodes import Episodes
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 

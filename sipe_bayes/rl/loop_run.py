@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.checks import whole
-from sipe_bayes.demonstration import default_steps
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.validation import whole
+from sipe_bayes.datasets.demonstrations import default_steps
 from sipe_bayes.envs.task import Task
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.gaussian_search import Search
+from sipe_bayes.inference.search.gaussian_search import Search
+from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.rl.evaluation import evaluate
-from sipe_bayes.rl.policy import Policy
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report, checksum
 from sipe_bayes.rl.trainer import Trainer
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories, Trajectory
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
@@ -236,7 +236,7 @@ class LoopRun:
             "reference_return": outside["mean"],
             "reference_success": outside["success_rate"],
             "redrawn": self.draw.redrawn,
-            "diverged": self.trainer.episodes.simulator.diverged,
+            "diverged": self.trainer.simulator.diverged,
             "failure": failure,
             "mean": mean.tolist(),
             "sd": sd.tolist(),

@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.envs.adroit import Adroit
-from sipe_bayes.inference.state import load_state, save_state
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.envs.tasks.adroit import Adroit
 from sipe_bayes.rl.scripted import Demonstrator
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 Report = Callable[[str, int, int], None]

@@ -43,16 +43,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.atomic import write_text
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.files import to_json, write_text
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.gaussian_search import Search
-from sipe_bayes.inference.state import load_state, save_state
-from sipe_bayes.output import to_json
+from sipe_bayes.inference.search.gaussian_search import Search
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report
-from sipe_bayes.trajectory import Trajectories
 
 CHECKPOINT = "checkpoint/state.safetensors"
 

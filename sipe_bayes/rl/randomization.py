@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.checks import whole
-from sipe_bayes.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.validation import whole
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.atomic import replacing
-from sipe_bayes.episodes import Step
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.core.files import replacing
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.simulation.episodes import Step
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

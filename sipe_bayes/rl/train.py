@@ -26,18 +26,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.atomic import replacing, write_text
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.files import replacing, to_json, write_text
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
-from sipe_bayes.inference.state import load_state, save_state
-from sipe_bayes.output import to_json
+from sipe_bayes.models.policy import Policy, load_policy
 from sipe_bayes.rl.evaluation import evaluate
-from sipe_bayes.rl.policy import Policy, load_policy
 from sipe_bayes.rl.randomization import Draws, Randomization
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.trainer import Trainer
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 
 Report = Callable[[str, int, int], None]
 """Called with a line of text, the steps taken and those to take."""
@@ -89,7 +88,7 @@ def train(
     trainer = Trainer(task, settings, seed, randomization, demonstrations, threads, device)
     described = {
         "task": task.name,
-        "model": trainer.episodes.simulator.checksum(),
+        "model": trainer.simulator.checksum(),
         "seed": seed,
         "settings": {k: v for k, v in settings.to_dict().items() if v or k not in _LATER},
         "drawn": randomization is not None and randomization.fingerprint,
@@ -149,7 +148,7 @@ class _Log:
     def evaluate(self, trainer: Trainer) -> None:
         policy, now = trainer.policy(), time.perf_counter()
         rate = (trainer.agent.updates - self._last[1]) / (now - self._last[0])
-        self._evaluator = self._evaluator or Simulator(trainer.task, trainer.episodes.simulator.num_threads)
+        self._evaluator = self._evaluator or Simulator(trainer.task, trainer.simulator.num_threads)
         if self._randomization is not None and self._theta is None:
             draws = Draws(self._evaluator, self._randomization.posterior)
             self._theta = draws(np.random.default_rng(_EVALUATION_SEED), self._episodes)
@@ -191,7 +190,7 @@ class _Log:
             "steps": trainer.steps,
             "updates": trainer.agent.updates,
             "redrawn": 0 if trainer.draws is None else trainer.draws.redrawn,
-            "diverged": trainer.episodes.simulator.diverged,
+            "diverged": trainer.simulator.diverged,
             "asked": steps,
             "fingerprint": fingerprint,
         }

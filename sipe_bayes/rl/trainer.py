@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.task import Task
-from sipe_bayes.episodes import Episodes, Step
-from sipe_bayes.inference.state import State
+from sipe_bayes.models.policy import Policy
 from sipe_bayes.rl.ddpg import Agent
-from sipe_bayes.rl.policy import Policy
 from sipe_bayes.rl.randomization import Draws, Randomization
 from sipe_bayes.rl.replay import Batch, Replay
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.episodes import Episodes, Step
+from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 
@@ -59,8 +59,9 @@ class Trainer:
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
         ending = {"allow_outside": True, "end_hopeless": settings.end_hopeless}
-        self.episodes = Episodes(Simulator(task, threads), task.theta("default"), lanes, **ending)
-        self.draws = None if randomization is None else Draws(self.episodes.simulator, randomization.posterior)
+        self.simulator = Simulator(task, threads)
+        self.episodes = Episodes(self.simulator, task.theta("default"), lanes, **ending)
+        self.draws = None if randomization is None else Draws(self.simulator, randomization.posterior)
         self._disturbances = None
         if randomization is not None and randomization.disturbs:
             middle = np.full(task.num_actions, (task.action_low + task.action_high) / 2)
@@ -101,7 +102,7 @@ class Trainer:
         generators = [self._noise, self._picks, self._draws, *self.episodes.generators]
         arrays = {name: value.copy() for name, value in self._lanes().items()}
         states = json.dumps([g.bit_generator.state for g in generators])
-        counts = {"steps": self.steps, "owed": self._owed, "diverged": self.episodes.simulator.diverged}
+        counts = {"steps": self.steps, "owed": self._owed, "diverged": self.simulator.diverged}
         if self.draws is not None:
             counts["redrawn"] = self.draws.redrawn
         disturbed = {} if self._disturbances is None else self._disturbances.state()
@@ -117,7 +118,7 @@ class Trainer:
         for generator, found in zip(generators, json.loads(state["generators"]), strict=True):
             generator.bit_generator.state = found
         self.steps, self._owed, self._over = int(state["steps"]), float(state["owed"]), np.array(state["over"])
-        self.episodes.simulator.diverged = int(state.get("diverged", 0))  # earlier versions did not count
+        self.simulator.diverged = int(state.get("diverged", 0))  # earlier versions did not count
         if self.draws is not None:
             self.draws.redrawn = int(state.get("redrawn", 0))
         if self._disturbances is not None:

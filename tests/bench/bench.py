@@ -27,11 +27,12 @@ import mujoco.rollout
 import numpy as np
 import transfer
 
-import sipe_bayes.inference.laplace as laplace_module
+import sipe_bayes.inference.laplace.estimator as laplace_module
+from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import Segments, Windows
-from sipe_bayes.problem import prepare
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "simple_pendulum" / "calibrate.toml"
 LANES, STEPS = 64, 200
@@ -81,8 +82,8 @@ def engine(pairs: int) -> None:
 
 
 def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
+    from sipe_bayes.core.parameters import Parameter
     from sipe_bayes.envs.mjcf import MjcfEnvironment
-    from sipe_bayes.parameters import Parameter
 
     parameters = [Parameter(f"damping_{j}", 0.01, 1.0, targets=(f"joint:{j}.damping",)) for j in joints]
     simulator = Simulator(MjcfEnvironment.build(xml, parameters, list(joints), [f"joint:{j}.position" for j in joints]))

@@ -26,10 +26,10 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from sipe_bayes.engine import quiet
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
-from sipe_bayes.simulator import Simulator
+from sipe_bayes.simulation.engine import quiet
+from sipe_bayes.simulation.simulator import Simulator
 
 LANES, STEPS, THREADS = 64, 200, 2
 PUBLISHED = {  # task: model file, id of the published environment, bar against its AsyncVectorEnv

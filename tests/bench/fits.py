@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 import sipe_bayes as sipe
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import ESTIMATORS, get_estimator
-from sipe_bayes.simulator import Simulator
-from sipe_bayes.trajectory import Trajectories
+from sipe_bayes.simulation.simulator import Simulator
 
 TASK, STEPS, BUDGET = "HalfCheetahLinks", 100, 1000
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.benchmark.transfer import settings
+from sipe_bayes.benchmark.transfer.study import settings
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, prior
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.trainer import Trainer

@@ -1,0 +1,137 @@
+"""The output folder of a run: claimed, resumed, filled; every file written under a temporary name and renamed."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+from sipe_bayes.calibration.problem import RUN, Problem
+from sipe_bayes.core.files import OutputError, replacing, to_json, write_text
+from sipe_bayes.diagnostics.result import Calibration
+
+CHECKPOINT = "checkpoint.safetensors"
+RANDOMIZATION = "randomization"
+_RANDOMIZATION_DRAWS = 100  # in the generated code
+_PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
+
+
+def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, Any]:
+    """Configuration, versions, seed and checksums of the inputs."""
+    config = problem.config
+    return {
+        "config": str(config.path),
+        "config_sha256": _checksum(config.path),
+        "model_sha256": problem.simulator.checksum(),  # compiled: with included files and meshes
+        "prior_sha256": _checksum(Path(f"{config.prior.source}.safetensors")) if config.prior else "",
+        "logs_sha256": {report.name: report.sha256 for report in problem.reports},
+        "estimator": estimator,
+        "seed": seed,
+        "budget": budget,
+        "configuration": config.model_dump(mode="json", by_alias=True),
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
+    }
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+_IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
+
+
+def release(folder: Path) -> None:
+    """Give back a folder that was claimed by a run that was refused before it had anything to keep."""
+    if not (folder / CHECKPOINT).exists() and [p.name for p in folder.iterdir()] == [RUN]:
+        (folder / RUN).unlink()
+        folder.rmdir()
+
+
+def claim(folder: Path, run: dict[str, Any]) -> None:
+    """Make ``folder`` this run's own; the same run may come back to it. Raises OutputError when it holds another."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+    record = folder / RUN
+    if record.is_file():
+        try:
+            found = json.loads(record.read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError) as error:
+            raise OutputError(f"--out {folder}: its {RUN} cannot be read ({error}); choose another folder") from None
+        differing = [key for key in _IDENTITY if found.get(key) != run[key]]
+        if differing:
+            what = ", ".join(key.removesuffix("_sha256") for key in differing)
+            raise OutputError(
+                f"--out {folder}: holds another run (it differs in {what}); choose another folder or delete it"
+            )
+        return
+    if folder.is_dir() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
+        raise OutputError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(record, to_json({**run, "status": "started"}, indent=2))
+
+
+def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
+    """Fill the folder of a finished run; its ``run.json`` comes last and says so."""
+    from sipe_bayes.envs.export import ExportError, write_identified
+    from sipe_bayes.envs.randomization_code import write_randomization
+    from sipe_bayes.report.page import write_report
+
+    calibration.posterior.save(folder / "posterior")
+    with replacing(folder / "posterior.nc") as temporary:
+        calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
+    values = problem.environment.space.values(calibration.posterior.mode.numpy())
+    try:
+        calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
+    except ExportError as error:
+        calibration.warnings.append(str(error))
+    draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=_generator())
+    write_randomization(problem.environment, draws, folder / RANDOMIZATION)
+    randomization = domain_randomization(calibration, problem)
+    write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
+    write_report(calibration, folder)
+    write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
+    write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
+
+
+def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, Any]:
+    """What a policy trainer samples from: each parameter's normal in its unit, its bounds, and the covariance.
+
+    ``targets`` says what the value is multiplied by for each target that it is written to, ``posterior`` which saved posterior beside the
+    file the normal stands for (``sipe_bayes.rl.randomization.load_randomization`` reads it)."""
+    import numpy as np
+
+    space = problem.environment.space
+    draws = calibration.posterior.values(4000, generator=_generator())
+    rows = [
+        {
+            "name": p.name,
+            "targets": problem.environment.multipliers(s),
+            "unit": p.unit,
+            "mean": p.mean,
+            "sd": p.sd,
+            "q05": p.q05,
+            "q95": p.q95,
+            "low": s.low,
+            "high": s.high,
+            "log": s.log,
+        }
+        for p, s in zip(calibration.parameters, space, strict=True)
+    ]
+    covariance = np.atleast_2d(np.cov(draws.T))
+    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "posterior": "posterior"}
+
+
+def _generator() -> Any:
+    import torch
+
+    return torch.Generator().manual_seed(0)

@@ -1,0 +1,230 @@
+"""A configuration read and bound: model, logs, unknowns, prior and likelihood, and the estimator that it asks for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sipe_bayes.calibration.config import Config, ConfigError, LogEntry, check_dimensions, load_config, overlap
+from sipe_bayes.calibration.logs import LogReport, load_log
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.units import find_unit, to_si
+from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
+from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.inference import get_estimator
+from sipe_bayes.inference.base import Estimator, Progress
+from sipe_bayes.inference.registry import estimator_class
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
+from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.simulation.simulator import Simulator
+
+_FLAT_SD = 1e3  # stands for a uniform prior beside an earlier posterior
+RUN = "run.json"
+_SCORED = 0.5  # s, windows over which logs are scored and drawn where the likelihood has none
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A configuration read and bound: what an Estimator needs, and the logs behind it."""
+
+    config: Config
+    environment: MjcfEnvironment
+    simulator: Simulator
+    likelihood: Segments | StateSpace
+    prior: Posterior
+    train: Trajectories
+    holdout: Trajectories | None
+    reports: tuple[LogReport, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def segments(self) -> Segments:
+        """The windows by which logs are scored, drawn and checked: the likelihood's own, or, beside a ``StateSpace``, of half a second
+        or what a held-out log's ``window`` says; a shorter log is one window."""
+        if isinstance(self.likelihood, Segments):
+            return self.likelihood
+        own = {log.name: self.config.window_of(log) for log in self.config.logs if log.window is not None}
+        every = [*self.train, *(self.holdout or ())]
+        short = {log.name: None for log in every if len(log) * log.dt < _SCORED}
+        windows = tuple({**short, **own}.items())
+        return Segments(_SCORED, "white", self.likelihood.fit, self.likelihood.noise_sd, windows)
+
+
+def prepare(config: Config | str | Path, num_threads: int | None = None) -> Problem:
+    """Read the model and the logs of a configuration; raises ConfigError, LogError, ModelError or TargetError."""
+    config = config if isinstance(config, Config) else load_config(config)
+    train_logs, held_logs = config.logs_for("train"), config.logs_for("holdout")
+    environment = _environment(config, train_logs)
+    dimensions = {m.target: _dimension(u) for m, u in zip(config.measurements, environment.channel_units, strict=True)}
+    dimensions = {target: d for target, d in dimensions.items() if d}
+    check_dimensions(config, dimensions)
+    read = [load_log(config, log, dimensions) for log in (*train_logs, *held_logs)]
+    trajectories = [t for t, _ in read]
+    held = trajectories[len(train_logs) :]
+    reports = tuple(report for _, report in read)
+    for held_log, copy in zip(held_logs, reports[len(train_logs) :], strict=True):
+        for log, report in zip(train_logs, reports[: len(train_logs)], strict=True):
+            if copy.sha256 == report.sha256 and overlap(held_log.span, log.span):
+                raise ConfigError(
+                    f"{config.path}: log {held_log.name!r} is held out, but {held_log.file} is a copy of {log.file}, which trains; hold out another log"
+                )
+    prior, remarks = _prior(config, environment.space, reports[: len(train_logs)])
+    return Problem(
+        config,
+        environment,
+        Simulator(environment, num_threads),
+        _likelihood(config),
+        prior,
+        Trajectories.stack(trajectories[: len(train_logs)]),
+        Trajectories.stack(held) if held else None,
+        reports,
+        remarks,
+    )
+
+
+def _dimension(unit: str) -> str:
+    try:
+        return find_unit(unit).dimension
+    except ValueError:
+        return ""
+
+
+def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
+    parameters: list[Parameter] = []
+    for i, entry in enumerate(config.parameters):
+        low, high = entry.bounds or entry.factor or (0.0, 1.0)
+        try:
+            one = Parameter(
+                entry.name,
+                low,
+                high,
+                scale=entry.scale,
+                targets=entry.targets,
+                relative=entry.factor is not None,
+                unit=_command_unit(config, entry.targets[0]),
+                prior_mean=entry.prior.mean if entry.prior else None,
+                prior_sd=entry.prior.sd if entry.prior else None,
+                description=entry.description,
+            )
+        except ValueError as error:
+            raise ConfigError(f"{config.path}: key `parameters[{i}]`: {error}") from None
+        logs = [log.name for log in train] if entry.per_log else []
+        parameters += [replace(one, name=f"{one.name}[{log}]", log=log) for log in logs] or [one]
+    channels = [Channel(m.target, m.name) for m in config.measurements]
+    try:
+        return MjcfEnvironment.build(config.model, parameters, [c.actuator for c in config.commands], channels)
+    except (TargetError, ModelError):
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{config.path}: {error}") from None
+
+
+def _command_unit(config: Config, target: str) -> str:
+    """The unit of a command offset is the command's; other units are the model's own (empty here)."""
+    units = {f"{c.target}.offset": to_si(c.unit)[1] for c in config.commands}
+    return units.get(target, "")
+
+
+def _likelihood(config: Config) -> Segments | StateSpace:
+    fit = tuple(m.name for m in config.measurements if m.fit)
+    noise_sd = tuple(m.noise_sd for m in config.measurements)
+    if config.likelihood == "state_space":
+        return StateSpace(fit, noise_sd)
+    window = None if config.window == "log" else config.window
+    return Segments(
+        window=window,
+        noise=config.noise.model,
+        fit=fit,
+        noise_sd=noise_sd,
+        windows=tuple((log.name, config.window_of(log)) for log in config.logs if log.window is not None),
+    )
+
+
+def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) -> tuple[Posterior, tuple[str, ...]]:
+    """The parameters' own priors, or the normal of an earlier posterior for the parameters that it knows, matched by name;
+    and warnings."""
+    own = default_prior(space)
+    if config.prior is None:
+        return own, ()
+    earlier = load_posterior(config.prior.source)
+    shared = [n for n in space.names if n in earlier.space.names]
+    if not shared:
+        raise ConfigError(
+            f"{config.path}: key `prior.from`: the posterior knows {list(earlier.space.names)}, none of them is asked for "
+            f"here ({list(space.names)}); rename the parameters or drop the key"
+        )
+    mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
+    covariance[np.isinf(covariance)] = _FLAT_SD**2
+    old_mean, old_covariance = (x.numpy() for x in earlier.gaussian_moments())
+    new, old = [space.index(n) for n in shared], [earlier.space.index(n) for n in shared]
+    slope, shift = np.empty(len(shared)), np.empty(len(shared))
+    for k, (i, j) in enumerate(zip(new, old, strict=True)):
+        for what in ("scale", "unit"):
+            there, here = getattr(earlier.space[j], what), getattr(space[i], what)
+            if there != here:
+                raise ConfigError(
+                    f"{config.path}: key `prior.from`: {space[i].name!r} had the {what} {there!r} there and has {here!r} here; "
+                    "use the same"
+                )
+        ends = space[i].normalise(earlier.space[j].value(np.array([0.0, 1.0])))
+        slope[k], shift[k] = ends[1] - ends[0], ends[0]
+    mean[new] = shift + slope * old_mean[old]
+    covariance[np.ix_(new, new)] = slope[:, None] * old_covariance[np.ix_(old, old)] * slope
+    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space), _remarks(config, earlier, train)
+
+
+def _remarks(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> tuple[str, ...]:
+    """What is to be said of an earlier posterior as the prior."""
+    assert config.prior is not None
+    remarks = []
+    if isinstance(earlier, GaussianMixture) and len(earlier.means) > 1:
+        remarks.append(
+            f"the earlier posterior is a mixture of {len(earlier.means)} normals; one with its mean and covariance stands for it"
+        )
+    record = Path(config.prior.source).parent / RUN
+    if record.is_file():
+        before = set(json.loads(record.read_text(encoding="utf-8")).get("logs_sha256", {}).values())
+        again = [report.name for report in train if report.sha256 in before]
+        if again:
+            remarks.append(
+                f"the earlier posterior has seen {', '.join(again)} already: counted twice, the intervals come out too narrow"
+            )
+    return tuple(remarks)
+
+
+def method_of(
+    problem: Problem,
+    estimator: str | None,
+    seed: int | None,
+    budget: int | None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Estimator:
+    """The configuration's estimator; what is given overrides it."""
+    config = problem.config
+    name = estimator or config.estimator
+    takes = estimator_class(name).searches
+    if not takes and config.search != type(config.search)():
+        raise ConfigError(f"{config.path}: key `search`: {name} does not search from several starts; drop the key")
+    if not takes and config.likelihood == "state_space":
+        raise ConfigError(
+            f"{config.path}: key `likelihood`: 'state_space' is for laplace and mcmc, got {name}; use 'segments'"
+        )
+    return get_estimator(
+        problem.simulator,
+        name,
+        prior=problem.prior,
+        likelihood=problem.likelihood,
+        seed=config.seed if seed is None else seed,
+        budget=config.budget if budget is None else budget,
+        **(config.search.model_dump() if takes else {}),
+        checkpoint=checkpoint,
+        progress=progress,
+    )

@@ -1,0 +1,216 @@
+"""The command ``sipe``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sipe_bayes.cli import benchmark as benchmark_commands
+from sipe_bayes.cli import check as check_commands
+from sipe_bayes.cli import data as data_commands
+from sipe_bayes.cli import suggest as suggest_commands
+from sipe_bayes.cli import train as rl_commands
+from sipe_bayes.cli import transfer as transfer_commands
+from sipe_bayes.cli.progress import Progress
+from sipe_bayes.cli.refusing import refusing
+from sipe_bayes.inference.registry import ESTIMATORS
+
+if TYPE_CHECKING:
+    from sipe_bayes.diagnostics.result import Calibration
+
+app = typer.Typer(
+    name="sipe",
+    help="Calibrate robot simulators with honest uncertainty.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.add_typer(data_commands.app)
+app.add_typer(benchmark_commands.app)
+app.add_typer(transfer_commands.app)
+app.command()(benchmark_commands.simulate)
+app.command()(check_commands.check)
+app.command()(suggest_commands.suggest)
+app.command()(rl_commands.train)
+app.command()(rl_commands.agents)
+
+_ABORTED = 1
+# what the parser says of options and arguments, whose name typer keeps private
+_REFUSED: Any = typer.BadParameter.__mro__[2]
+_PIPED_WIDTH = 120
+_TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
+
+
+def main() -> None:
+    """Entry point: input errors are one line on standard error and exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except typer.Abort:
+        code = _ABORTED
+    except _REFUSED as error:
+        message = error.format_message()
+        if not message or "\n" in message:  # the help, where a command was given nothing
+            error.show()
+        else:
+            print(f"sipe: {message[:1].lower()}{message[1:].rstrip('.')}; see --help of the command", file=sys.stderr)
+        code = error.exit_code
+    sys.exit(code or 0)
+
+
+@app.callback()
+def _root() -> None:
+    """Calibrate robot simulators with honest uncertainty."""
+
+
+@app.command()
+def calibrate(
+    config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
+    estimator: Annotated[
+        str | None, typer.Option(help=f"{', '.join(ESTIMATORS)}; default: the configuration's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Default: the configuration's.")] = None,
+    budget: Annotated[int | None, typer.Option(help="Rollouts: logs times parameter values simulated.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-ESTIMATOR.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+    threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+) -> None:
+    """Posterior of a simulator's parameters from logs of the real machine."""
+    from sipe_bayes.calibration.run import run
+    from sipe_bayes.core.files import to_json
+
+    with refusing("; the same command goes on"), Progress(quiet=as_json) as progress:
+        _check("--seed", seed, 0)
+        _check("--budget", budget, 1)
+        _check("--threads", threads, 1)
+        found = run(config, estimator, seed, budget, out, threads, progress.update)
+    if as_json:
+        print(to_json(found.to_dict()))
+    else:
+        print_calibration(found)
+
+
+@app.command()
+def envs(
+    name: Annotated[str | None, typer.Argument(help="A task; without it all are listed.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
+) -> None:
+    """The benchmark's environments; with NAME its parameters and how much each moves what is observed."""
+    from sipe_bayes.core.files import to_json
+    from sipe_bayes.diagnostics.catalogue import describe, tasks
+
+    with refusing():  # assets may not be installed
+        found: Any = tasks() if name is None else describe(name)
+    if as_json:
+        print(to_json(found))
+    elif name is None:
+        print_tasks(found)
+    else:
+        print_task(found)
+
+
+def _check(option: str, value: int | None, least: int) -> None:
+    if value is not None and value < least:
+        raise ValueError(f"{option} {value}: expected at least {least}; raise it or leave it out")
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    console = Console(soft_wrap=True)
+    if not console.is_terminal:
+        console.width = _PIPED_WIDTH
+    return console
+
+
+def print_tasks(found: list[dict[str, Any]]) -> None:
+    """One line for every task, on standard output."""
+    from rich.table import Table
+
+    table = Table()
+    for heading in ("environment", "parameters", "observations", "actions", "steps", "solved at", "reproduces"):
+        table.add_column(heading, justify="left" if heading in ("environment", "reproduces") else "right")
+    for t in found:
+        solved = f"{t['solved_by']} {t['solved_at']:g}"
+        sizes = (str(t[k]) for k in ("parameters", "observations", "actions", "episode_steps"))
+        table.add_row(t["name"], *sizes, solved, t["reproduces"])
+    _console().print(table)
+
+
+def print_task(found: dict[str, Any]) -> None:
+    """A task's parameter table, what each does, its sensitivities and what changes nothing, on standard output."""
+    from rich.table import Table
+    from rich.text import Text
+
+    console = _console()
+    console.print(Text(f"{found['name']} ({found['id']}): {found['summary']}"))
+    console.print(
+        Text(
+            f"{found['observations']} observations, {found['actions']} actions, {found['episode_steps']} steps an episode; "
+            f"solved at a {found['solved_by']} of {found['solved_at']:g}; theta = 0.5 is {found['reproduces']}"
+        )
+    )
+    levels = found["sensitivity_at_theta"]
+    table = Table(
+        caption="moved at theta: rms change of the observations, in their spreads, for a 10 % change of the value"
+    )
+    for heading in ("parameter", "default", "from", "to", "unit", *(f"at {level:g}" for level in levels)):
+        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
+    for p in found["parameters"]:
+        numbers = (f"{p[k]:.4g}" for k in ("default", "low", "high"))
+        moved = (f"{x:.2g}" for x in p["sensitivity"])
+        table.add_row(p["name"], *numbers, p["unit"], *moved)
+    console.print(table)
+    for p in found["parameters"]:
+        console.print(Text(f"{p['name']} ({', '.join(p['writes'])}): {p['description']}"))
+    for name in found["changes_nothing"]:
+        console.print(
+            Text(f"{name} changes nothing under random actions: expect the prior back unless the actions do better")
+        )
+    for name, where in found["changes_nothing_at_theta"].items():
+        console.print(Text(f"{name} changes nothing at theta = {', '.join(f'{w:g}' for w in where)}"))
+
+
+def print_calibration(found: Calibration) -> None:
+    """What to think of it, the table of parameters, the errors, the warnings and where the report lies, on standard output."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from sipe_bayes.report.page import parameter_verdict, significant, verdicts
+
+    console = _console()
+    console.print(Text(f"{found.name}: posterior by {found.estimator}"))
+    for verdict in verdicts(found):
+        console.print(Text(verdict.text, style=_TONES[verdict.tone]))
+    table = Table()
+    for heading in ("parameter", "value", "90 % interval", "unit", "verdict"):
+        table.add_column(heading, justify="right" if heading in ("value", "90 % interval") else "left")
+    for p in found.parameters:
+        scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
+        value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
+        verdict = parameter_verdict(p, found.ridges, found.doubts)
+        # brackets of a name are not markup
+        table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
+    console.print(table)
+    for title, scores in (("held out", found.holdout), ("train", found.train)):
+        for s in scores:
+            ratio = s.rmse_default / s.rmse if s.rmse else float("inf")
+            console.print(
+                f"{title} {s.log}, {s.channel}: RMSE {s.rmse:.3g} {s.unit}; model as given {s.rmse_default:.3g} "
+                f"({ratio:.1f} times that of the estimate)",
+                highlight=False,
+                markup=False,
+            )
+    for sentence in found.left_out:
+        console.print(f"left out: {sentence}", highlight=False, markup=False)
+    for warning in found.warnings:
+        console.print(f"warning: {warning}", highlight=False, markup=False)
+    console.print(f"{found.rollouts} rollouts, {found.seconds:.1f} s", highlight=False)
+    if found.out:
+        console.print(f"report: {Path(found.out) / 'report.html'}", highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    main()

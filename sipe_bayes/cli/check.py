@@ -1,0 +1,82 @@
+"""The command ``sipe check``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sipe_bayes.cli.refusing import refusing
+from sipe_bayes.core.validation import at_least, whole
+from sipe_bayes.inference.registry import ESTIMATORS
+
+
+def check(
+    target: Annotated[str, typer.Argument(help="A configuration (.toml), or a task of `sipe envs`.")],
+    estimator: Annotated[str, typer.Argument(help=", ".join(ESTIMATORS))],
+    truths: Annotated[int, typer.Option(help="Logs simulated and fitted, at least 20.")] = 100,
+    budget: Annotated[int | None, typer.Option(help="Rollouts of each fit; default the estimator's.")] = None,
+    refits: Annotated[int, typer.Option(help="Check sipe.Recalibrated(ESTIMATOR, refits=...) instead.")] = 0,
+    noise: Annotated[float, typer.Option(help="Of a task: sd as a share of each channel's spread.")] = 0.01,
+    steps: Annotated[int, typer.Option(help="Of a task: control steps of a log.")] = 100,
+    seed: Annotated[int, typer.Option(help="Of truths, noise and fits.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; default checks/NAME-ESTIMATOR. The same command goes on.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+    threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+) -> None:
+    """Simulation-based calibration: do the estimator's intervals hold the truth on this model, noise and commands?
+
+    Exit code 1 where they do not."""
+    with refusing("; the same command goes on"):
+        from sipe_bayes.calibration import check as checks
+        from sipe_bayes.core.files import to_json
+        from sipe_bayes.diagnostics.coverage import FEWEST
+
+        for option, value, least in (
+            ("--truths", truths, FEWEST),
+            ("--steps", steps, 1),
+            ("--refits", refits, 0),
+            ("--seed", seed, 0),
+        ):
+            whole(option, value, least)
+        at_least("--noise", noise, 0)
+        if target.endswith(".toml"):
+            study = checks.study_of_config(
+                Path(target), estimator, budget=budget, refits=refits, seed=seed, threads=threads
+            )
+        else:
+            study = checks.study_of_task(
+                target, estimator, steps=steps, noise=noise, budget=budget, refits=refits, seed=seed, threads=threads
+            )
+        path = Path(target)
+        stem = path.resolve().parent.name if path.stem in ("calibrate", "config") else path.stem
+        folder = out or Path("checks") / f"{stem}-{estimator}{f'-recalibrated{refits}' if refits else ''}"
+        once, each = study.cost
+        trained = f"one training of {once} rollouts, then " * bool(once)
+        of = f" of at most {each} rollouts each" * bool(each)
+        if not as_json:
+            print(f"{trained}{truths} fits{of}, kept in {folder}", flush=True)
+        found = checks.run(study, truths, folder, _say if not as_json and sys.stderr.isatty() else _silent)
+    if as_json:
+        print(to_json(found.to_dict()))
+    else:
+        print(found.sentence())
+        for line in found.check.sentences():
+            print(line)
+        for name, c in zip(found.check.names, found.contraction, strict=True):
+            print(f"{name}: {found.check.verdict(name)}, mean contraction {c:.2f}")
+        print(f"figures: {folder / 'ranks.png'}, {folder / 'coverage.png'}")
+    if not found.check.calibrated:
+        raise typer.Exit(1)
+
+
+def _say(what: str, done: int, of: int) -> None:
+    print(f"\r{what}\033[K", end="\r", file=sys.stderr, flush=True)
+
+
+def _silent(what: str, done: int, of: int) -> None:
+    pass

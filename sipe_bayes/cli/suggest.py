@@ -1,0 +1,184 @@
+"""The command ``sipe suggest``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sipe_bayes.cli.refusing import refusing
+from sipe_bayes.core.validation import positive, whole
+
+if TYPE_CHECKING:
+    from sipe_bayes.calibration.problem import Problem
+    from sipe_bayes.diagnostics.expected import Plan
+    from sipe_bayes.likelihood.noise import Noise
+    from sipe_bayes.posterior import Posterior
+
+_SHOWN = 10
+
+
+def suggest(
+    config: Annotated[Path, typer.Argument(help="TOML file of `sipe calibrate`.")],
+    candidates: Annotated[int, typer.Option(help="Sequences that are generated.")] = 24,
+    given: Annotated[
+        list[Path] | None,
+        typer.Option(help="CSV of commands with columns as the logs', to be ranked too; again for several."),
+    ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option("--for", help="Parameters that count; again for several; default all.")
+    ] = None,
+    posterior: Annotated[
+        Path | None, typer.Option(help="What is known so far: RUN/posterior of `sipe calibrate`; default the prior.")
+    ] = None,
+    duration: Annotated[float, typer.Option(help="Seconds.")] = 5.0,
+    low: Annotated[float | None, typer.Option(help="Hz; default one period in the duration.")] = None,
+    high: Annotated[float | None, typer.Option(help="Hz; default 5, or a fifth of the log's rate.")] = None,
+    draws: Annotated[int, typer.Option(help="Of what is known, over which the gain is averaged.")] = 4,
+    seed: Annotated[int, typer.Option(help="Of candidates and draws.")] = 0,
+    out: Annotated[Path, typer.Option(help="The best sequence, as CSV with the configuration's columns.")] = Path(
+        "suggested.csv"
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+    threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+) -> None:
+    """Which experiment next: command sequences ranked by the expected contraction of the parameters' sds."""
+    with refusing():
+        import numpy as np
+
+        from sipe_bayes.calibration.problem import prepare
+        from sipe_bayes.core.files import to_json
+        from sipe_bayes.diagnostics import suggest as suggestions
+
+        whole("--candidates", candidates, 0)
+        whole("--seed", seed, 0)
+        whole("--draws", draws)
+        positive("--duration", duration)
+        problem = prepare(config, threads)
+        used = {
+            path.resolve()
+            for path in (config, problem.config.model, *(log.file for log in problem.config.logs), *(given or []))
+        }
+        if out.resolve() in used:
+            raise ValueError(f"--out {out}: is what {config} reads, and would be lost; choose another name")
+        dt = float(problem.train.dt[0])
+        bounds = suggestions.limits(problem.simulator, np.concatenate([log.actions for log in problem.train]))
+        band = (low or 1 / duration, high or min(5.0, 0.2 / dt))
+        plans = suggestions.generate(candidates, duration, dt, bounds, band, seed)
+        plans += [_read(problem, file, dt) for file in given or []]
+        if not plans:
+            raise ValueError("--candidates: expected at least 1, or --given; got none")
+        known = _known(problem, posterior)
+        found = suggestions.rank(
+            problem.simulator,
+            problem.segments,
+            plans,
+            _noise(problem, posterior),
+            known,
+            parameter or (),
+            draws=draws,
+            seed=seed,
+        )
+        _write(problem, found[0].plan, out)
+    plain = suggestions.to_dict(found, problem.simulator, parameter or ())
+    if as_json:
+        print(to_json({**plain, "out": str(out)}))
+        return
+    for row in plain["candidates"][:_SHOWN]:
+        each = ", ".join(f"{name} {row['contraction'][name]:.2f}" for name in plain["parameters"])
+        reach = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, (a, b) in row["reach"].items())
+        lost = f"; diverges at {row['diverged']} of {draws} draws" if row["diverged"] else ""
+        print(f"{row['score']:.3f}  {row['name']}: expected contraction {each}; reaches {reach}{lost}")
+    print(f"the first one is in {out}; check what it reaches before it runs on the machine")
+
+
+def _known(problem: Problem, path: Path | None) -> Posterior:
+    from sipe_bayes.posterior import load_posterior
+
+    if path is None:
+        return problem.prior
+    found = load_posterior(path)
+    difference = found.space.difference(problem.simulator.space)
+    if difference:
+        raise ValueError(f"--posterior {path}: {difference} in the configuration; give that of a run of it")
+    return found
+
+
+def _noise(problem: Problem, path: Path | None) -> Noise:
+    """Of the fitted channels: as the run beside the posterior found it, else by a fit."""
+    import json
+
+    import numpy as np
+
+    from sipe_bayes.inference.recalibrated import fitted_noise
+    from sipe_bayes.likelihood.noise import Noise
+
+    channels = list(problem.simulator.environment.channels)
+    fitted = list(problem.segments.fit or channels)
+    record = None if path is None else path.parent / "result.json"
+    if record is not None and record.is_file():
+        noise = json.loads(record.read_text(encoding="utf-8"))["noise"]
+        if set(fitted) <= set(noise):
+            return Noise(*(np.array([noise[c][what] for c in fitted]) for what in ("sd", "tau")))
+    every, *_ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior)
+    chosen = [channels.index(c) for c in fitted]
+    return Noise(every.sd[chosen], every.tau[chosen])
+
+
+def _read(problem: Problem, file: Path, dt: float) -> Plan:
+    """Commands of a table, in the configuration's columns and units, on the logs' grid."""
+    import numpy as np
+
+    from sipe_bayes.calibration.tables import read_table
+    from sipe_bayes.core.units import to_si
+    from sipe_bayes.diagnostics.expected import Plan
+
+    clock, commands, model = problem.config.columns.time, problem.config.commands, problem.simulator.model
+    table, names = read_table(file), [clock.column, *(c.column for c in commands)]
+    for name in names:
+        if name not in table:
+            raise ValueError(f"--given {file}: no column {name!r}; it has {list(table)}")
+    seconds, *series = (_numbers(file, name, table[name]) for name in names)
+    seconds = (seconds - seconds[0]) * to_si(clock.unit)[0]
+    if any(len(values) != len(seconds) for values in series) or not (np.diff(seconds) > 0).all():
+        raise ValueError(f"--given {file}: expected a command for each time, and times that increase; sort the rows")
+    grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
+    held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
+    columns = [c.sign * to_si(c.unit)[0] * values[held] for c, values in zip(commands, series, strict=True)]
+    for command, values in zip(commands, columns, strict=True):
+        actuator = model.actuator(command.actuator).id
+        low, high = model.actuator_ctrlrange[actuator]
+        slack = 1e-6 * (high - low)
+        if model.actuator_ctrllimited[actuator] and not low - slack <= values.min() <= values.max() <= high + slack:
+            raise ValueError(
+                f"--given {file}: {command.column!r} makes {command.actuator} go from {values.min():.4g} to {values.max():.4g}, beyond its "
+                f"control range, {low:.4g} to {high:.4g}, in the model's unit; make it smaller"
+            )
+    return Plan(np.stack(columns, axis=1), dt, name=str(file))
+
+
+def _numbers(file: Path, name: str, column: Any) -> Any:
+    import numpy as np
+
+    try:
+        values = np.asarray(column, float)
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
+    if not np.isfinite(values).all():
+        raise ValueError(f"--given {file}: column {name!r} holds what is no number; fill it in")
+    return values
+
+
+def _write(problem: Problem, plan: Plan, out: Path) -> None:
+    import numpy as np
+    import pandas as pd
+
+    from sipe_bayes.core.files import write_text
+    from sipe_bayes.core.units import to_si
+
+    clock = problem.config.columns.time
+    columns: dict[str, Any] = {clock.column: np.arange(len(plan.actions)) * plan.dt / to_si(clock.unit)[0]}
+    for command, column in zip(problem.config.commands, plan.actions.T, strict=True):
+        columns[command.column] = command.sign * column / to_si(command.unit)[0]
+    write_text(out, pd.DataFrame(columns).to_csv(index=False, float_format="%.9g"))

@@ -1,0 +1,224 @@
+"""Recorded or simulated motion: one ``Trajectory``, or a padded batch ``Trajectories``.
+
+Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state), rewards (T,); dt in seconds.
+Action t is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``:
+masked, never invented.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.core.files import replacing
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One trajectory of T control steps, ``dt`` seconds apart.
+
+    observations (T+1, O), NaN where there is no measurement; actions (T, A), finite; states (T+1, S) or None;
+    rewards (T,) or None. ``name`` is the log's name; ``channels`` names the O observed quantities.
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    dt: float
+    states: FloatArray | None = None
+    name: str = ""
+    channels: tuple[str, ...] = ()
+    rewards: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        label = f"trajectory {self.name!r}"
+        observations = np.atleast_2d(np.asarray(self.observations, dtype=np.float64))
+        actions = np.asarray(self.actions, dtype=np.float64)
+        if observations.ndim != 2 or actions.ndim != 2 or len(observations) != len(actions) + 1:
+            raise ValueError(
+                f"{label}: expected observations (T+1, O) and actions (T, A), "
+                f"got {observations.shape} and {actions.shape}"
+            )
+        if not len(actions):
+            raise ValueError(f"{label}: expected at least one control step, got none")
+        if not 0 < self.dt < np.inf:
+            raise ValueError(f"{label}: dt must be positive, got {self.dt}")
+        if not np.isfinite(actions).all():
+            raise ValueError(f"{label}: actions must be finite, got {int((~np.isfinite(actions)).sum())} that are not")
+        states = None if self.states is None else np.asarray(self.states, dtype=np.float64)
+        if states is not None and (states.ndim != 2 or len(states) != len(observations)):
+            raise ValueError(f"{label}: expected states ({len(observations)}, S), got {states.shape}")
+        rewards = None if self.rewards is None else np.asarray(self.rewards, dtype=np.float64)
+        if rewards is not None and rewards.shape != (len(actions),):
+            raise ValueError(f"{label}: expected rewards ({len(actions)},), one for each step, got {rewards.shape}")
+        if self.channels and len(self.channels) != observations.shape[1]:
+            raise ValueError(f"{label}: {len(self.channels)} channel names for {observations.shape[1]} channels")
+        object.__setattr__(self, "observations", observations)
+        object.__setattr__(self, "actions", actions)
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "rewards", rewards)
+
+    def __len__(self) -> int:
+        """Control steps T."""
+        return len(self.actions)
+
+    @property
+    def time(self) -> FloatArray:
+        """Sample times (T+1,) in seconds from the start."""
+        return np.arange(len(self) + 1, dtype=np.float64) * self.dt
+
+    def slice(self, start: int, stop: int) -> Trajectory:
+        """Control steps start..stop, with both end samples; 0 <= start < stop <= T."""
+        if not 0 <= start < stop <= len(self):
+            raise ValueError(
+                f"trajectory {self.name!r}: expected 0 <= start < stop <= {len(self)}, got {start} and {stop}"
+            )
+        states = None if self.states is None else self.states[start : stop + 1]
+        return Trajectory(
+            self.observations[start : stop + 1],
+            self.actions[start:stop],
+            self.dt,
+            states,
+            self.name,
+            self.channels,
+            None if self.rewards is None else self.rewards[start:stop],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories(Sequence[Trajectory]):
+    """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,),
+    length (B,), rewards (B, T) or None: of simulated tasks, zero where a step was not valid, going on after a task's end.
+
+    Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first
+    sample of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index
+    gives a Trajectory, a slice or an array of them Trajectories that keep ``valid``.
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    dt: FloatArray
+    length: NDArray[np.int64]
+    valid: BoolArray
+    states: FloatArray | None = None
+    names: tuple[str, ...] = ()
+    channels: tuple[str, ...] = field(default=())
+    rewards: FloatArray | None = None
+
+    @classmethod
+    def stack(cls, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Trajectories:
+        """A batch of one or several trajectories, which may differ in length and dt. States and rewards are kept where all
+        of them have them."""
+        if isinstance(trajectories, Trajectories):
+            return trajectories
+        items = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
+        if not items:
+            raise ValueError("trajectories: expected at least one, got none")
+        sizes = {(t.observations.shape[1], t.actions.shape[1]) for t in items}
+        if len(sizes) > 1:
+            raise ValueError(f"trajectories differ in (observation, action) sizes: {sorted(sizes)}")
+        channels = {t.channels for t in items if t.channels}
+        if len(channels) > 1:
+            raise ValueError(f"trajectories differ in their channels: {sorted(channels)}")
+        state_sizes = {t.states.shape[1] for t in items if t.states is not None}
+        if len(state_sizes) > 1:
+            raise ValueError(f"trajectories differ in the size of their states: {sorted(state_sizes)}")
+        batch, steps = len(items), max(len(t) for t in items)
+        (n_obs, n_act), with_states = sizes.pop(), all(t.states is not None for t in items)
+        observations = np.full((batch, steps + 1, n_obs), np.nan)
+        actions = np.zeros((batch, steps, n_act))
+        states = None
+        if with_states:
+            states = np.full((batch, steps + 1, items[0].states.shape[1]), np.nan)  # type: ignore[union-attr]
+        rewards = np.zeros((batch, steps)) if all(t.rewards is not None for t in items) else None
+        for i, t in enumerate(items):
+            observations[i, : len(t) + 1], actions[i, : len(t)] = t.observations, t.actions
+            if states is not None and t.states is not None:
+                states[i, : len(t) + 1] = t.states
+            if rewards is not None and t.rewards is not None:
+                rewards[i, : len(t)] = t.rewards
+        length = np.array([len(t) for t in items])
+        valid = np.arange(steps + 1)[None] <= length[:, None]
+        names = tuple(t.name or str(i) for i, t in enumerate(items))
+        dt = np.array([t.dt for t in items])
+        names_of_channels = channels.pop() if channels else ()
+        return cls(observations, actions, dt, length, valid, states, names, names_of_channels, rewards)
+
+    @property
+    def longest(self) -> float:
+        """Seconds of the longest; of the correlation times of its noise, the longest that can be told."""
+        return float((self.length * self.dt).max())
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, (slice, Sequence, np.ndarray)):
+            return self._subset(np.arange(len(self))[key])
+        n = int(self.length[key])
+        states = None if self.states is None else self.states[key, : n + 1]
+        name = self.names[key] if self.names else ""
+        dt = float(self.dt[key])
+        observations, actions = self.observations[key, : n + 1], self.actions[key, :n]
+        rewards = None if self.rewards is None else self.rewards[key, :n]
+        return Trajectory(observations, actions, dt, states, name, self.channels, rewards)
+
+    def _subset(self, chosen: NDArray[np.int64]) -> Trajectories:
+        if not len(chosen):
+            raise ValueError(f"trajectories: expected to choose at least one of {len(self)}, got none")
+        length = self.length[chosen]
+        steps = int(length.max())
+        return Trajectories(
+            self.observations[chosen, : steps + 1],
+            self.actions[chosen, :steps],
+            self.dt[chosen],
+            length,
+            self.valid[chosen, : steps + 1],
+            None if self.states is None else self.states[chosen, : steps + 1],
+            tuple(self.names[i] for i in chosen) if self.names else (),
+            self.channels,
+            None if self.rewards is None else self.rewards[chosen, :steps],
+        )
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return (self[i] for i in range(len(self)))
+
+    def save(self, path: str | Path) -> None:
+        """Write to an npz file, under exactly this name and atomically."""
+        arrays: dict[str, Any] = {
+            "observations": self.observations,
+            "actions": self.actions,
+            "dt": self.dt,
+            "length": self.length,
+            "valid": self.valid,
+            "names": np.array(self.names, dtype=np.str_),
+            "channels": np.array(self.channels, dtype=np.str_),
+        }
+        if self.states is not None:
+            arrays["states"] = self.states
+        if self.rewards is not None:
+            arrays["rewards"] = self.rewards
+        with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Trajectories:
+        """Read what ``save`` wrote; runs no code from the file. Raises ValueError for another file."""
+        needed = {"observations", "actions", "dt", "length", "valid", "names", "channels"}
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {key: data[key] for key in data.files}
+        except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as error:
+            raise ValueError(f"{path}: expected an npz file of trajectories, got {error}") from None
+        if arrays.keys() - {"states", "rewards"} != needed:
+            raise ValueError(f"{path}: expected the arrays {sorted(needed)}, got {sorted(arrays)}")
+        names, channels = (tuple(str(s) for s in arrays.pop(key)) for key in ("names", "channels"))
+        return cls(**arrays, names=names, channels=channels)

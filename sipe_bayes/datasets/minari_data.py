@@ -1,0 +1,176 @@
+"""Trajectories to and from Minari, the Farama Foundation's format of offline data sets (https://minari.farama.org).
+
+``sipe.from_minari("mujoco/halfcheetah/expert-v0")`` reads a data set that is installed, whoever made it;
+``sipe data export --minari NAME`` writes one. It is looked for, and written, where Minari has them: in the folder of
+``MINARI_DATASETS_PATH``, default ~/.minari/datasets. Nothing is downloaded, and no code that a data set names is run.
+
+An observation that is a dictionary or a tuple becomes one row: its parts in the space's order, but the achieved and the desired
+goal of a goal-based environment last, as in this library's Fetch tasks. Minari has no place for the physics states: those
+exported here are in each episode's ``infos["state"]``, and come back.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.registry import TASKS
+
+FloatArray = NDArray[np.float64]
+
+_GOALS = ("achieved_goal", "desired_goal")
+_STATE = "state"
+
+
+def from_minari(dataset: str | Path, dt: float | None = None) -> Trajectories:
+    """The episodes of a Minari data set: its id, or the folder that it lies in.
+
+    dt: seconds of a control step; by default that of the data set's environment where Gymnasium knows it by itself, and must be
+    given otherwise. Rewards are kept, and states where this library wrote them. Raises ValueError for what cannot be read and
+    ModuleNotFoundError without Minari.
+    """
+    found = _open(dataset)
+    if dt is None:
+        dt = _dt(found.spec.env_spec, dataset)
+    episodes = [_trajectory(episode, dt, str(dataset)) for episode in found.iterate_episodes()]
+    if not episodes:
+        raise ValueError(f"dataset: {dataset} holds no episodes; take another")
+    return Trajectories.stack(episodes)
+
+
+def to_minari(trajectories: Trajectories, dataset: str, task: str, description: str = "", command: str = "") -> Path:
+    """Write trajectories of ``task`` with rewards as a new Minari data set, actions in float32; returns its folder. Raises
+    ValueError for a name that is none, or is taken."""
+    minari = _minari()
+    if trajectories.rewards is None:
+        raise ValueError("trajectories: they hold no rewards, which Minari needs; export them without noise")
+    import gymnasium
+
+    import sipe_bayes.simulation.gym  # registers the ids
+
+    folder, env = _new_folder(dataset), sipe_bayes.simulation.gym.make(task)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of authors that are not named
+            minari.create_dataset_from_buffers(
+                dataset,
+                _buffers(trajectories),
+                gymnasium.spec(f"sipe/{task}-v0"),
+                observation_space=env.observation_space,
+                action_space=env.action_space,
+                description=f"{description} Made by: {command}".strip(),
+                requirements=["sipe-bayes"],
+            )
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)  # no half of a data set
+        raise
+    return folder
+
+
+def _new_folder(dataset: str) -> Path:
+    """Where Minari will put a data set of that name; raises ValueError."""
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    try:
+        parse_dataset_id(dataset)
+    except ValueError:
+        raise ValueError(f"dataset: expected a name such as sipe/door/expert-v0, got {dataset!r}") from None
+    folder = Path(get_dataset_path(dataset))
+    if folder.exists():
+        raise ValueError(f"dataset: {folder} exists; choose another name than {dataset}, or `minari delete {dataset}`")
+    return folder
+
+
+def _buffers(trajectories: Trajectories) -> list[Any]:
+    """An EpisodeBuffer of each trajectory, cut off at its end."""
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    found = []
+    for i, episode in enumerate(trajectories):
+        ends = np.arange(len(episode)) == len(episode) - 1
+        infos = None if episode.states is None else {_STATE: episode.states}
+        actions = episode.actions.astype(np.float32)
+        found.append(
+            EpisodeBuffer(
+                i, None, None, episode.observations, actions, episode.rewards, np.zeros_like(ends), ends, infos
+            )
+        )
+    return found
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ImportError:
+        raise ModuleNotFoundError("Minari is not installed: pip install 'minari[hdf5]'") from None
+    return minari
+
+
+def _open(dataset: str | Path) -> Any:
+    """A minari.MinariDataset; raises ValueError for what is none."""
+    minari, folder = _minari(), Path(dataset)
+    try:
+        if folder.is_dir():
+            return minari.MinariDataset(folder / "data" if (folder / "data").is_dir() else folder)
+        return minari.load_dataset(str(dataset))
+    except (ValueError, OSError, KeyError) as error:
+        raise ValueError(
+            f"dataset: {dataset} cannot be read as a Minari data set ({' '.join(str(error).split())}); "
+            "see `minari list local`"
+        ) from None
+
+
+def _dt(spec: Any, dataset: str | Path) -> float:
+    """Seconds of a control step of an environment that Gymnasium makes by its id."""
+    import gymnasium
+
+    import sipe_bayes.simulation.gym
+
+    remedy = f"dataset: {dataset} does not say how long a control step is; pass dt in seconds"
+    if spec is None or spec.id not in gymnasium.registry:
+        raise ValueError(remedy)
+    name = spec.id.removeprefix("sipe/").removesuffix("-v0")
+    if name in TASKS:
+        return sipe_bayes.simulation.gym.make(name).simulator.dt
+    try:
+        env = gymnasium.make(spec.id)
+    except Exception as error:  # whatever a foreign environment raises
+        raise ValueError(f"{remedy} ({spec.id}: {' '.join(str(error).split())})") from None
+    dt = getattr(env.unwrapped, "dt", None)
+    env.close()
+    if not isinstance(dt, int | float) or not dt > 0:
+        raise ValueError(remedy)
+    return float(dt)
+
+
+def _trajectory(episode: Any, dt: float, dataset: str) -> Trajectory:
+    observations, actions = _rows(episode.observations, True), _rows(episode.actions, False)
+    states = None if not isinstance(episode.infos, dict) else episode.infos.get(_STATE)
+    try:
+        return Trajectory(
+            observations, actions, dt, states, str(episode.id), rewards=np.asarray(episode.rewards, float)
+        )
+    except ValueError as error:
+        raise ValueError(f"dataset: {dataset}, episode {episode.id}: {error}") from None
+
+
+def _rows(values: Any, goals_last: bool) -> FloatArray:
+    """(T, O) of arrays (T, ...), or of dictionaries and tuples of such."""
+    if isinstance(values, dict):
+        keys = (
+            [k for k in values if k not in _GOALS] + [k for k in _GOALS if k in values] if goals_last else list(values)
+        )
+        return np.concatenate([_rows(values[key], goals_last) for key in keys], axis=1)
+    if isinstance(values, tuple):
+        return np.concatenate([_rows(part, goals_last) for part in values], axis=1)
+    array = np.asarray(values)
+    if not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
+        raise ValueError(f"dataset: expected numbers, got {array.dtype}; convert it first")
+    return array.reshape(len(array), -1).astype(np.float64)

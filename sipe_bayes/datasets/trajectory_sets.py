@@ -1,0 +1,300 @@
+"""Trajectory sets: the benchmark's trajectories, simulated once, stored compactly, and read without being simulated again.
+
+A set is one file, ``TASK/VARIANT-SPLIT-TYPE.npz``: five trajectories of one agent in one variant of an environment. What is
+stored is what counts: a long contact-rich motion that is replayed on another processor drifts apart. So a file holds the
+motion itself: starting states and goals in float64, all later states, the actions and the rewards in float32.
+The time is not stored (it is k dt), nor are the observations: they follow from the states. Where an environment reads more
+than the state (the humanoid's forces, the hand's palm), sample k+1 has what one control step from the stored state k under
+the stored action k gives: no error outlives a step. Measured on the random agent's sets against the observations at the
+simulation, root mean square in each channel's sd: 1e-7 at the median and, in the worst channel, 3e-7 (hand), 4e-6 (humanoid, a
+contact's torque), 9e-6 (Fetch, an object that hardly moves). That is float32's rounding.
+
+float32 numbers are kept as their four bytes apart, the time as the last axis: neighbours share exponents, so that deflate
+saves another eighth. Files hold no time stamp and no pickle: the same command on the same versions and kind of processor gives the
+same bytes. ``manifest.json`` is the one list of them: size, SHA-256, count, steps, seed, parameter values, versions, command.
+
+The half-cheetah's default variant is one model whatever is unknown about it, so HalfCheetahLinks' files serve for the
+others. HumanoidJoints has springs of 0.001 N m/rad where HumanoidLinks has none: each has its own.
+
+The benchmark is that of A User's Guide to Calibrating Robotics Simulators, Mehta, Handa, Fox and Ramos, 2020,
+https://arxiv.org/abs/2011.08985, which released no trajectories; sizes and formats are this library's own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import platform
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.core.files import to_json, write_bytes, write_text
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
+from sipe_bayes.envs.task import VARIANTS, Task, Variant
+from sipe_bayes.simulation.simulator import Simulator
+
+FloatArray = NDArray[np.float64]
+
+SHIPPED = Path(__file__).parent / "trajectories"
+FORMAT = "sipe_bayes.trajectories/1"
+MANIFEST = "manifest.json"
+TASKS = (  # the benchmark's
+    *("FetchPush", "FetchSlide", "FetchPickAndPlace", "Relocate", "Door"),
+    *("HalfCheetahLinks", "HalfCheetahJoints", "HumanoidLinks", "HumanoidJoints"),
+)
+COUNT = 5
+_SHARED = {
+    "HalfCheetahJoints": "HalfCheetahLinks",
+    "HalfCheetahAllJoints": "HalfCheetahLinks",
+}  # in the default variant
+_REMEDY = "reinstall the package, or remake it with `sipe data generate`"
+
+
+class TrajectorySetError(ValueError):
+    """A file of a trajectory set, or the manifest, that cannot be used."""
+
+
+@dataclass(frozen=True)
+class SetName:
+    """Which trajectories: of which task, variant, split and type of agent; the task is the one whose file it is."""
+
+    task: str
+    variant: Variant
+    split: Split
+    type: Agent
+
+    def __post_init__(self) -> None:
+        if self.variant == "default":
+            object.__setattr__(self, "task", _SHARED.get(self.task, self.task))
+
+    @property
+    def file(self) -> str:
+        return f"{self.task}/{self.variant}-{self.split}-{self.type}.npz"
+
+
+def names(
+    tasks: Sequence[str] = TASKS,
+    variants: Sequence[Variant] = VARIANTS,
+    splits: Sequence[Split] = SPLITS,
+    types: Sequence[Agent] = AGENTS,
+) -> Iterator[SetName]:
+    """All sets of these, each file once."""
+    every = (SetName(task, v, s, t) for task in tasks for v in variants for s in splits for t in types)
+    return iter(dict.fromkeys(every))
+
+
+def manifest(folder: Path) -> dict[str, dict[str, Any]]:
+    """What a folder's manifest says of each file; nothing where there is none. Raises TrajectorySetError."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        sets: dict[str, dict[str, Any]] = found["sets"]
+        good = found["format"] == FORMAT and all({"sha256", "bytes"} <= entry.keys() for entry in sets.values())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        good = False
+    if not good:
+        raise TrajectorySetError(f"{path}: cannot be read as a manifest of {FORMAT}; {_REMEDY}")
+    return sets
+
+
+def entry_of(folder: Path, name: SetName, simulator: Simulator) -> dict[str, Any] | None:
+    """The manifest's entry of a set that was made with this task's parameter values, or None."""
+    entry, task = manifest(folder).get(name.file), simulator.environment
+    assert isinstance(task, Task)
+    shared = name.task != task.name  # the values are another task's
+    return entry if entry is not None and (shared or fits(entry, simulator, name.variant)) else None
+
+
+def fits(entry: dict[str, Any], simulator: Simulator, variant: Variant) -> bool:
+    """Whether a set was made with the values that the variant has today."""
+    return bool(entry.get("values") == _values(simulator, variant))
+
+
+def _values(simulator: Simulator, variant: Variant) -> list[float]:
+    task = simulator.environment
+    assert isinstance(task, Task)
+    return [p.value(t) for p, t in zip(simulator.space, task.theta(variant).tolist(), strict=True)]
+
+
+# Writing
+
+
+def write(
+    folder: Path,
+    name: SetName,
+    simulator: Simulator,
+    found: Trajectories,
+    goals: FloatArray | None,
+    about: dict[str, Any],
+) -> dict[str, Any]:
+    """Store trajectories of equal length with states and rewards, and enter them in the manifest with what there is to say
+    ``about`` them; returns the entry."""
+    assert found.states is not None
+    assert found.rewards is not None
+    arrays: dict[str, Any] = {
+        "start": found.states[:, 0],
+        "states": _planes(found.states[:, 1:, 1:]),  # the time is left out
+        "actions": _planes(found.actions),
+        "rewards": found.rewards.astype(np.float32),
+        "dt": np.float64(found.dt[0]),
+    }
+    if goals is not None:
+        arrays["goals"] = goals
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    content = buffer.getvalue()
+    path = folder / name.file
+    write_bytes(path, content)
+    entry = {
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "bytes": len(content),
+        "count": len(found),
+        "steps": found.actions.shape[1],
+        "values": _values(simulator, name.variant),
+        **about,
+        "versions": versions(),
+    }
+    sets = {**manifest(folder), name.file: entry}
+    write_text(folder / MANIFEST, to_json({"format": FORMAT, "sets": dict(sorted(sets.items()))}, indent=1))
+    return entry
+
+
+def versions() -> dict[str, str]:
+    """What the bits of a simulation, and of a file, depend on."""
+    return {
+        "mujoco": mujoco.__version__,
+        "numpy": np.__version__,
+        "zlib": zlib.ZLIB_RUNTIME_VERSION,
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()} {_processor()}".strip(),
+    }
+
+
+def _processor() -> str:
+    """The processor's model, as Linux tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+
+
+def _planes(values: FloatArray) -> NDArray[np.uint8]:
+    """(B, T, C) as float32, byte by byte: (4, B, C, T)."""
+    single = np.ascontiguousarray(np.moveaxis(values, 1, -1), dtype="<f4")
+    return np.ascontiguousarray(np.moveaxis(single.view(np.uint8).reshape(*single.shape, 4), -1, 0))
+
+
+def _joined(planes: NDArray[np.uint8]) -> FloatArray:
+    """(B, T, C) of what ``_planes`` made."""
+    single = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view("<f4")[..., 0]
+    return np.moveaxis(single, -1, 1).astype(np.float64)
+
+
+# Reading
+
+
+def read(folder: Path, name: SetName, simulator: Simulator, count: int, steps: int) -> Trajectories:
+    """The first ``count`` trajectories of a set and their first ``steps`` steps, with states and rewards, as of the
+    variant's parameters. Raises TrajectorySetError, which names the file, for one that is not as the manifest says."""
+    arrays = _arrays(folder, name.file)
+    start, goals = arrays["start"][:count], arrays["goals"][:count] if "goals" in arrays else None
+    actions = np.ascontiguousarray(_joined(arrays["actions"])[:count, :steps])
+    states = np.concatenate([start[:, None, 1:], _joined(arrays["states"])[:count, :steps]], axis=1)
+    dt = float(arrays["dt"])
+    time = start[:, :1] + dt * np.arange(states.shape[1])
+    states = np.concatenate([time[..., None], states], axis=-1)
+    task = simulator.environment
+    assert isinstance(task, Task)
+    if states.shape[-1] != simulator.state_size or actions.shape[-1] != task.num_actions:
+        raise TrajectorySetError(
+            f"{folder / name.file}: expected {simulator.state_size} numbers of state and {task.num_actions} of action for "
+            f"{task.name}, got {states.shape[-1]} and {actions.shape[-1]}; {_REMEDY}"
+        )
+    observations = _observations(simulator, task.theta(name.variant), states, actions, goals)
+    return Trajectories(
+        observations,
+        actions,
+        np.full(count, dt),
+        np.full(count, actions.shape[1]),
+        np.ones(states.shape[:2], bool),
+        states,
+        tuple(f"{name.split}_{i}" for i in range(count)),
+        task.channels,
+        arrays["rewards"][:count, :steps].astype(np.float64),
+    )
+
+
+def _arrays(folder: Path, file: str) -> dict[str, Any]:
+    """What a file holds, checked against the manifest before it is opened."""
+    path, entry = folder / file, manifest(folder)[file]
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise TrajectorySetError(f"{path}: cannot be read ({error.strerror}); {_REMEDY}") from None
+    if len(content) != entry["bytes"]:
+        raise TrajectorySetError(
+            f"{path}: expected {entry['bytes']} bytes, got {len(content)}: cut short or another file; {_REMEDY}"
+        )
+    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
+        raise TrajectorySetError(f"{path}: its SHA-256 is not the manifest's: corrupted or altered; {_REMEDY}")
+    stream = io.BytesIO(content)
+    try:
+        with np.load(stream, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+        raise TrajectorySetError(f"{path}: expected an npz file, got {error}; {_REMEDY}") from None
+    missing = {"start", "states", "actions", "rewards", "dt"} - arrays.keys()
+    if missing:
+        raise TrajectorySetError(f"{path}: holds no {', '.join(sorted(missing))}; {_REMEDY}")
+    return arrays
+
+
+def _observations(
+    simulator: Simulator, theta: FloatArray, states: FloatArray, actions: FloatArray, goals: FloatArray | None
+) -> FloatArray:
+    """Observations (B, T+1, O) of states (B, T+1, S)."""
+    task = simulator.environment
+    if not task.needs_derived:
+        return task.observe(simulator.model, states, None, None if goals is None else goals[:, None])
+    batch, steps, _ = actions.shape
+    windows = simulator.rollout(
+        theta,
+        actions.reshape(batch * steps, 1, -1),
+        states[:, :-1].reshape(batch * steps, -1),
+        allow_outside=True,
+        goals=None if goals is None else np.repeat(goals, steps, axis=0),
+    )
+    seen = windows.observations.reshape(batch, steps, 2, -1)
+    after = np.concatenate([seen[:, :1, 0], seen[:, :, 1]], axis=1)
+    for channel, column in enumerate(task.state_columns(simulator.model)):
+        if column is not None:
+            after[..., channel] = states[..., column]
+    return after
+
+
+def verify(folder: Path) -> list[str]:
+    """What is wrong with a folder's files, one line each; raises TrajectorySetError where there is no manifest."""
+    sets = manifest(folder)
+    if not sets:
+        raise TrajectorySetError(f"{folder}: no {MANIFEST} there; name a folder that `sipe data generate` filled")
+    wrong = []
+    for file in sets:
+        try:
+            _arrays(folder, file)
+        except TrajectorySetError as error:
+            wrong.append(str(error))
+    present = {path.relative_to(folder).as_posix() for path in folder.rglob("*.npz")}
+    return wrong + [f"{folder / file}: not in the manifest; delete it" for file in sorted(present - sets.keys())]

@@ -1,0 +1,101 @@
+"""log p(theta | y) with all states of a ``StateSpace`` marginalised, for ``mcmc``: one simulation of the logs a value.
+
+The states follow theta as the smoother found, x(theta) = x_hat - slope (theta - theta_hat), and are simulated there; what
+remains of the likelihood is quadratic in them with the Jacobians of the ``laplace`` optimum, so its block-tridiagonal
+matrix is factorised once. Exact where measurement and transition are linear in the states. The noise is that of the
+optimum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import scipy.linalg
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.inference.laplace.posterior_linearisation import linearise
+from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation, ChainNoise, eliminate, log_likelihood, pull
+from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.posterior import Posterior
+
+FloatArray = NDArray[np.float64]
+
+_NAMES = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step")
+_STEPS = 2  # of the states, before a fresh linearisation is compared
+
+
+def at_optimum(chain: Chain, mode: State) -> State:
+    """What ``ChainTarget`` needs of a ``laplace`` optimum, with the Jacobians there, under names of a fit's state."""
+    found = _linearised(chain, mode["theta"], mode["states"], mode["theta_step"], mode["state_step"])
+    if found is None:
+        raise ValueError("mcmc: the simulation diverges at the laplace fit; narrow the bounds")
+    kept = {f"fit_{k}": mode[k] for k in _NAMES}
+    return kept | {f"fit_{f.name}": getattr(found, f.name) for f in fields(found)}
+
+
+def _linearised(
+    chain: Chain, theta: FloatArray, states: FloatArray, theta_step: FloatArray, state_step: FloatArray
+) -> ChainLinearisation | None:
+    """By differences as long as the fit took them."""
+    if not state_step.any():
+        return chain.linearise(theta, states)
+    return linearise(chain, theta, states, theta_step, state_step)
+
+
+class ChainTarget:
+    """log p(theta | y) of walkers (B, N), up to the prior's constant."""
+
+    def __init__(self, prior: Posterior, chain: Chain, state: State) -> None:
+        self.prior, self.chain, self.state = prior, chain, state
+        self.fit = ChainLinearisation(**{f.name: state[f"fit_{f.name}"] for f in fields(ChainLinearisation)})
+        self.sd = ChainNoise(state["fit_sd"], state["fit_process"], state["fit_movement"], state["fit_loose"])
+        self.solved = eliminate(self.fit, self.sd)
+
+    def states(self, theta: FloatArray) -> FloatArray:
+        """States (B, K, S) that follow theta (B, N)."""
+        away = np.einsum("kdn,bn->bkd", self.state["fit_slope"], theta - self.state["fit_theta"])
+        return self.chain.moved(self.state["fit_states"], -away)
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        out = np.full(len(points), -np.inf)
+        inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
+        if not len(inside):
+            return out
+        theta = points[inside]
+        found = self.chain.compare(theta, self.states(theta), self.fit)
+        good = [k for k, one in enumerate(found) if one is not None]
+        if not good:
+            return out
+        values = self._marginal([one for one in found if one is not None])
+        out[inside[good]] = values + self.prior.log_prob(torch.from_numpy(theta[good])).numpy()
+        return out
+
+    def _marginal(self, found: list[ChainLinearisation]) -> FloatArray:
+        """log p(y | theta) of comparisons that share the optimum's Jacobians."""
+        forces = np.stack([pull(one, self.sd).ravel() for one in found], axis=1)
+        moved = scipy.linalg.cho_solve_banded((self.solved.factor, True), forces, check_finite=False)
+        gains = (forces * moved).sum(0)
+        solved = [replace(self.solved, explained=float(g)) for g in gains]
+        return np.array([log_likelihood(one, self.sd, s) for one, s in zip(found, solved, strict=True)])
+
+    @property
+    def check_cost(self) -> int:
+        """Rollouts of a log to hold ``refreshed`` against the target."""
+        sides = 2 if self.state["fit_state_step"].any() else 1
+        return 1 + _STEPS * (1 + sides * (self.chain.num_theta + self.chain.num_start))
+
+    def refreshed(self, point: FloatArray) -> float:
+        """The target at one point (N,) with the Jacobians taken there, after steps of the states alone."""
+        states = self.states(point[None])[0]
+        value = -np.inf
+        for _ in range(_STEPS):
+            found = _linearised(self.chain, point, states, self.state["fit_theta_step"], self.state["fit_state_step"])
+            if found is None:
+                return -np.inf
+            solved = eliminate(found, self.sd)
+            value = log_likelihood(found, self.sd, solved)
+            states = self.chain.moved(states, solved.shift)
+        return value + float(self.prior.log_prob(torch.from_numpy(point)))

@@ -1,0 +1,101 @@
+"""log p(theta | y) of windows with their starts and the noise integrated out, for ``mcmc`` and ``importance``: one simulation of the
+logs a value.
+
+With r the residual at the predicted starts x(theta), V(noise) its covariance and J_x the starts' Jacobian,
+
+    log p(theta | y) = log prior + max over noise of -1/2 [log|V| + log|A| + r' V^-1 r - b' A^-1 b + x' P_x x] + a constant,
+    A = J_x' V^-1 J_x + P_x,   b = J_x' V^-1 r - P_x x.
+
+The starts are integrated out exactly where the prediction is linear in them over their (narrow) conditional posterior: x(theta) = x_hat - S (theta -
+theta_hat) and J_x are those of the ``laplace`` optimum. The noise is integrated out by Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations
+for Posterior Moments and Marginal Densities", J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at
+the optimum hardly depends on theta; exact for white noise of one channel whose starts are known.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.inference.laplace.window_noise import beyond_rounding, free_noise
+from sipe_bayes.likelihood.marginal import marginal
+from sipe_bayes.likelihood.noise import Moments, Noise, Pulls, estimate_noise
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import Posterior
+
+FloatArray = NDArray[np.float64]
+
+_NAMES = ("theta", "starts", "slope", "sd", "tau")
+
+
+def at_optimum(windows: Windows, mode: State) -> State:
+    """What ``WindowTarget`` needs of a ``laplace`` optimum, under names of a fit's state."""
+    shape = (*windows.observed.shape, windows.num_start)
+    jacobian = np.zeros(shape)
+    if windows.num_start:
+        found = windows.linearise(mode["theta"], mode["starts"], with_theta=False)
+        jacobian = np.ascontiguousarray(found.jacobian)
+    return {**{f"fit_{k}": mode[k] for k in _NAMES}, "fit_jacobian": jacobian}
+
+
+class WindowTarget:
+    """log p(theta | y) of points (B, N), up to a constant; minus infinity outside the cube and where the simulation diverges."""
+
+    def __init__(self, prior: Posterior, windows: Windows, state: State) -> None:
+        self.prior, self.windows = prior, windows
+        self.fit = {k[4:]: v for k, v in state.items() if k.startswith("fit_")}
+        self.noise = Noise(self.fit["sd"], self.fit["tau"])
+        silent = beyond_rounding(windows, self.noise).sd
+        self.silent = bool((silent > self.noise.sd).any())  # residuals of rounding are no evidence
+        least = np.where(silent > self.noise.sd, silent, windows.rounding)
+        self.least_sd = np.where(np.isnan(windows.fixed_sd), least, 0.0)
+
+    def starts(self, theta: FloatArray) -> FloatArray:
+        """Starts (B, W, D) that follow theta (B, N)."""
+        moved = np.einsum("wdn,bn->bwd", self.fit["slope"], theta - self.fit["theta"])
+        return np.asarray(self.fit["starts"] - moved)
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        out = np.full(len(points), -np.inf)
+        inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
+        if not len(inside):
+            return out
+        theta = points[inside]
+        starts = self.starts(theta)
+        residuals, valid = self.windows.residuals(theta, starts)
+        good = np.flatnonzero(valid)
+        prior = self.prior.log_prob(torch.from_numpy(theta)).numpy()
+        for k in good:
+            out[inside[k]] = prior[k] + self._integrated(residuals[k], self.fit["jacobian"], starts[k])[0]
+        return np.where(np.isnan(out), -np.inf, out)
+
+    def _integrated(self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray) -> tuple[float, FloatArray]:
+        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), up to a constant, with the noise that fits best there, and the best
+        change of the starts."""
+        windows, nothing = self.windows, np.zeros(0)
+        moments = Moments(residual, jacobian, 0, windows.sequences, windows.settings.noise == "white")
+        noise = self.noise
+        if len(free_noise(windows)):
+            pull = -windows.start_precision * starts
+            context = Pulls(np.zeros((0, 0)), nothing, windows.start_precision, pull, np.zeros(0, bool))
+            shortest, longest = float(windows.dt.min()), windows.trajectories.longest
+            coloured = windows.settings.noise == "ar1"
+            noise = estimate_noise(moments, noise, context, windows.fixed_sd, coloured, shortest, longest)
+        noise = Noise(np.maximum(noise.sd, self.least_sd), noise.tau)
+        return marginal(moments, noise, starts, windows.start_precision)
+
+    @property
+    def check_cost(self) -> int:
+        """Rollouts of a log to hold ``refreshed`` against the target."""
+        return 2 * self.windows.num_start + 3
+
+    def refreshed(self, point: FloatArray) -> float:
+        """The target at one point (N,) with the starts' Jacobian taken there, after one step of the starts."""
+        starts, value = self.starts(point[None])[0], -np.inf
+        for _ in range(2):
+            found = self.windows.linearise(point, starts, with_theta=False)
+            value, move = self._integrated(found.residual, found.jacobian, starts)
+            starts = starts + move
+        return value + float(self.prior.log_prob(torch.from_numpy(point)))

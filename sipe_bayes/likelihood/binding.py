@@ -1,0 +1,63 @@
+"""What a likelihood's settings make of a simulator and its logs: ``Windows`` of ``Segments``, the ``Chain`` of a ``StateSpace``."""
+
+from __future__ import annotations
+
+from typing import overload
+
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.likelihood.callable_windows import CallableWindows
+from sipe_bayes.likelihood.indirect_positions import indirect_positions
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
+
+
+@overload
+def bind(likelihood: Segments, simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> Windows: ...
+@overload
+def bind(likelihood: StateSpace, simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> Chain: ...
+@overload
+def bind(
+    likelihood: Segments | StateSpace, simulator: Simulator | CallableSimulator, trajectories: Trajectories
+) -> Windows | Chain: ...
+def bind(
+    likelihood: Segments | StateSpace, simulator: Simulator | CallableSimulator, trajectories: Trajectories
+) -> Windows | Chain:
+    """Hold the trajectories against the simulator as a likelihood does.
+
+    Args:
+        likelihood: its settings.
+        simulator: what is calibrated.
+        trajectories: the logs.
+
+    Returns:
+        Windows of ``Segments``, or the Chain of a ``StateSpace``.
+
+    Raises:
+        ValueError: for logs or simulators that do not fit.
+    """
+    if isinstance(likelihood, StateSpace):
+        return _chain(likelihood, simulator, trajectories)
+    if isinstance(simulator, CallableSimulator):
+        windows: Windows = CallableWindows(likelihood, simulator, trajectories)
+    else:
+        windows = Windows(likelihood, simulator, trajectories)
+    for name, seen in zip(windows.fitted, windows.observed.any(axis=(0, 1)), strict=True):
+        if not seen:
+            raise ValueError(f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`")
+    return windows
+
+
+def _chain(settings: StateSpace, simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> Chain:
+    if not isinstance(simulator, Simulator):
+        raise ValueError("likelihood: StateSpace needs a MuJoCo simulator with states; use sipe.Segments")
+    if simulator.environment.memory_size and settings.starts == "estimated":
+        raise ValueError(
+            f"likelihood: StateSpace looks for no controller's memory, as {type(simulator.environment).__name__} has "
+            "one, in measurements; use starts='recorded', or sipe.Segments"
+        )
+    chain = Chain(settings, simulator, trajectories)
+    chain.place(*indirect_positions(chain, chain.reference, chain.measured_directly))
+    return chain

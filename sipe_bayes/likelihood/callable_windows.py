@@ -1,0 +1,66 @@
+"""A CallableSimulator's x as windows, so that methods written for trajectories take it: one sample, no start to estimate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.likelihood.sequences import sequences
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.windows import Windows, fitted_channels
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+
+FloatArray = NDArray[np.float64]
+
+
+class CallableWindows(Windows):
+    """As ``likelihood.Windows``: W observed x, L = 2 samples of which the second counts, D = 0 start unknowns."""
+
+    def __init__(self, settings: Segments, simulator: CallableSimulator, trajectories: Trajectories) -> None:
+        self.simulator = simulator  # type: ignore[assignment]
+        self.trajectories, self.settings = trajectories, settings
+        self.rollouts, self.budget, self._glimpse = 0, math.inf, None
+        size = len(simulator.environment.channels)
+        if trajectories.observations.shape[2] != size or trajectories.actions.shape[1:] != (1, 0):
+            raise ValueError(
+                f"trajectories: expected an x ({size},), got observations {trajectories.observations.shape}"
+            )
+        self.channels = fitted_channels(simulator.environment.channels, settings.fit)
+        count = len(trajectories)
+        self.log, self.start, self.steps = np.arange(count), np.zeros(count, int), np.ones(count, int)
+        self.dt, self.names, self.goals = trajectories.dt, list(trajectories.names), None
+        self.owned = np.tile([False, True], (count, 1))
+        self.measured = trajectories.observations[:, :, self.channels]
+        self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
+        unseen = [n for n, seen in zip(self.fitted, self.observed.any(axis=(0, 1)), strict=True) if not seen]
+        if unseen:
+            raise ValueError(
+                f"x: {', '.join(unseen)} is NaN; leave it out of fn and of x, or compare the others, Segments(fit=...)"
+            )
+        self.actions = trajectories.actions
+        self.sequences = sequences(self.observed, np.tile([0, 1], (count, 1)), self.log, self.dt)
+        self.reference, self.num_start, self.start_precision = np.zeros((count, 0)), 0, np.zeros(0)
+
+    @property
+    def starts_measured(self) -> bool:
+        return True
+
+    def least_steps(self, theta: FloatArray) -> FloatArray:
+        return np.zeros(self.num_theta)
+
+    def states(self, starts: FloatArray) -> FloatArray:
+        return starts
+
+    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        batch, count = len(theta), len(self.trajectories)
+        if self.rollouts + batch * count > self.budget:
+            raise BudgetExhausted(
+                f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {batch * count}"
+            )
+        self.rollouts += batch * count
+        made = self.simulator.replay(theta, self.trajectories).observations
+        predicted = made.reshape(batch, count, 2, -1)[..., self.channels]
+        return predicted, np.asarray(np.isfinite(predicted).all(axis=(1, 2, 3)))

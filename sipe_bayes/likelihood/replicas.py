@@ -1,0 +1,179 @@
+"""Replicas of recorded trajectories: the same experiment simulated at a known theta, with the noise that the recording has.
+
+Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white or
+first-order autoregressive in each channel, and where the recording has process noise, each state after a control step is moved by some. The
+commands are replayed open loop: where a feedback law kept the machine on its
+course, a replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.noise_level import noise_level
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.windows import estimate_states, first_states, moved
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
+
+FloatArray = NDArray[np.float64]
+
+_BEGINNING, _LEAST_STEPS = 0.2, 4  # s and steps of a log on which the estimate of its start depends, and more
+
+
+def observation_noise(
+    diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments | StateSpace
+) -> Noise:
+    """Noise of all O channels: what an estimator's ``diagnostics`` say of the channels that it fitted, ``noise_level`` of the
+    others, as white."""
+    sd = noise_level(trajectories, likelihood)
+    tau = np.zeros(len(sd))
+    fitted = list(range(len(sd)))
+    if likelihood.fit is not None and trajectories.channels:
+        fitted = [trajectories.channels.index(name) for name in likelihood.fit]
+    if len(diagnostics.get("noise_sd", ())) == len(fitted):
+        sd[fitted], tau[fitted] = diagnostics["noise_sd"], diagnostics.get("noise_tau", np.zeros(len(fitted)))
+    return Noise(sd, tau)
+
+
+class Replicas:
+    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels), and process noise of sd ``process`` (D,), default none, in the
+    tangent coordinates of ``StateSpace``, whose loose jumps are not repeated."""
+
+    def __init__(
+        self,
+        simulator: Simulator | CallableSimulator,
+        trajectories: Trajectories,
+        noise: Noise,
+        process: FloatArray | None = None,
+    ) -> None:
+        self.simulator, self.trajectories, self.noise = simulator, trajectories, noise
+        self.process = process if process is not None and process.any() else None
+        self.starts = _starts(simulator, trajectories)
+
+    def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
+        """One replica of every trajectory at theta (N,), with states where the recording has them; None where one diverges."""
+        return self.many(theta[None], rng)[0]
+
+    def many(self, theta: FloatArray, rng: np.random.Generator, estimated: bool = False) -> list[Trajectories | None]:
+        """What ``make`` gives for each theta (B, N), simulated in one batch.
+
+        estimated: a replica starts where the recording's own start would lie if the replica's noise were what its estimate is off
+        by, so that a recording is as far from its replicas as they are from one another."""
+        noises = [self._noise(rng) for _ in theta]
+        starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
+        motion, count = self.simulator.replay(theta, self.trajectories, starts), len(self.trajectories)
+        if self.process is not None:
+            motion = self._shaken(motion, theta, rng)
+        found = []
+        for b, noise in enumerate(noises):
+            rows = slice(b * count, (b + 1) * count)
+            states = None if motion.states is None else motion.states[rows]
+            found.append(self._measured(motion.observations[rows] + noise, motion.valid[rows], states))
+        return found
+
+    def _shaken(self, motion: Trajectories, theta: FloatArray, rng: np.random.Generator) -> Trajectories:
+        """The replayed ``motion`` again, control step by control step, with process noise after each."""
+        simulator, log = self.simulator, self.trajectories
+        assert isinstance(simulator, Simulator)
+        assert self.process is not None
+        assert motion.states is not None
+        environment, batch = simulator.environment, len(theta)
+        late = np.array([environment.derived_late and c is None for c in environment.state_columns(simulator.model)])
+        lanes, dt = np.repeat(theta, len(log), axis=0), np.tile(log.dt, batch)
+        names, goals = list(log.names or [None] * len(log)) * batch, environment.recorded_goals(log.observations[:, 0])
+        goals = None if goals is None else np.tile(goals, (batch, 1))
+        seen, states, valid = motion.observations.copy(), motion.states.copy(), motion.valid.copy()
+        steps = states.shape[1] - 1
+        for k in range(steps + 1):
+            actions = np.tile(log.actions[:, min(k, steps - 1)], (batch, 1))[:, None]
+            step = simulator.rollout(lanes, actions, states[:, k], dt, names, goals=goals)
+            assert step.states is not None
+            seen[:, k, ~late] = step.observations[:, 0, ~late]
+            valid[:, k] &= step.valid[:, 0]
+            if k < steps:
+                white = rng.standard_normal((len(lanes), len(self.process)))
+                ends = np.where(step.valid[:, 1, None], step.states[:, 1], states[:, 0])
+                states[:, k + 1] = moved(simulator.model, ends, self.process * white)
+                seen[:, k + 1, late] = step.observations[:, 1, late]
+                valid[:, k + 1 :] &= step.valid[:, 1, None]
+        inside = np.arange(steps + 1) <= motion.length[:, None]
+        return replace(motion, observations=np.where(inside[..., None], seen, np.nan), states=states, valid=valid)
+
+    def _measured(
+        self, observations: FloatArray, valid: NDArray[np.bool_], states: FloatArray | None
+    ) -> Trajectories | None:
+        """Observations (R, T+1, O) where the recording has samples; None where one is not valid."""
+        log = self.trajectories
+        inside = np.arange(valid.shape[1]) <= log.length[:, None]
+        if not (valid | ~inside).all():
+            return None
+        seen = np.where(np.isfinite(log.observations), observations, np.nan)
+        items = []
+        for k, recorded in enumerate(log):
+            n = len(recorded) + 1
+            own = None if recorded.states is None or states is None else states[k, :n]
+            items.append(Trajectory(seen[k, :n], recorded.actions, recorded.dt, own, recorded.name, log.channels))
+        return Trajectories.stack(items)
+
+    def _noise(self, rng: np.random.Generator) -> FloatArray:
+        """Noise (R, T+1, O) of every trajectory."""
+        samples = self.trajectories.observations.shape[1]
+        noise = np.stack([self._drawn(samples, float(dt), rng) for dt in self.trajectories.dt])
+        if isinstance(self.simulator, CallableSimulator):
+            noise[:, 0] = 0.0  # x is the second sample
+        return noise
+
+    def _misled(self, noise: FloatArray) -> FloatArray:
+        """By how much (R, S) noise (R, T+1, O) on the recording moves the estimate of its start."""
+        if isinstance(self.simulator, CallableSimulator) or self.trajectories.states is not None:
+            return np.zeros_like(self.starts)
+        moved = np.zeros_like(self.starts)
+        for k, ((begin, before), own) in enumerate(zip(self._beginnings, noise, strict=True)):
+            assert isinstance(self.simulator, Simulator)
+            noisy = replace(begin, observations=begin.observations + own[: len(begin) + 1])
+            moved[k, : len(before)] = estimate_states(self.simulator, noisy)[0] - before
+        return moved
+
+    @cached_property
+    def _beginnings(self) -> list[tuple[Trajectory, FloatArray]]:
+        """The first moments of every recording, and the start that they tell."""
+        assert isinstance(self.simulator, Simulator)
+        found = []
+        for recorded in self.trajectories:
+            steps = min(len(recorded), max(_LEAST_STEPS, math.ceil(_BEGINNING / recorded.dt)))
+            begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
+            found.append((begin, estimate_states(self.simulator, begin)[0]))
+        return found
+
+    def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
+        """Noise (count, O) of samples dt seconds apart."""
+        white = rng.standard_normal((count, len(self.noise.sd)))
+        out = np.empty_like(white)
+        for c, (sd, tau) in enumerate(zip(self.noise.sd, self.noise.tau, strict=True)):
+            a = float(np.exp(-dt / tau)) if tau > 0 else 0.0
+            scaled = white[:, c] * np.sqrt(1 - a**2)
+            scaled[0] = white[0, c]
+            out[:, c] = sd * scipy.signal.lfilter([1.0], [1.0, -a], scaled)
+        return out
+
+
+def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
+    """Starting states (R, S); where they are not recorded, a delayed actuator's commands before the log are its first ones."""
+    starts = first_states(simulator, trajectories)
+    if isinstance(simulator, CallableSimulator) or trajectories.states is not None:
+        return starts
+    starts[:, 0] = 0.0
+    past = [actions[:1] for actions in trajectories.actions]
+    timestep = np.array([simulator.physics_steps(float(dt))[1] for dt in trajectories.dt])
+    return simulator.environment.history(simulator.model, starts, past, timestep)

@@ -1,0 +1,87 @@
+"""How trajectories are compared with simulations: the settings of a likelihood, and what a budget raises."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, ClassVar
+
+import numpy as np
+
+
+class BudgetExhausted(RuntimeError):
+    """Raised instead of simulating beyond the budget."""
+
+
+class BudgetTooSmall(ValueError):
+    """A budget that ran out before there was anything to estimate from."""
+
+
+def checked(fit: Any, noise_sd: Any, zero: bool = True) -> None:
+    """Raises ValueError for settings of a likelihood that are no names of channels, or no sds. zero: whether an sd may be."""
+    if fit is not None and (isinstance(fit, str) or not len(fit) or not all(isinstance(n, str) for n in fit)):
+        raise ValueError(f"fit: expected names of channels, such as ('angle',), got {fit!r}; None for all")
+    if noise_sd is None:
+        return
+    if not isinstance(noise_sd, tuple | list | np.ndarray):
+        raise ValueError(
+            f"noise_sd: expected one sd for each channel, None where unknown, got {noise_sd!r}; such as (0.01, None)"
+        )
+    for sd in noise_sd:
+        least = 0.0 if zero else 1e-300
+        if sd is not None and not (isinstance(sd, Real) and least <= float(sd) < math.inf):
+            raise ValueError(
+                f"noise_sd: expected finite sds {'not below' if zero else 'above'} zero, got {sd!r}; None where unknown"
+            )
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Multiple shooting with white or autoregressive noise.
+
+    window: seconds, or None for each log as one window; ``windows`` overrides it for logs by name. noise: "ar1", "white", or "sandwich"
+    (the optimum of white noise with the width of "ar1"; ``laplace`` only). fit: names of the channels whose
+    residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated. starts: "estimated" with
+    theta, or "recorded": the trajectories' states are exact (they come from a simulator) and each window predicts the
+    samples after its start; ``window`` = dt then compares single control steps.
+    """
+
+    window: float | None = 0.5
+    noise: str = "ar1"
+    fit: tuple[str, ...] | None = None
+    noise_sd: tuple[float | None, ...] | None = None
+    windows: tuple[tuple[str, float | None], ...] = ()
+    starts: str = "estimated"
+
+    def __post_init__(self) -> None:
+        if self.starts not in ("estimated", "recorded"):
+            raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
+        if self.noise not in ("ar1", "white", "sandwich"):
+            raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
+        if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
+            raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
+        checked(self.fit, self.noise_sd)
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """States unknown at every sample; measurement and process noise inferred. For ``laplace`` and ``mcmc``.
+
+    fit: names of the channels that count, default all. noise_sd: given sd per channel in its unit, None where it is
+    inferred. starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known. All other recorded states are
+    left aside.
+    """
+
+    fit: tuple[str, ...] | None = None
+    noise_sd: tuple[float | None, ...] | None = None
+    starts: str = "estimated"
+    noise: ClassVar[str] = "white"
+
+    def __post_init__(self) -> None:
+        if self.starts not in ("estimated", "recorded"):
+            raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
+        checked(self.fit, self.noise_sd, zero=False)
+
+
+Likelihood = Segments | StateSpace

@@ -1,0 +1,373 @@
+"""log p(trajectory | theta) by windows of the log (multiple shooting), each window's start estimated with theta.
+
+A log of T samples is cut into windows of ``window`` seconds; each is simulated from its own starting state, which is
+unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by exactly one
+window. Long open loops are chaotic and one model error would dominate them; short windows with measured starts give
+away the noise of the measurement: both cost coverage. The residuals are white or first-order autoregressive and carry
+on across windows (``sipe_bayes.likelihood.noise``).
+
+A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior whose sd is
+``START_SD``, far wider than any measurement, so that what is never measured does not make the equations singular.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.noise import Moments, Noise, chosen_sd, whiten
+from sipe_bayes.likelihood.sequences import Sequence, sequences
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
+
+FloatArray = NDArray[np.float64]
+
+_THETA_STEP = (1e-5, 1e-3)  # finite differences, of the unit cube: least, and for windows of one control step
+_START_STEP = 1e-5  # rad or m, rad/s or m/s
+START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
+_ROUNDING = 1e-7  # of a channel's size: what the tolerance of MuJoCo's contact solver leaves, in its rare worst steps
+_SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
+
+
+def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
+    """A first guess of the states (T+1, S) along a log: recorded ones, else measured ones.
+
+    Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
+    the slopes of the positions; what no channel measures stays at the model's reset state. The search starts here,
+    and so do the windows of held-out logs."""
+    if trajectory.states is not None:
+        return trajectory.states
+    model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
+    columns = simulator.environment.state_columns(model)
+    measured: dict[int, FloatArray] = {}
+    for channel, column in enumerate(columns):
+        series = trajectory.observations[:, channel]
+        there = np.flatnonzero(np.isfinite(series))
+        if column is not None and len(there):
+            measured[column] = np.interp(np.arange(len(series)), there, series[there])
+    for joint in range(model.njnt):
+        if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            position, velocity = (
+                1 + int(model.jnt_qposadr[joint]),
+                1 + model.nq + int(model.jnt_dofadr[joint]),
+            )
+            if position in measured and velocity not in measured:
+                states[:, velocity] = smoothed(measured[position], trajectory.dt, 1)
+    if measured:
+        states[:, list(measured)] = smoothed(np.stack(list(measured.values()), axis=1), trajectory.dt)
+    return states
+
+
+def first_states(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
+    """Starting states (R, S) of R recorded trajectories: recorded, else estimated from the measurements."""
+    if isinstance(simulator, CallableSimulator):
+        return np.empty((len(trajectories), 0))
+    return np.stack([estimate_states(simulator, t)[0] for t in trajectories])
+
+
+def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
+    """Local quadratics over ``_SMOOTHING`` seconds, at least 5 samples, along the first axis."""
+    span = min(max(5, 2 * round(_SMOOTHING / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
+    if span < 3:
+        return np.gradient(series, dt, axis=0) if derivative else series
+    return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
+
+
+def chosen_channels(
+    simulator: Simulator | CallableSimulator, trajectories: Trajectories, fit: tuple[str, ...] | None
+) -> list[int]:
+    """Which channels ``fit`` names, default all; raises ValueError for unknown ones and for trajectories of other sizes."""
+    environment = simulator.environment
+    if trajectories.observations.shape[2] != len(environment.channels):
+        raise ValueError(
+            f"trajectories: expected observations of the {len(environment.channels)} channels "
+            f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
+        )
+    if trajectories.actions.shape[2] != environment.num_actions:
+        raise ValueError(
+            f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
+        )
+    return fitted_channels(environment.channels, fit)
+
+
+def fitted_channels(names: SequenceOf[str], fit: tuple[str, ...] | None) -> list[int]:
+    """Places among ``names`` of those in ``fit``, default all; raises ValueError for unknown ones."""
+    fit = fit or tuple(names)
+    unknown = [n for n in fit if n not in names]
+    if unknown:
+        raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
+    return [list(names).index(n) for n in fit]
+
+
+def moved(model: Any, states: FloatArray, tangent: FloatArray) -> FloatArray:
+    """States (..., S) moved by tangents (..., 2 nv + na); either may have fewer leading dimensions."""
+    shape = np.broadcast_shapes(states.shape[:-1], tangent.shape[:-1])
+    out = np.broadcast_to(states, (*shape, states.shape[-1])).copy()
+    tangent = np.broadcast_to(tangent, (*shape, tangent.shape[-1]))
+    nq, nv = model.nq, model.nv
+    if nq == nv:
+        out[..., 1 : 1 + nq] += tangent[..., :nv]
+    else:
+        flat, turns = out.reshape(-1, out.shape[-1]), tangent.reshape(-1, tangent.shape[-1])
+        for state, turn in zip(flat, turns, strict=True):
+            position = state[1 : 1 + nq].copy()
+            mujoco.mj_integratePos(model, position, np.ascontiguousarray(turn[:nv]), 1.0)
+            state[1 : 1 + nq] = position
+    out[..., 1 + nq : 1 + nq + nv + model.na] += tangent[..., nv:]
+    return out
+
+
+def past_commands(
+    simulator: Simulator, trajectories: Trajectories, log: NDArray[np.int64], start: NDArray[np.int64], dt: FloatArray
+) -> list[FloatArray]:
+    """The commands before each (log, start sample), one row a physics step; before the log its first command."""
+    past = []
+    for k, first, seconds in zip(log, start, dt, strict=True):
+        skip = simulator.physics_steps(float(seconds))[0]
+        rows = trajectories.actions[k, max(0, first - 2000) : first]
+        past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
+    return past
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """residual (W, L, C) = measured - predicted; jacobian (W, L, C, N + D) of the prediction; valid: all simulated."""
+
+    residual: FloatArray
+    jacobian: FloatArray
+    valid: bool
+
+
+class Windows:
+    """Recorded trajectories cut into W windows of at most L samples and C fitted channels, with D start unknowns."""
+
+    def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
+        self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
+        self.rollouts, self.budget = 0, math.inf
+        self._glimpse: Windows | None = None
+        self.channels = chosen_channels(simulator, trajectories, settings.fit)
+        if settings.starts == "recorded" and trajectories.states is None:
+            raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
+        self._cut(trajectories)
+        self._read_samples(trajectories)
+
+    @property
+    def fitted(self) -> list[str]:
+        """Names of the C fitted channels."""
+        return [self.simulator.environment.channels[c] for c in self.channels]
+
+    def _cut(self, trajectories: Trajectories) -> None:
+        pieces, overrides = [], dict(self.settings.windows)
+        for k, trajectory in enumerate(trajectories):
+            window = overrides.get(trajectory.name, self.settings.window)
+            steps = len(trajectory) if window is None else max(1, round(window / trajectory.dt))
+            if window is not None and steps > len(trajectory):
+                raise ValueError(
+                    f"log {trajectory.name!r}: lasts {len(trajectory) * trajectory.dt:.3g} s, shorter than one window of "
+                    f"{window:g} s; use a shorter window"
+                )
+            for start in range(0, len(trajectory), steps):
+                pieces.append((k, start, min(steps, len(trajectory) - start)))
+        self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
+        self.dt = trajectories.dt[self.log]
+        names = trajectories.names or (None,) * len(trajectories)
+        self.names = [names[k] for k in self.log]
+
+    def _read_samples(self, trajectories: Trajectories) -> None:
+        simulator, environment = self.simulator, self.simulator.environment
+        longest = int(self.steps.max())
+        sample = self.start[:, None] + np.arange(longest + 1)
+        last = self.start + self.steps == trajectories.length[self.log]
+        place = np.arange(longest + 1)
+        if self.settings.starts == "recorded":
+            self.owned = (place >= 1) & (place <= self.steps[:, None])
+        else:
+            self.owned = place < (self.steps + last)[:, None]
+        clipped = np.minimum(sample, trajectories.length[self.log][:, None])
+        self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
+        self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
+        self.actions = trajectories.actions[
+            self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)
+        ][:, :-1]
+        self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
+        guesses = [estimate_states(simulator, t) for t in trajectories]
+        reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
+        reference[:, 0] = 0.0
+        self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
+        past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
+        self.reference = environment.history(simulator.model, reference, past, self._timestep())
+        model = simulator.model
+        free = np.array([model.nv, model.nv, model.na]) * (self.settings.starts == "estimated")
+        self.num_start = int(free.sum())
+        sd = np.repeat(START_SD, free)
+        self.start_precision = sd**-2.0
+
+    def _timestep(self) -> FloatArray:
+        return np.array([self.simulator.physics_steps(float(d))[1] for d in self.dt])
+
+    def glimpse(self) -> Windows:
+        """Every other window, for a rough search; the windows themselves where a log has fewer than four. Its rollouts are
+        counted by themselves, as if whole."""
+        if np.bincount(self.log).min() < 4:
+            return self
+        if self._glimpse is None:
+            self._glimpse = self._every_other()
+        self._glimpse.rollouts, self._glimpse.budget = self.rollouts, self.budget
+        return self._glimpse
+
+    def _every_other(self) -> Windows:
+        within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
+        view, keep = copy.copy(self), np.flatnonzero(within % 2 == 0)
+        for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):
+            setattr(view, name, getattr(self, name)[keep])
+        view.goals = None if self.goals is None else self.goals[keep]
+        view.names = [self.names[w] for w in keep]
+        sample = view.start[:, None] + np.arange(view.observed.shape[1])
+        view.sequences = sequences(view.observed, sample, view.log, view.dt)
+        return view
+
+    @cached_property
+    def rounding(self) -> FloatArray:
+        """Noise sd (C,) below which finite differences are mostly rounding: what was simulated cannot be fitted closer."""
+        size = np.sqrt(np.nanmean(np.where(self.observed, self.measured, np.nan) ** 2, axis=(0, 1)))
+        moving = size[size > 0]
+        return _ROUNDING * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
+
+    @property
+    def fixed_sd(self) -> FloatArray:
+        """Given noise sd (C,) of the fitted channels, NaN where it is inferred."""
+        return chosen_sd(self.settings.noise_sd, self.channels, self.simulator.environment.channels)
+
+    @property
+    def theta_step(self) -> float:
+        """Of the finite differences: the longer a window, the more a small change grows, and the less smooth its effect."""
+        least, most = _THETA_STEP
+        return max(least, most / int(self.steps.max()))
+
+    def least_steps(self, theta: FloatArray) -> FloatArray:
+        """Least changes (N,) of theta (N,) that finite differences can be taken over."""
+        return self.simulator.environment.least_steps(theta)
+
+    @property
+    def num_windows(self) -> int:
+        return len(self.log)
+
+    @property
+    def num_theta(self) -> int:
+        return len(self.simulator.space)
+
+    def no_starts(self) -> FloatArray:
+        """The starts (W, D) at their reference."""
+        return np.zeros((self.num_windows, self.num_start))
+
+    def states(self, starts: FloatArray) -> FloatArray:
+        """Starting states (..., W, S) of starts (..., W, D)."""
+        if not self.num_start:
+            return np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
+        return moved(self.simulator.model, self.reference, starts)
+
+    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid throughout.
+
+        A prediction is NaN from the sample on at which its window diverged."""
+        batch = len(theta)
+        cost = batch * len(self.trajectories)
+        if self.rollouts + cost > self.budget:
+            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost}")
+        self.rollouts += cost
+        lanes = np.repeat(theta, self.num_windows, axis=0)
+        states = self.states(starts).reshape(batch * self.num_windows, -1)
+        actions = np.tile(self.actions, (batch, 1, 1))
+        goals = None if self.goals is None else np.tile(self.goals, (batch, 1))
+        dt, names = np.tile(self.dt, batch), self.names * batch
+        result = self.simulator.rollout(lanes, actions, states, dt, names, goals=goals)
+        shape = (batch, self.num_windows)
+        good = result.valid.reshape(*shape, -1)
+        predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
+        predicted = np.where(good[..., None], predicted, np.nan)
+        return predicted, np.asarray((good | ~self.owned).all(axis=(1, 2)))
+
+    def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Measured minus predicted (B, W, L, C), zero where nothing was measured, and which of the B are valid."""
+        predicted, valid = self.predict(theta, starts)
+        with np.errstate(invalid="ignore"):
+            residual = np.where(self.observed, self.measured - predicted, 0.0)
+        return np.where(valid[:, None, None, None], residual, 0.0), valid
+
+    @property
+    def starts_measured(self) -> bool:
+        """Whether the log tells where every window starts: recorded states, or a measured position of each joint."""
+        model = self.simulator.model
+        if self.trajectories.states is not None:
+            return True
+        if model.na or model.nq != model.nv:
+            return False
+        columns = self.simulator.environment.state_columns(model)
+        seen = [column for c, column in enumerate(columns) if np.isfinite(self.trajectories.observations[..., c]).any()]
+        return set(range(1, 1 + model.nq)) <= set(seen)
+
+    def linearise(
+        self,
+        theta: FloatArray,
+        starts: FloatArray,
+        with_theta: bool = True,
+        with_starts: bool = True,
+        residual: FloatArray | None = None,
+        theta_step: float | FloatArray | None = None,
+    ) -> Linearisation:
+        """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs.
+
+        with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
+        at this very point, which spares the one. theta_step: of the finite differences, default ``self.theta_step``, or where that is too
+        short ``least_steps``."""
+        n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
+        default = np.maximum(self.theta_step, self.least_steps(theta))
+        size = default if theta_step is None else np.broadcast_to(theta_step, theta.shape)
+        sign = np.where(theta + size <= 1, 1.0, -1.0)
+        thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
+        for j in range(n):
+            thetas[j + 1, j] += sign[j] * size[j]
+        for j in range(d):
+            all_starts[n + 1 + j, :, j] += _START_STEP
+        if residual is None:
+            predicted, valid = self.predict(thetas, all_starts)
+        else:
+            there = np.where(self.observed, self.measured - residual, np.nan)
+            predicted, valid = self.predict(thetas[1:], all_starts[1:])
+            predicted, valid = np.concatenate([there[None], predicted]), np.append(True, valid)
+        wrong = [j for j in range(n) if not valid[j + 1]]
+        if wrong and valid[0]:  # a step across a physical limit: look the other way
+            sign[wrong] = -sign[wrong]
+            again = np.tile(theta, (len(wrong), 1))
+            again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
+            inside = np.clip(again, 0, 1)
+            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
+        scale = np.concatenate([sign[:n] * size[:n], np.full(d, _START_STEP)])
+        with np.errstate(invalid="ignore"):
+            jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
+        jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
+        residual = np.where(self.observed, self.measured - predicted[0], 0.0)
+        return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
+
+    def moments(self, lin: Linearisation, white: bool = False) -> Moments:
+        """Products of the linearised rows, from which every noise model's normal equations follow; ``white``: for white
+        noise alone."""
+        n = lin.jacobian.shape[-1] - self.num_start
+        return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
+
+    def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
+        """Whitened sum of squares (B,) of residuals (B, W, L, C)."""
+        flat = residual.reshape(len(residual), -1, len(self.channels))
+        parts = [whiten(flat[..., c], s, float(noise.sd[c]), float(noise.tau[c])) for c, s in enumerate(self.sequences)]
+        return np.asarray(sum((p**2).sum(-1) for p in parts))

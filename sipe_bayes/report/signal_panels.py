@@ -1,0 +1,88 @@
+"""Panels of one channel of one log: measured against simulated, and the error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from sipe_bayes.diagnostics.records import Signal
+from sipe_bayes.report.drawing import DEFAULT, MEASURED, POSTERIOR, PRIOR, _ticks
+
+FloatArray = NDArray[np.float64]
+
+
+def _restarted(signal: Signal, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Time and values with a gap before each window's first sample, so that no line joins two windows."""
+    starts = np.unique(np.searchsorted(signal.time, signal.window_starts - 1e-9))
+    starts = starts[(starts > 0) & (starts < len(signal.time))]
+    return np.insert(signal.time, starts, signal.time[starts]), np.insert(values, starts, np.nan)
+
+
+def _window_ticks(ax: Axes, signal: Signal, height: float) -> None:
+    ax.vlines(signal.window_starts, 0, height, transform=ax.get_xaxis_transform(), color=PRIOR, lw=0.9, clip_on=True)
+
+
+def _signal(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+    time, low = _restarted(signal, signal.low)
+    ax.fill_between(time, low, _restarted(signal, signal.high)[1], color=POSTERIOR, alpha=0.3, lw=0)
+    ax.plot(*_restarted(signal, signal.default), color=DEFAULT, ls="--", lw=1)
+    if len(signal.time) > 400 or not np.isfinite(signal.measured).any():
+        ax.plot(signal.time, signal.measured, color=MEASURED, lw=0.9)
+    else:
+        ax.plot(signal.time, signal.measured, ".", color=MEASURED, ms=3)
+    ax.plot(*_restarted(signal, signal.mode), color=POSTERIOR, lw=1.3)
+    _window_ticks(ax, signal, 0.05)
+    _keep_in_view(ax, signal, span)
+    _ticks(ax.yaxis, 4)
+
+
+def _keep_in_view(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+    """Limits from what was measured and the posterior; a default that runs away leaves the panel."""
+    shown = (signal.time >= span[0]) & (signal.time <= span[1])
+    ours = np.concatenate([a[shown] for a in (signal.measured, signal.mode, signal.low, signal.high)])
+    ours = ours[np.isfinite(ours)]
+    if not len(ours):
+        return
+    low, high = float(ours.min()), float(ours.max())
+    margin = 0.5 * max(high - low, 1e-9)
+    default = signal.default[shown & np.isfinite(signal.default)]
+    if len(default):
+        low = min(low, max(float(default.min()), low - margin))
+        high = max(high, min(float(default.max()), high + margin))
+    pad = 0.08 * max(high - low, 1e-9)
+    ax.set_ylim(low - 1.3 * pad, high + pad)
+
+
+def _error(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+    time, low = _restarted(signal, signal.low - signal.mode)
+    ax.fill_between(time, low, _restarted(signal, signal.high - signal.mode)[1], color=POSTERIOR, alpha=0.3, lw=0)
+    ax.axhline(0, color="#555555", lw=0.7)
+    error = signal.measured - signal.mode
+    ax.plot(*_restarted(signal, error), color=MEASURED, lw=0.8)
+    _window_ticks(ax, signal, 0.1)
+    shown = np.abs(error[(signal.time >= span[0]) & (signal.time <= span[1]) & np.isfinite(error)])
+    if len(shown) and shown.max() > 0:
+        band = np.nanmax(np.abs([signal.low - signal.mode, signal.high - signal.mode]), initial=0.0)
+        reach = 1.2 * max(shown.max(), min(band, 3 * shown.max()))
+        ax.set_ylim(-reach, reach)
+    _ticks(ax.yaxis, 2)
+
+
+def _worst_stretch(rows: Sequence[Signal]) -> tuple[float, float]:
+    """About a tenth of the log, four windows at least, where the squared error, relative to each channel's,
+    is largest."""
+    time = rows[0].time
+    starts = rows[0].window_starts
+    window = float(np.median(np.diff(starts))) if len(starts) > 1 else 0.0
+    length = min(max(0.1 * (time[-1] - time[0]), 4 * window), time[-1] - time[0])
+    total = np.zeros(len(time))
+    for signal in rows:
+        squared = np.nan_to_num((signal.measured - signal.mode) ** 2)
+        total += squared / max(float(squared.mean()), 1e-300)
+    width = max(round(length / max(float(np.median(np.diff(time))), 1e-12)), 1)
+    running = np.convolve(total, np.ones(min(width, len(time))), "valid")
+    start = float(time[running.argmax()])
+    return start, start + float(length)

@@ -1,0 +1,220 @@
+"""Gymnasium faces of the engine: ``gymnasium.make("sipe/FetchPush-v0")`` and ``gymnasium.make_vec``.
+
+The ids are registered when this module is imported: by ``import gymnasium, sipe_bayes`` in this order, by
+``gymnasium.register_envs(sipe_bayes.simulation.gym)`` in any. The vector environment is the engine
+itself, all lanes in one native call, not a loop of processes. ``info`` holds ``valid``, and where a task has them
+``success``, ``achieved_goal`` and ``desired_goal``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from sipe_bayes.envs.registry import TASKS, make_task
+from sipe_bayes.envs.task import Task
+from sipe_bayes.simulation.episodes import Episodes, Step
+from sipe_bayes.simulation.simulator import Simulator
+
+FloatArray = NDArray[np.float64]
+Info = dict[str, Any]
+
+for _name in TASKS:
+    gymnasium.register(
+        f"sipe/{_name}-v0",
+        entry_point="sipe_bayes.simulation.gym:SipeEnv",
+        vector_entry_point="sipe_bayes.simulation.gym:SipeVectorEnv",
+        kwargs={"task": _name},
+    )
+
+
+def make(name: str, variant: str = "default") -> SipeEnv:
+    """The task ``name`` as a Gymnasium environment with the parameters of a variant; raises ValueError that suggests the
+    nearest name. ``.simulator`` is its engine."""
+    return SipeEnv(name, variant)
+
+
+def make_vec(name: str, num_envs: int, variant: str = "default", num_threads: int | None = None) -> SipeVectorEnv:
+    """``num_envs`` lanes of the task ``name`` as a Gymnasium vector environment on the batch engine."""
+    return SipeVectorEnv(name, num_envs, variant, num_threads)
+
+
+def _spaces(task: Task) -> tuple[Any, Any]:
+    """Observation and action space."""
+    size = (len(task.channels),)
+    observation = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float64)
+    return observation, gymnasium.spaces.Box(task.action_low, task.action_high, (task.num_actions,), np.float32)
+
+
+def _info(step: Step) -> Info:
+    """What a step says besides observation, reward and end, for all lanes."""
+    found = {
+        "valid": step.valid,
+        "success": step.success,
+        "achieved_goal": step.achieved_goals,
+        "desired_goal": step.goals,
+    }
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def _checked(options: Info | None, known: tuple[str, ...]) -> Info:
+    unknown = sorted(set(options or {}) - set(known))
+    if unknown:
+        raise ValueError(f"options: no {unknown[0]!r}; expected any of {', '.join(known)}")
+    return options or {}
+
+
+class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
+    """One lane of a task. ``set_parameters(theta)`` changes the simulator at once, ``reset(options={"theta": ...})`` from
+    the new episode on; theta (N,) outside the unit cube only where ``options["allow_outside"]`` or the variant says."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium declares it so)
+
+    def __init__(self, task: str | Task, variant: str = "default") -> None:
+        self.task = make_task(task) if isinstance(task, str) else task
+        self.theta = self.task.theta(variant)
+        self.simulator = Simulator(self.task, num_threads=1)
+        self.observation_space, self.action_space = _spaces(self.task)
+        self._episodes: Episodes | None = None
+
+    def set_parameters(self, theta: FloatArray, allow_outside: bool = False) -> None:
+        """Give the simulator theta (N,); raises ValueError for other shapes, NaN, or values outside [0, 1]."""
+        theta = self.simulator.check_theta(theta, allow_outside, 1)
+        if self._episodes is None:
+            self.simulator.written(theta[0])  # raises for unphysical values
+        else:
+            self._episodes.allow_outside = True
+            self._episodes.set_theta(np.zeros(1, int), theta)
+        self.theta = theta[0]
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[FloatArray, Info]:
+        super().reset(seed=seed)
+        options = _checked(options, ("theta", "allow_outside"))
+        if "theta" in options:
+            self.set_parameters(options["theta"], bool(options.get("allow_outside", False)))
+        if self._episodes is None:
+            self._episodes = Episodes(self.simulator, self.theta, [self.np_random], allow_outside=True)
+        else:
+            self._episodes.generators = [self.np_random]
+            self._episodes.begin(np.ones(1, bool))
+        return self._single(self._episodes.first())
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, Info]:
+        if self._episodes is None:
+            raise ValueError("step: nothing has begun yet; call reset first")
+        step = self._episodes.step(np.asarray(action, float)[None])
+        observation, info = self._single(step)
+        return observation, float(step.rewards[0]), bool(step.terminated[0]), bool(step.truncated[0]), info
+
+    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: Any = None) -> FloatArray:
+        """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
+        return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
+
+    @staticmethod
+    def _single(step: Step) -> tuple[FloatArray, Info]:
+        info = {key: value[0] for key, value in _info(step).items()}
+        return step.observations[0], {k: bool(v) if v.dtype == bool else v for k, v in info.items()}
+
+
+class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
+    """``num_envs`` lanes of a task, all in one native call a step. Autoreset: NEXT_STEP."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self, task: str | Task, num_envs: int = 1, variant: str = "default", num_threads: int | None = None
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs: expected at least one lane, got {num_envs}")
+        self.task = make_task(task) if isinstance(task, str) else task
+        self.theta = np.tile(self.task.theta(variant), (num_envs, 1))
+        self.simulator, self.num_envs = Simulator(self.task, num_threads), num_envs
+        self.single_observation_space, self.single_action_space = _spaces(self.task)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._episodes: Episodes | None = None
+        self._generators: list[np.random.Generator] = []
+
+    def set_parameters(
+        self, theta: FloatArray, lanes: NDArray[np.int64] | None = None, allow_outside: bool = False
+    ) -> None:
+        """Give the ``lanes``, (L,) numbers or a mask (B,), default all, theta (L, N) or (N,); raises ValueError for what does
+        not fit, and then changes nothing."""
+        chosen = self._chosen("lanes", lanes)
+        theta = self.simulator.check_theta(theta, allow_outside, len(chosen))
+        if self._episodes is not None:
+            self._episodes.allow_outside = True
+            self._episodes.set_theta(chosen, theta)
+        else:
+            for row in np.unique(theta, axis=0):
+                self.simulator.written(row)  # raises for unphysical values
+        self.theta[chosen] = theta
+
+    def _chosen(self, name: str, lanes: Any) -> NDArray[np.int64]:
+        """Numbers of lanes given as numbers or as a mask; raises ValueError."""
+        given = np.arange(self.num_envs) if lanes is None else np.asarray(lanes)
+        if given.dtype == bool and given.shape == (self.num_envs,):
+            return np.flatnonzero(given)
+        whole = given.ndim == 1 and np.issubdtype(given.dtype, np.integer)
+        if not whole or (len(given) and not 0 <= given.min() <= given.max() < self.num_envs):
+            raise ValueError(
+                f"{name}: expected a mask ({self.num_envs},) or numbers of lanes below {self.num_envs}, got {given.tolist()}"
+            )
+        return given
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[FloatArray, Info]:
+        """options: ``reset_mask`` (B,) to begin anew in some lanes only, and for those ``theta`` (L, N) or (N,) with
+        ``allow_outside``."""
+        options = _checked(options, ("theta", "allow_outside", "reset_mask"))
+        chosen = self._chosen("reset_mask", options.get("reset_mask"))
+        seeds = self._seeds(seed)
+        if "theta" in options:
+            self.set_parameters(options["theta"], chosen, bool(options.get("allow_outside", False)))
+        if not self._generators:
+            self._generators = [np.random.default_rng(s) for s in seeds]
+        elif seed is not None:
+            for lane in chosen:
+                self._generators[lane] = np.random.default_rng(seeds[lane])
+        if self._episodes is None:
+            self._episodes = Episodes(self.simulator, self.theta, self._generators, allow_outside=True)
+        else:
+            self._episodes.generators = self._generators
+            self._episodes.begin(np.isin(np.arange(self.num_envs), chosen))
+        step = self._episodes.first()
+        return step.observations, self._marked(step)
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        """One seed for each lane: seed, seed + 1, ... of one number."""
+        if seed is None:
+            return [None] * self.num_envs
+        if np.ndim(seed) == 0:
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed: expected one number or {self.num_envs}, got {len(seed)}")
+        return [None if s is None else int(s) for s in seed]
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, Info]:
+        if self._episodes is None:
+            raise ValueError("step: nothing has begun yet; call reset first")
+        step = self._episodes.step(actions)
+        return step.observations, step.rewards, step.terminated, step.truncated, self._marked(step)
+
+    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: Any = None) -> FloatArray:
+        """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
+        return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
+
+    def _marked(self, step: Step) -> Info:
+        """Gymnasium's form: with every entry the lanes that it holds for."""
+        info = _info(step)
+        return {**info, **{f"_{key}": np.ones(self.num_envs, bool) for key in info}}
