@@ -36,7 +36,7 @@ def check_recovery(name: str, budget: int, factor: float, seeds: int = 3, **sett
     for seed in range(seeds):
         fit = get_estimator(simulator, name, budget=budget, seed=seed, **settings)
         errors.append(float(np.abs(fit.fit(trajectory).mean.numpy() - theta).mean()))
-        assert budget - fit.rollouts < 20 or fit._state["done"]
+        assert budget - fit.rollouts < 20 or fit.state["done"]
     trivial = float(np.abs(0.5 - theta).mean())
     print(name, settings, "mean |error|", np.round(errors, 4), "prior mean", round(trivial, 3))
     assert np.mean(errors) * factor < trivial, (errors, trivial)
@@ -117,8 +117,8 @@ def check_other_trajectories(name: str, **settings: Any) -> None:
     used = fit.rollouts
     fit.update_parameter_estimate(another)
     assert fit.rollouts > used
-    assert fit._state["simulated"] == fit.rollouts
-    assert len(fit._state["pool_theta"]) <= fit.rollouts - used
+    assert fit.state["simulated"] == fit.rollouts
+    assert len(fit.state["pool_theta"]) <= fit.rollouts - used
     fit.get_parameter_estimate(another)
     with pytest.raises(ValueError, match="raise it"):
         get_estimator(simulator, name, budget=1, **settings).fit([trajectory, another])

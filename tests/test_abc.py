@@ -84,8 +84,8 @@ def test_the_pendulum(tmp_path: Path) -> None:
 def test_other_logs_need_no_other_simulations() -> None:
     method = ABC(linear(), budget=2000, likelihood=QUIET)
     method.fit(seen(0.4, 0.5))
-    assert method._state is not None
-    other = method.posterior(method._state, Trajectories.stack(seen(0.7, 0.6)))
+    assert method.state is not None
+    other = method.posterior(method.state, Trajectories.stack(seen(0.7, 0.6)))
     mean, sd = exact(0.7, 0.6)
     assert (np.abs(other.mean.numpy() - mean) < sd).all()
     assert method.rollouts == 2000

@@ -80,10 +80,10 @@ def test_paths_are_kept_and_the_first_is_the_prior() -> None:
     simulator, trajectory, _ = problem()
     fit = ADR(simulator, budget=55, seed=0)
     posterior = fit.fit(trajectory)
-    assert fit._state["paths"].shape == (7, 10, 2)
-    np.testing.assert_array_equal(fit._state["paths"][-1], posterior.theta.numpy())
+    assert fit.state["paths"].shape == (7, 10, 2)
+    np.testing.assert_array_equal(fit.state["paths"][-1], posterior.theta.numpy())
     np.testing.assert_allclose(posterior.weights.numpy(), 0.1)
-    assert fit._state["paths"][0].std(0).min() > 0.15
+    assert fit.state["paths"][0].std(0).min() > 0.15
 
 
 def test_contract() -> None:

@@ -83,7 +83,7 @@ def test_what_a_search_makes_of_a_prior_is_said(name: str, words: str) -> None:
     fit = get_estimator(simulator, name, prior=prior, budget=6)
     fit.fit(log(simulator, [0.6, 0.05], 1, steps=60))
     assert any(words in w for w in fit.warnings), fit.warnings
-    began_there = bool((np.abs(fit._state["pool_theta"][:, 0] - 0.9) < 0.01).all())  # type: ignore[index]
+    began_there = bool((np.abs(fit.state["pool_theta"][:, 0] - 0.9) < 0.01).all())  # type: ignore[index]
     assert began_there == (words == "only to begin")
 
 
@@ -100,11 +100,11 @@ def test_the_guides_example_is_an_estimator(tmp_path: Path) -> None:
     assert np.abs(one.mean.numpy() - truth).mean() < 0.5 * np.abs(0.5 - truth).mean()
     other = names["RandomSearch"](simulator, budget=60, seed=3)
     assert other.fit(log(simulator, [0.45, 0.16], 3)).mean.tolist() != one.mean.tolist()
-    assert not set(other._state["theta"][:, 0]) & set(made[0]._state["theta"][:, 0])
-    lost = other._state["cost"].copy()
+    assert not set(other.state["theta"][:, 0]) & set(made[0].state["theta"][:, 0])
+    lost = other.state["cost"].copy()
     lost[int(lost.argmin())] = np.inf  # the best diverges
     assert (
-        other.posterior({**other._state, "cost": lost}, None).mean.tolist()
-        != other.posterior(other._state, None).mean.tolist()
+        other.posterior({**other.state, "cost": lost}, None).mean.tolist()
+        != other.posterior(other.state, None).mean.tolist()
     )
     assert other.warnings[-1:] == ["1 of 60 simulations diverged and do not count"]

@@ -181,7 +181,7 @@ def test_other_trajectories_start_a_new_process() -> None:
     method.update_parameter_estimate(other)
     fresh = BayesOpt(simulator, budget=200, **ROUGH)
     fresh.update_parameter_estimate(other)
-    assert np.array_equal(method._state["cost"], fresh._state["cost"])
+    assert np.array_equal(method.state["cost"], fresh.state["cost"])
     assert method.rollouts == before + fresh.rollouts
     method.get_parameter_estimate(other)
     assert not any("other trajectories" in w for w in method.warnings)

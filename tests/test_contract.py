@@ -93,7 +93,7 @@ def test_support_seeds_budget_and_files(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_setting_is_part_of_what_tells_runs_apart(name: str) -> None:
     """Whatever an estimator takes by name changes the result, but for where it works and what it tells."""
-    silent = {"simulator", "settings", "checkpoint", "progress", "cache", "device"}
+    silent = {"simulator", "settings", "options", "checkpoint", "progress", "cache", "device"}
     taken = {p for c in estimator_class(name).__mro__[:-1] for p in inspect.signature(c).parameters}
     stated = get_estimator(pendulum(), name).settings()
     assert taken - silent <= set(stated), taken - silent - set(stated)

@@ -151,8 +151,8 @@ def test_unknown_noise_of_a_log_is_integrated_out() -> None:
     wanted = [np.interp(levels, (np.cumsum(m) - 0.5 * m) / m.sum(), grid) for m in (density.sum(1), density.sum(0))]
     print(found.T, np.array(wanted), estimator.diagnostics, estimator.rollouts)
     np.testing.assert_allclose(found.T, wanted, atol=0.08)
-    assert estimator._state is not None
-    mode = {k[5:]: v[0] for k, v in estimator._state.items() if k.startswith("mode_")}
+    assert estimator.state is not None
+    mode = {k[5:]: v[0] for k, v in estimator.state.items() if k.startswith("mode_")}
     windows = bind(likelihood, simulator, Trajectories.stack([log]))
     values = WindowTarget(estimator.prior, windows, at_optimum(windows, mode))(points)
     expected = -0.5 * len(log) * np.log(squares).sum(1)

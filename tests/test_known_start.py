@@ -123,8 +123,8 @@ def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
         for budget in range(first, first + 4):
             estimator = Laplace(bouncing(), likelihood=KNOWN, initial=start, budget=budget)
             estimator.fit(log)
-            assert estimator._state is not None
-            assert estimator._state["mode_evidence"].max() >= evidence - 1e-9
+            assert estimator.state is not None
+            assert estimator.state["mode_evidence"].max() >= evidence - 1e-9
 
 
 def test_mcmc_agrees_with_laplace() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.checkpoint import State, load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.search.learned_reward import LearnedReward
@@ -126,7 +126,7 @@ def test_training_goes_on_exactly_from_disk(tmp_path: Path) -> None:
     once = reward.train(reward.start(), features)
     save_state(tmp_path / "s", once, "x")
     two = reward.train(once, features)
-    again = LearnedReward(bound, updates=5).train(load_state(tmp_path / "s", "x"), features)
+    again = LearnedReward(bound, updates=5).train(load_state(tmp_path / "s", State, "x"), features)
     assert two.keys() == again.keys()
     assert all(np.array_equal(two[k], again[k]) for k in two)
     assert not np.array_equal(once["reward_weights"], two["reward_weights"])

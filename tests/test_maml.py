@@ -62,7 +62,7 @@ def trained(budget: int = 150) -> tuple[MAML, Counting, Trajectories]:
     simulator = Counting()
     method = MAML(simulator, budget=budget, **FORM["maml"])
     recorded = Trajectories.stack(log(simulator, TRUTH, 1, steps=60))
-    while method._state is None or not method._state["trained"]:
+    while method.state is None or not method.state["trained"]:
         method.update_parameter_estimate(recorded)
     return method, simulator, recorded
 
@@ -70,7 +70,7 @@ def trained(budget: int = 150) -> tuple[MAML, Counting, Trajectories]:
 def test_a_step_at_test_time_goes_down_the_gradient() -> None:
     """Against plain autograd on the same simulations near the estimate."""
     method, _, recorded = trained()
-    state = method._state
+    state = method.state
     assert state is not None
     steps = recorded_steps(recorded)
     network = method._network(steps.shape[-1], 0)
@@ -102,7 +102,7 @@ def test_adapting_ends_where_the_budget_does() -> None:
         method.update_parameter_estimate(both)
     assert simulator.lanes == 20
     assert method.rollouts == 145
-    assert method._state["done"]
+    assert method.state["done"]
     assert any("ran out" in w for w in method.warnings)
 
 

@@ -69,8 +69,8 @@ def trained() -> tuple[NPE, Flow]:
 def test_the_exact_posterior_without_training_again(trained: tuple[NPE, Flow], x: tuple[float, float]) -> None:
     """Also where a bound cuts it off (a = 0.02)."""
     method, _ = trained
-    assert method._state is not None
-    posterior = method.posterior(method._state, Trajectories.stack(seen(*x)))
+    assert method.state is not None
+    posterior = method.posterior(method.state, Trajectories.stack(seen(*x)))
     mean, sd = exact(*x)
     print(x, (posterior.mean.numpy() - mean) / sd, posterior.stddev.numpy() / sd)
     np.testing.assert_array_less(np.abs(posterior.mean.numpy() - mean), 0.5 * sd)
@@ -183,9 +183,9 @@ def test_rounds_sharpen_and_stay_exact() -> None:
     assert errors[2][0] < 0.4
     assert errors[2][1] < 0.25
     assert sum(errors[2]) < sum(errors[1]) + 0.15
-    assert method._state is not None
+    assert method.state is not None
     with pytest.raises(ValueError, match="use rounds=1, or fit again"):
-        method.posterior(method._state, Trajectories.stack(seen(0.5, 0.5)))
+        method.posterior(method.state, Trajectories.stack(seen(0.5, 0.5)))
 
 
 class Interrupted(Exception):
@@ -244,7 +244,7 @@ def test_wrong_input() -> None:
     longer = sipe.Trajectory(np.zeros((3, 2)), np.zeros((2, 0)), 1.0)
     trained = NPE(simulator, **TINY)
     trained.fit(seen(0.4, 0.5))
-    assert trained._state is not None
+    assert trained.state is not None
     table: list[tuple[Any, str]] = [
         (lambda: NPE(simulator, embedding="lstm"), "embedding: expected one of transitions, none"),
         (lambda: NPE(simulator, rounds=0), "rounds: expected at least 1"),
@@ -254,7 +254,7 @@ def test_wrong_input() -> None:
         (lambda: NPE(pendulum(), embedding="none", budget=50).fit(missing), "use 'transitions'"),
         (lambda: NPE(pendulum(), max_epochs=1, budget=50).fit(missing), "no control step"),
         (lambda: NPE(simulator, **{**TINY, "budget": 5}).fit(seen(0.4, 0.5)), "raise the budget"),
-        (lambda: trained.posterior(trained._state or {}, Trajectories.stack(longer)), "logs of one length only"),
+        (lambda: trained.posterior(trained.state or {}, Trajectories.stack(longer)), "logs of one length only"),
     ]
     for call, words in table:
         with pytest.raises(ValueError, match=words):

@@ -198,7 +198,7 @@ def test_impossible_draws_are_drawn_anew_and_counted() -> None:
 
 def test_a_diverging_draw_ends_its_episode_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     run = run_of(told())
-    engine = run.trainer.episodes.simulator.engine
+    engine = run.trainer.simulator.engine
     advance, seen = engine.advance, []
 
     def diverging(*args: Any, **settings: Any) -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from sipe_bayes.core import files
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.misspecification import Misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior

@@ -83,7 +83,7 @@ def test_every_update_of_a_fit_respects_the_bound() -> None:
     simulator, trajectory, _ = problem()
     fit = SimOpt(simulator, budget=150, seed=0)
     fit.fit(trajectory)
-    means, covariances = fit._state["means"], fit._state["covariances"]
+    means, covariances = fit.state["means"], fit.state["covariances"]
     moves = [gaussian_kl(means[k + 1], covariances[k + 1], means[k], covariances[k]) for k in range(len(means) - 1)]
     assert len(moves) == 25
     assert max(moves) <= fit.epsilon * (1 + 1e-9)

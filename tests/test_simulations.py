@@ -110,12 +110,12 @@ def test_rounds_begin_anew_with_another_log() -> None:
     simulator = Counting()
     one, other = (log(simulator, TRUTH, k, steps=60) for k in (1, 2))
     estimator = get_estimator(simulator, "bayessim", rounds=2, budget=200, **FORM["bayessim"])
-    while estimator._state is None or estimator._state["round"] == 1:
+    while estimator.state is None or estimator.state["round"] == 1:
         estimator.update_parameter_estimate(one)
     estimator.update_parameter_estimate(one)
     assert estimator.rollouts == 150
     simulator.lanes = 0
-    while not estimator._state["done"]:
+    while not estimator.state["done"]:
         estimator.update_parameter_estimate(other)
     assert simulator.lanes == 50
     estimator.get_parameter_estimate(other)

@@ -14,7 +14,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import sipe_bayes as sipe
-from sipe_bayes.core.checkpoint import CheckpointError, load_state, save_state
+from sipe_bayes.core.checkpoint import CheckpointError, State, load_state, save_state
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -238,7 +238,7 @@ def test_laplace_and_mcmc_find_the_kalman_filters_posterior() -> None:
     posteriors = {name: e.fit(logs) for name, e in estimators.items()}
     chain = bind(StateSpace(), spring(), Trajectories.stack(logs))
     firsts = chain.reference[chain.first][:, 1:3]
-    state = estimators["laplace"]._state
+    state = estimators["laplace"].state
     assert state is not None
     noise = ChainNoise(state["mode_sd"][0], state["mode_process"][0])
     print("noise", noise, "made with", MADE_WITH)
@@ -292,8 +292,8 @@ def test_no_budget_loses_what_was_found() -> None:
     for budget in range(75, 205, 10):
         estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0, budget=budget)
         estimator.fit(kicked_logs())
-        assert estimator._state is not None
-        found.append((float(estimator._state["mode_evidence"][0]), len(estimator.diagnostics["loose"])))
+        assert estimator.state is not None
+        found.append((float(estimator.state["mode_evidence"][0]), len(estimator.diagnostics["loose"])))
     print(found)
     evidence = np.array([value for value, _ in found])
     assert (np.diff(evidence) >= 0).all()
@@ -400,7 +400,7 @@ def test_quaternions_stay_of_length_one() -> None:
     log = Trajectory(noisy, actions, 0.01, name="log")
     estimator = Laplace(simulator, likelihood=StateSpace(), restarts=1, candidates=0)
     posterior = estimator.fit(log)
-    state = estimator._state
+    state = estimator.state
     assert state is not None
     lengths = np.linalg.norm(state["mode_states"][0][:, 1:5], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-9)
@@ -445,7 +445,7 @@ def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
         estimator.fit(logs)
     with safe_open(path, framework="numpy") as file:
         fingerprint = file.metadata()["fingerprint"]
-    state = load_state(path, fingerprint)
+    state = load_state(path, State, fingerprint)
     del state["state_step"]
     save_state(path, state, fingerprint)
     with pytest.raises(CheckpointError, match=r"has no 'state_step', as one of another version.*delete it"):

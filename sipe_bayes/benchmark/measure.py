@@ -19,6 +19,7 @@ from sipe_bayes.benchmark.executors.work import Done
 from sipe_bayes.benchmark.frame import Files, blank, failed, measured
 from sipe_bayes.benchmark.log import Log, one_step, recorded
 from sipe_bayes.benchmark.records import Record, file_name, posterior_path
+from sipe_bayes.core.findings import Findings
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
@@ -153,18 +154,18 @@ def _simulated(estimator: PriorSampling, cell: Cell, log: Log, folder: Path) -> 
 
 
 def _over(estimator: Estimator) -> bool:
-    return estimator._state is not None and bool(estimator._state["done"])
+    return estimator.ended
 
 
 def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
     """A row of the history, if there is an estimate yet; the estimator stays as it is."""
-    said = list(estimator.warnings)
+    before = list(estimator.findings)
     try:
         scores = score(estimator.get_parameter_estimate(log.trajectories), log.truth)
     except ValueError:  # too early
         return []
     finally:
-        estimator.warnings = said
+        estimator.findings = Findings(before)
     return [{"rollouts": estimator.rollouts, "mean_accuracy": scores.mean_accuracy, "mean_crps": scores.mean_crps}]
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.output import CHECKPOINT, claim, describe_run, release, write_all
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
+from sipe_bayes.core.findings import Code
 from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
@@ -77,7 +78,8 @@ def calibrate(
     fitted = bind(problem.segments, problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
     conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed, tell)
-    method.warnings += [f"log {name} could not be fitted by itself; whether it agrees is unknown" for name in skipped]
+    for name in skipped:
+        method.warn(f"log {name} could not be fitted by itself; whether it agrees is unknown")
     noise = _noise_of(method, fitted, theta)
     tell("checking what the model lacks")
     lacking, residuals = _residuals(problem, method, fitted, theta, noise, posterior.stddev.numpy())
@@ -224,7 +226,7 @@ def _warnings(
     conflict: Disagreement | None,
     holdout: Sequence[ChannelScore],
 ) -> list[str]:
-    own = [w for w in method.warnings if w != method.diagnostics.get("at_bound")]  # said below, with the value
+    own = [f.text for f in method.findings if f.code is not Code.AT_BOUND]  # said below, with the value
     words = [*problem.warnings, *own] + [
         f"{p.name}: its targets have different values in the model, so 'the model as given' stands for all at {p.default:.4g} {p.unit}"
         for p in problem.environment.space

@@ -1,10 +1,19 @@
-"""An estimator's state on disk: one safetensors file, numbers and text in its JSON header, written atomically."""
+"""A search's state on disk: a frozen dataclass as one safetensors file, numbers and text in its JSON header.
+
+Fields may be arrays, numbers, text, booleans, None, enumerations, ``Finding``-like plain dictionaries of JSON, other
+frozen dataclasses, and tuples or dictionaries by name of all these. The dataclass that is asked for says how to read
+them; nothing in the file does.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import enum
 import json
+import types
+import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -20,24 +29,102 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be read or belongs to another run."""
 
 
-def save_state(path: Path, state: State, fingerprint: str) -> None:
-    """Write ``state`` to ``path``; ``fingerprint`` says which run it belongs to."""
-    arrays = {k: np.ascontiguousarray(v) for k, v in state.items() if isinstance(v, np.ndarray)}
-    plain = {k: v for k, v in state.items() if not isinstance(v, np.ndarray)}
+class SearchState(Protocol):
+    """What every method's state is: a frozen dataclass that says whether the search has ended."""
+
+    @property
+    def done(self) -> bool: ...
+
+
+S = TypeVar("S")
+
+
+def save_state(path: Path, state: Any, fingerprint: str) -> None:
+    """Write a state.
+
+    Args:
+        path: the file.
+        state: a frozen dataclass.
+        fingerprint: which run it belongs to.
+    """
+    arrays: dict[str, Any] = {}
+    plain = _flattened("", state, arrays)
     arrays.setdefault("_", np.zeros(1))  # safetensors wants at least one
-    data = save(arrays, metadata={"plain": json.dumps(plain), "fingerprint": fingerprint})
-    write_bytes(path, data)
+    write_bytes(path, save(arrays, metadata={"plain": json.dumps(plain), "fingerprint": fingerprint}))
 
 
-def load_state(path: Path, fingerprint: str) -> State:
-    """Read what ``save_state`` wrote; raises CheckpointError when it is corrupt or belongs to another run."""
+def load_state(path: Path, kind: type[S], fingerprint: str) -> S:
+    """Read what ``save_state`` wrote.
+
+    Args:
+        path: the file.
+        kind: the dataclass of the state.
+        fingerprint: which run it has to belong to.
+
+    Raises:
+        CheckpointError: when it is corrupt, of another version, or belongs to another run.
+    """
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata()
-            state: State = {k: file.get_tensor(k) for k in file.keys() if k != "_"}  # noqa: SIM118
-        state.update(json.loads(metadata["plain"]))
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, OSError) as error:
-        raise CheckpointError(f"checkpoint {path}: cannot be read ({error}); delete it to start again") from None
-    if metadata["fingerprint"] != fingerprint:
-        raise CheckpointError(f"checkpoint {path}: belongs to another run; choose another folder or delete it")
-    return state
+            arrays = {k: file.get_tensor(k) for k in file.keys() if k != "_"}  # noqa: SIM118
+        if metadata["fingerprint"] != fingerprint:
+            raise CheckpointError(f"checkpoint {path}: belongs to another run; choose another folder or delete it")
+        return typing.cast(S, _restored("", json.loads(metadata["plain"]), kind, arrays))
+    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(
+            f"checkpoint {path}: cannot be read ({error}); it is damaged or of another version of sipe_bayes: delete "
+            "it to start again"
+        ) from None
+
+
+def _flattened(name: str, value: Any, arrays: dict[str, Any]) -> Any:
+    """The value as JSON; arrays go into ``arrays`` under their dotted names, and leave None."""
+    if isinstance(value, np.ndarray):
+        arrays[name] = np.ascontiguousarray(value)
+        return None
+    if dataclasses.is_dataclass(value):
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return {k: _flattened(f"{name}.{k}", v, arrays) for k, v in fields.items()}
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, tuple | list):
+        return [_flattened(f"{name}.{k}", v, arrays) for k, v in enumerate(value)]
+    if isinstance(value, dict):
+        return {k: _flattened(f"{name}.{k}", v, arrays) for k, v in value.items()}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
+    """The value of type ``kind`` that ``_flattened`` made ``plain`` and ``arrays`` of."""
+    if name in arrays:
+        return arrays[name]
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (types.UnionType, typing.Union):
+        chosen = [a for a in arguments if a is not type(None)]
+        return None if plain is None and not _stored(name, arrays) else _restored(name, plain, chosen[0], arrays)
+    whole = origin if dataclasses.is_dataclass(origin) else kind
+    if dataclasses.is_dataclass(whole) and isinstance(whole, type):
+        hints = typing.get_type_hints(whole)
+        stands_for = dict(zip(getattr(whole, "__parameters__", ()), arguments, strict=False))
+        hints = {k: stands_for.get(v, v) if isinstance(v, TypeVar) else v for k, v in hints.items()}
+        return whole(
+            **{
+                f.name: _restored(f"{name}.{f.name}", plain[f.name], hints[f.name], arrays)
+                for f in dataclasses.fields(whole)
+            }
+        )
+    if isinstance(kind, type) and issubclass(kind, enum.Enum):
+        return kind(plain)
+    if origin in (tuple, list):
+        items = [arguments[0] if arguments[1:] in ((), (...,)) else arguments[k] for k in range(len(plain))]
+        return origin(_restored(f"{name}.{k}", v, items[k], arrays) for k, v in enumerate(plain))
+    if origin is dict:
+        return {k: _restored(f"{name}.{k}", v, arguments[1], arrays) for k, v in plain.items()}
+    return plain
+
+
+def _stored(name: str, arrays: dict[str, Any]) -> bool:
+    return any(key.startswith(f"{name}.") for key in arrays)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import os
 from collections.abc import Iterable
@@ -73,3 +74,15 @@ def _shown(value: Any) -> str:
 def cores() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def nearest_name(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """``"; did you mean 'NAME'?"`` for the known name that is most alike, empty where none is.
+
+    Args:
+        name: what was given.
+        known: the legal names.
+        cutoff: how alike they have to be, from 0 to 1.
+    """
+    close = difflib.get_close_matches(name, list(known), 1, cutoff)
+    return f"; did you mean {close[0]!r}?" if close else ""

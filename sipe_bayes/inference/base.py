@@ -7,17 +7,21 @@ windows; finite differences count.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
 
-from sipe_bayes.core.checkpoint import CheckpointError, State, load_state, save_state
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
+from sipe_bayes.core.options import Options
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import path, whole
 from sipe_bayes.datasets.demonstrations import Given
@@ -38,7 +42,20 @@ Recorded = Trajectory | Iterable[Trajectory] | Trajectories | Any
 """One or several trajectories, or an environment: a task's name, a Task, a Simulator of one, ``sipe.make(...)``."""
 
 
-class Estimator(ABC):
+S = TypeVar("S", bound=Any)  # SearchState, once every method's state is a dataclass
+
+
+@dataclass(frozen=True)
+class Snapshot(Generic[S]):
+    """A state with what was counted and noticed when it was made: what a checkpoint holds."""
+
+    state: S
+    rollouts: int
+    findings: tuple[Finding, ...]
+    diagnostics: str  # JSON
+
+
+class Estimator(ABC, Generic[S]):
     """Infers a posterior over theta from trajectories.
 
     simulator: what is calibrated. prior: a posterior with a density over ``simulator.space``, default the one its
@@ -89,7 +106,7 @@ class Estimator(ABC):
                     self.warn(f"{lost} of {len(state['cost'])} simulations {self.simulator.failure} and do not count")
                 return Dirac(state["theta"][state["cost"].argmin()], self.space)
 
-    ``warn`` adds to ``warnings``, ``doubt`` to those for which no interval is to be trusted (``doubts``), ``digest`` tells trajectories apart.
+    ``find`` notes a finding, whose code and text stand in ``core.finding_texts``; ``digest`` tells trajectories apart.
     """
 
     name: ClassVar[str]
@@ -99,6 +116,9 @@ class Estimator(ABC):
     uncertain: ClassVar[bool] = True  # False: the spread is that of a search, not an uncertainty
     default_budget: ClassVar[int] = 1000
     checkpoint_seconds: float = 1.0
+    options_type: ClassVar[type[Options]] = Options
+    state_type: ClassVar[Any] = dict[str, Any]  # the dataclass of a method's state
+    options: Options
 
     def __init__(
         self,
@@ -110,7 +130,9 @@ class Estimator(ABC):
         likelihood: Segments | StateSpace | None = None,
         checkpoint: str | Path | None = None,
         progress: Progress | None = None,
+        **options: object,
     ) -> None:
+        self.options = self.options_type.of(options, self.name)
         if not isinstance(simulator, Simulator | CallableSimulator):
             raise ValueError(
                 f"simulator: expected a Simulator or a CallableSimulator, got {simulator!r}; sipe.get_estimator takes the "
@@ -138,10 +160,9 @@ class Estimator(ABC):
         self.likelihood: Any = likelihood or _default_likelihood(simulator)  # StateSpace only where it ``searches``
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts = 0
-        self.warnings: list[str] = []
-        self._doubtful: set[str] = set()
+        self.findings = Findings()
         self.diagnostics: dict[str, Any] = {}
-        self._state: State | None = None
+        self._last: Snapshot[S] | None = None
         self._bound: tuple[Trajectories, Windows] | None = None
         self._given = Given()
         self._observed: Trajectory | None = None
@@ -159,83 +180,95 @@ class Estimator(ABC):
             )
         return path(name, given)
 
-    @abstractmethod
-    def start(self, trajectories: Trajectories) -> State: ...
+    def __init_subclass__(cls, **settings: Any) -> None:
+        """Show the fields of a method's own options in the signature of its constructor."""
+        super().__init_subclass__(**settings)
+        if "options_type" not in vars(cls) or "__init__" in vars(cls):
+            return
+        common = [p for p in inspect.signature(Estimator.__init__).parameters.values() if p.kind is not p.VAR_KEYWORD]
+        own = [
+            inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type)
+            for f in fields(cls.options_type)
+        ]
+        cls.__signature__ = inspect.Signature([*common[1:], *own])  # type: ignore[attr-defined]
 
     @abstractmethod
-    def step(self, state: State, trajectories: Trajectories) -> State: ...
+    def start(self, trajectories: Trajectories) -> S: ...
 
     @abstractmethod
-    def posterior(self, state: State, trajectories: Trajectories) -> Posterior: ...
+    def step(self, state: S, trajectories: Trajectories) -> S: ...
+
+    @abstractmethod
+    def posterior(self, state: S, trajectories: Trajectories) -> Posterior: ...
 
     def fit(self, trajectories: Recorded) -> Posterior:
-        """The posterior given one or several trajectories, or an environment, which stands for its reference demonstrations;
-        raises ValueError for ones that do not fit the simulator, and BudgetTooSmall for a budget without an estimate."""
+        """Infer.
+
+        Args:
+            trajectories: one or several, or an environment, which stands for its reference demonstrations.
+
+        Returns:
+            The posterior given them.
+
+        Raises:
+            ValueError: for trajectories that do not fit the simulator.
+            BudgetTooSmall: for a budget without an estimate.
+            CheckpointError: for a checkpoint that is damaged or of another run.
+        """
         batch = self._given.stack(self._recorded(trajectories), anew=True)
         fingerprint = self._fingerprint(batch)
-        self.warnings, self.diagnostics, self.rollouts, self._bound = [], {}, 0, None
-        self._doubtful = set()
-        state = None
+        self.findings, self.diagnostics, self.rollouts, self._bound = Findings(), {}, 0, None
+        self._last = last = None
         if self.checkpoint is not None and self.checkpoint.exists():
-            state = load_state(self.checkpoint, fingerprint)
-        saved, resumed = time.monotonic(), state is not None
+            last = load_state(self.checkpoint, Snapshot[self.state_type], fingerprint)  # type: ignore[name-defined]
+            self.go_on_from(last)
+        saved = time.monotonic()
         try:
-            if state is not None:
-                self._recall(state)
-            else:
-                state = self._counted(self.start(batch), batch)
-            while not state["done"]:
-                state = self._counted(self.step(state, batch), batch)
-                if self.checkpoint is not None and (
-                    state["done"] or time.monotonic() - saved > self.checkpoint_seconds
-                ):
-                    save_state(self.checkpoint, state, fingerprint)
+            last = self._keep(self.start(batch)) if last is None else last
+            while not _ended(last.state):
+                last = self._keep(self.step(last.state, batch))
+                late = time.monotonic() - saved > self.checkpoint_seconds
+                if self.checkpoint is not None and (_ended(last.state) or late):
+                    save_state(self.checkpoint, last, fingerprint)
                     saved = time.monotonic()
                 if self.progress is not None:
-                    self.progress(self.describe(state), self.rollouts, self.budget)
+                    self.progress(self.describe(last.state), self.rollouts, self.budget)
         except BudgetExhausted as error:
-            if state is None:
+            if last is None:
                 raise BudgetTooSmall(f"budget: {error}; raise it") from None
-            self.warn(self._spent())
-        except KeyError as error:
-            if not resumed or error.args[0] in (state or {}):
-                raise
-            raise CheckpointError(
-                f"checkpoint {self.checkpoint}: has no {error}, as one of another version of sipe_bayes; delete it to start again"
-            ) from error
-        self._state = state
-        return self._finished(state, batch)
+            self.find(Code.BUDGET_SPENT, budget=self.budget)
+        return self._finished(last.state, batch)
 
     def update_parameter_estimate(self, trajectories: Recorded) -> None:
-        """One step of the method, as the paper's interface names it; trajectories may differ from step to step. An
-        environment stands for its reference demonstrations."""
-        batch = self._given.stack(self._recorded(trajectories))
-        if self._state is None:
+        """One step of the method, as the paper's interface names it.
+
+        Args:
+            trajectories: as of ``fit``; they may differ from step to step.
+        """
+        batch, last = self._given.stack(self._recorded(trajectories)), self._last
+        if last is None:
             try:
-                self._state = self._counted(self.start(batch), batch)
+                last = self._keep(self.start(batch))
             except BudgetExhausted as error:
                 raise BudgetTooSmall(f"budget: {error}; raise it") from None
-        if not self._state["done"]:
-            self._recall(self._state)
+        if not _ended(last.state):
+            self.go_on_from(last)
             try:
-                self._state = self._counted(self.step(self._state, batch), batch)
+                self._keep(self.step(last.state, batch))
             except BudgetExhausted:
-                self.warn(self._spent())
-                self._state = self._counted({**self._state, "done": True}, batch)
-
-    def _spent(self) -> str:
-        return f"the budget of {self.budget} rollouts ran out before the method had converged"
+                self.find(Code.BUDGET_SPENT, budget=self.budget)
+                self._keep(_with_end(last.state))
 
     def get_parameter_estimate(self, trajectories: Recorded) -> Posterior:
         """The posterior of the present state."""
-        if self._state is None:
+        if self._last is None:
             raise ValueError(
                 "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
             )
-        self._recall(self._state)
-        return self._finished(self._state, self._given.stack(self._recorded(trajectories)))
+        self.go_on_from(self._last)
+        return self._finished(self._last.state, self._given.stack(self._recorded(trajectories)))
 
-    def _finished(self, state: State, trajectories: Trajectories) -> Posterior:
+    def _finished(self, state: S, trajectories: Trajectories) -> Posterior:
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
         posterior = self.posterior(state, trajectories)
         middle = posterior.quantile(torch.tensor([0.5], dtype=torch.float64))[0].numpy()
@@ -246,11 +279,7 @@ class Estimator(ABC):
             if sharp and min(m, 1 - m) < AT_BOUND
         ]
         if at:
-            said = (
-                f"{', '.join(at)} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
-            )
-            self.warn(said)
-            self.diagnostics["at_bound"] = said
+            self.find(Code.AT_BOUND, parameters=at)
         return posterior
 
     def _recorded(self, given: Recorded) -> Recorded:
@@ -264,22 +293,51 @@ class Estimator(ABC):
             self._observed = made
         return self._observed
 
+    @property
+    def snapshot(self) -> Snapshot[S] | None:
+        """The present state with what was counted and found, or None before the first."""
+        return self._last
+
+    @property
+    def ended(self) -> bool:
+        """Whether the search is over."""
+        return self._last is not None and _ended(self._last.state)
+
+    @property
+    def state(self) -> S | None:
+        """The present state, or None before the first."""
+        return None if self._last is None else self._last.state
+
+    def go_on_from(self, last: Snapshot[S]) -> None:
+        """Take up a search where a snapshot left it; what an estimate in between found is forgotten."""
+        self._last, self.rollouts, self.findings = last, last.rollouts, Findings(last.findings)
+        self.diagnostics = json.loads(last.diagnostics)
+
+    def find(self, code: Code, **about: Any) -> None:
+        """Note a finding, once; ``about``: as of ``core.findings.finding``."""
+        self.findings.add(finding(code, **about))
+
     def warn(self, sentence: str | None) -> None:
         """Add a sentence to the warnings, once; None adds nothing."""
-        if sentence is not None and sentence not in self.warnings:
-            self.warnings.append(sentence)
+        if sentence is not None:
+            self.find(Code.REMARK, text=sentence)
 
     def doubt(self, sentence: str) -> None:
         """Warn of something for which no interval is to be trusted."""
-        self.warn(sentence)
-        self._doubtful.add(sentence)
+        self.findings = Findings(item for item in self.findings if item.text != sentence)
+        self.find(Code.REMARK, severity=Severity.BLOCKING, text=sentence)
+
+    @property
+    def warnings(self) -> list[str]:
+        """The texts of what was found."""
+        return self.findings.warnings
 
     @property
     def doubts(self) -> list[str]:
-        """The warnings for which no interval is to be trusted."""
-        return [said for said in self.warnings if said in self._doubtful]
+        """Of the warnings those for which no interval is to be trusted."""
+        return self.findings.doubts
 
-    def describe(self, state: State) -> str:
+    def describe(self, state: S) -> str:
         """What is being done, in a few words, for the progress bar."""
         return self.name
 
@@ -291,18 +349,12 @@ class Estimator(ABC):
             self._bound = (trajectories, bound)
         return self._bound[1]
 
-    def _counted(self, state: State, trajectories: Trajectories) -> State:
+    def _keep(self, state: S) -> Snapshot[S]:
+        """Count and remember a state with what was found until now."""
         if self._bound is not None:
             self.rollouts = self._bound[1].rollouts
-        said = json.dumps(self.diagnostics)
-        words = {"warnings": list(self.warnings), "doubts": self.doubts}
-        return {**state, "rollouts": self.rollouts, **words, "diagnostics": said}
-
-    def _recall(self, state: State) -> None:
-        """Count, warnings and diagnostics as they were when ``state`` was made: an estimate in between adds its own."""
-        self.rollouts, self.warnings = int(state["rollouts"]), list(state["warnings"])
-        self._doubtful |= set(state["doubts"])
-        self.diagnostics = json.loads(state["diagnostics"])
+        self._last = Snapshot(state, self.rollouts, tuple(self.findings), json.dumps(self.diagnostics))
+        return self._last
 
     def settings(self) -> dict[str, Any]:
         """Whatever changes the result besides the trajectories, as plain data; subclasses add theirs."""
@@ -314,10 +366,19 @@ class Estimator(ABC):
             "space": self.space.to_dict(),
             "prior": [x.tolist() for x in self.prior.gaussian_moments()],
             "model": self.simulator.checksum(),
+            **self.options.plain(),
         }
 
     def _fingerprint(self, trajectories: Trajectories) -> str:
         return hashlib.sha256(f"{self.settings()!r}{digest(trajectories)}".encode()).hexdigest()
+
+
+def _ended(state: Any) -> bool:
+    return bool(state["done"] if isinstance(state, dict) else state.done)
+
+
+def _with_end(state: Any) -> Any:
+    return {**state, "done": True} if isinstance(state, dict) else replace(state, done=True)
 
 
 def digest(trajectories: Trajectories) -> str:

@@ -98,16 +98,19 @@ class MCMC(Estimator):
                 f"{self.budget} rollouts did not suffice for the laplace fit that comes first"
             ) from None
         windows.rollouts += first.rollouts
-        assert first._state is not None
-        for sentence in first._state["warnings"]:  # of the search; those of its posterior do not hold of the chains
+        assert first.snapshot is not None
+        searched = first.snapshot.state
+        for sentence in (
+            f.text for f in first.snapshot.findings
+        ):  # of the search; its posterior's do not hold of the chains
             self.warn(sentence)
-        best = distinct_modes(first._state)[0]
-        mode = {k[5:]: v[best] for k, v in first._state.items() if k.startswith("mode_")}
+        best = distinct_modes(searched)[0]
+        mode = {k[5:]: v[best] for k, v in searched.items() if k.startswith("mode_")}
         if not mode.get("settled", True):
             self.doubt(UNSETTLED)  # the chains hold that noise
         at_optimum = (state_space_target if isinstance(windows, Chain) else window_target).at_optimum
         picked, proposal = at_optimum(windows, mode), found
-        if "draws_share" in first._state:  # kernels, which are slow to draw from
+        if "draws_share" in searched:  # kernels, which are slow to draw from
             mean, covariance = found.gaussian_moments()
             proposal = GaussianMixture([0.0], mean[None], covariance[None], self.space)
         random = np.random.RandomState(self.seed)

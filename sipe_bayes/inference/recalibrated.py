@@ -47,6 +47,7 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.datasets.demonstrations import Given
@@ -112,7 +113,7 @@ class Recalibrated(Estimator):
         self._fitted: tuple[Trajectories, Estimator, Posterior] | None = None
         self._replicas: tuple[Trajectories, Replicas] | None = None
         self._proposals: tuple[tuple[bytes, bytes], FloatArray] | None = None
-        self._said: tuple[list[str], list[str]] = [], []  # warnings and doubts of its fit
+        self._found: list[Finding] = []  # of its fit
         self._seconds: float | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -238,7 +239,7 @@ class Recalibrated(Estimator):
         """The estimator fitted to the log itself, and what it found; after an interruption from its own checkpoint."""
         if self._fitted is None or self._fitted[0] is not trajectories:
             base = fresh(self.estimator)
-            if base.amortised and (base._state or {}).get("done"):
+            if base.amortised and base.ended:
                 found = base.get_parameter_estimate(trajectories)
             else:
                 base.progress = self.progress
@@ -249,20 +250,21 @@ class Recalibrated(Estimator):
                 found = base.fit(trajectories)
             self._fitted = (trajectories, base, found)
             # before it sees replicas; one that is not amortised doubts its widths, which are mended here
-            self._said = list(base.warnings), base.doubts if base.amortised else []
-        for sentence in self._said[0]:
-            if sentence in self._said[1]:
-                self.doubt(sentence)
-            else:
-                self.warn(sentence)
+            self._found = [
+                item
+                if base.amortised or item.severity is not Severity.BLOCKING
+                else replace(item, severity=Severity.CAUTION)
+                for item in base.findings
+            ]
+        self.findings.extend(self._found)
         return self._fitted[1:]
 
     def _estimate(self, base: Estimator, replica: Trajectories) -> FloatArray | None:
         """Mean (N,) of the estimator's posterior of a replica; None where it finds none."""
         again = base if base.amortised else fresh(base)
         try:
-            if base.amortised and base._state is not None:
-                found = base.posterior(base._state, replica)
+            if base.amortised and base.snapshot is not None:
+                found = base.posterior(base.snapshot.state, replica)
             else:
                 again.budget = min(base.budget, max(1, self.budget - self.rollouts))
                 found = again.fit(replica)
@@ -270,7 +272,7 @@ class Recalibrated(Estimator):
             found = None
         if not base.amortised:
             self.rollouts += again.rollouts
-            if again.budget < base.budget and (found is None or again._spent() in again.warnings):
+            if again.budget < base.budget and (found is None or Code.BUDGET_SPENT in again.findings):
                 raise BudgetExhausted(f"{self.rollouts} of {self.budget} rollouts used, too few were left for a refit")
         return None if found is None else found.mean.numpy()
 
@@ -341,7 +343,7 @@ def fresh(estimator: Estimator) -> Estimator:
     """A copy that shares what the estimator has learned, but neither files nor progress nor what was said."""
     again = copy.copy(estimator)
     again.checkpoint = again.progress = None
-    again.warnings, again._doubtful, again.diagnostics = [], set(), {}
+    again.findings, again.diagnostics = Findings(), {}
     again._given, again._bound = Given(), None
     return again
 

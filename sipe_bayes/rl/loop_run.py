@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.core.findings import Findings
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import whole
 from sipe_bayes.datasets.demonstrations import default_steps
@@ -187,7 +188,7 @@ class LoopRun:
     def _searched(self, given: Trajectories, allowed: int) -> None:
         """Steps of a search, until it has spent ``allowed`` more rollouts or is over."""
         estimator, until = self.estimator, self.spent + allowed
-        estimator.warnings = []  # those of earlier estimates are over
+        estimator.findings = Findings()  # those of earlier estimates are over
         while self.spent < until and not self.idle:
             estimator.update_parameter_estimate(given)
             self.idle = estimator.rollouts == self.spent
@@ -256,7 +257,7 @@ def _task(estimator: Estimator) -> Task:
         raise ValueError(
             f"estimator: expected one on a task of `sipe envs`, got {estimator!r}; make sipe.get_estimator(task, name)"
         )
-    if estimator._state is not None or estimator.checkpoint is not None:
+    if estimator.snapshot is not None or estimator.checkpoint is not None:
         raise ValueError(
             "estimator: expected a fresh one without a checkpoint of its own; give a folder to the run instead"
         )

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.checkpoint import State, load_state, save_state
 from sipe_bayes.envs.tasks.adroit import Adroit
 from sipe_bayes.rl.scripted import Demonstrator
 from sipe_bayes.simulation.simulator import Simulator
@@ -170,7 +170,7 @@ def plan(
     sd, elites = np.full_like(mean, search.sd), mean[None]
     first = 0
     if checkpoint is not None and checkpoint.is_file():
-        state = load_state(checkpoint, fingerprint)
+        state = load_state(checkpoint, State, fingerprint)
         mean, sd, elites = (state[name] for name in ("mean", "sd", "elites"))
         first = int(state["iteration"])
     for iteration in range(first, search.iterations):

@@ -40,19 +40,22 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.files import to_json, write_text
+from sipe_bayes.core.findings import Finding, Findings
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.base import Estimator, Snapshot
 from sipe_bayes.inference.search.gaussian_search import Search
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report
 
+S = TypeVar("S")
 CHECKPOINT = "checkpoint/state.safetensors"
 
 
@@ -102,6 +105,17 @@ def train_in_the_loop(
     return found
 
 
+@dataclass(frozen=True)
+class LoopState(Generic[S]):
+    """A run between two iterations: trainer and search as they were, counts, the history as JSON."""
+
+    trainer: dict[str, Any]
+    search: Snapshot[S] | None
+    counts: dict[str, int]
+    history: str
+    findings: tuple[Finding, ...]
+
+
 class _Folder:
     """What a run keeps on disk. The checkpoint names its replay buffer and posteriors, which are written before it, and those of the
     one before go after it: an interruption leaves a whole set."""
@@ -124,15 +138,9 @@ class _Folder:
         run.trainer.replay.save(self._kept / f"replay-{number}.npz")
         run.posterior.save(self._kept / f"posterior-{number}")
         run.draw.source.save(self._kept / f"proposal-{number}")
-        searched = run.estimator._state if isinstance(run.estimator, Search) else None
+        searched = run.estimator.snapshot if isinstance(run.estimator, Search) else None
         counts = {name: getattr(run, name) for name in self._COUNTS}
-        state = {
-            **{f"trainer.{k}": v for k, v in run.trainer.state().items()},
-            **{f"estimator.{k}": v for k, v in (searched or {}).items()},
-            **counts,
-            "history": json.dumps(run.history),
-            "warnings": list(run.estimator.warnings),
-        }
+        state = LoopState(run.trainer.state(), searched, counts, json.dumps(run.history), tuple(run.estimator.findings))
         save_state(self._folder / CHECKPOINT, state, run.fingerprint)
         for path in self._kept.iterdir():  # also what an interruption left
             if path.name != "state.safetensors" and not path.stem.endswith(f"-{number}"):
@@ -157,22 +165,20 @@ class _Folder:
         write_text(self._folder / "result.json", to_json(said, indent=1))
 
     def _load(self, run: LoopRun) -> None:
-        state = load_state(self._folder / CHECKPOINT, run.fingerprint)
-        run.history = json.loads(state["history"])
+        kind = LoopState[run.estimator.state_type]  # type: ignore[name-defined]
+        state = load_state(self._folder / CHECKPOINT, kind, run.fingerprint)
+        run.history = json.loads(state.history)
         number = len(run.history)
         run.trainer.replay.load(self._kept / f"replay-{number}.npz")
-        run.trainer.restore(_part(state, "trainer."))
+        run.trainer.restore(state.trainer)
         run.posterior = load_posterior(self._kept / f"posterior-{number}")
         run.draw.source = load_posterior(self._kept / f"proposal-{number}")
         for name in self._COUNTS:
-            setattr(run, name, state[name])
-        run.estimator.warnings = list(state["warnings"])
-        if isinstance(run.estimator, Search):
-            run.estimator._state, run.estimator.rollouts = _part(state, "estimator."), run.spent
-
-
-def _part(state: dict[str, Any], prefix: str) -> dict[str, Any]:
-    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+            setattr(run, name, state.counts[name])
+        if isinstance(run.estimator, Search) and state.search is not None:
+            run.estimator.go_on_from(state.search)
+            run.estimator.rollouts = run.spent
+        run.estimator.findings = Findings(state.findings)
 
 
 def _table(history: list[Row], names: tuple[str, ...]) -> str:

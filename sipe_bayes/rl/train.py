@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.checkpoint import State, load_state, save_state
 from sipe_bayes.core.files import replacing, to_json, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.registry import make_task
@@ -173,7 +173,7 @@ class _Log:
                 path.unlink()
 
     def load(self, trainer: Trainer, fingerprint: str) -> None:
-        state = load_state(self._folder / CHECKPOINT, fingerprint)
+        state = load_state(self._folder / CHECKPOINT, State, fingerprint)
         trainer.replay.load(self._kept / Path(state["replay"]).name)
         trainer.restore(state)
         self.rows, self._spent = json.loads(state["curve"]), float(state["seconds"])

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.findings import Findings
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, describe_invalid
 from sipe_bayes.inference.base import Estimator, Recorded, digest
@@ -133,7 +134,7 @@ class PriorSampling(Estimator):
 
     def judge(self, made: Simulations) -> None:
         """Count all that were made so far and say where the invalid ones lie; raises ValueError where too few are valid."""
-        self.warnings = [w for w in self.warnings if w != self.diagnostics.get("invalid")]  # said of fewer
+        self.findings = Findings(f for f in self.findings if f.text != self.diagnostics.get("invalid"))  # of fewer
         said = describe_invalid(made, self.space, self.simulator.failure)
         self.warn(said)
         self.diagnostics.update({"invalid": said} if said else {}, invalid_simulations=int((~made.valid).sum()))

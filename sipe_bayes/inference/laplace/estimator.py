@@ -203,10 +203,10 @@ class Laplace(Estimator):
 
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
-        if self._state is None or not len(self._state["mode_theta"]):
+        if self.state is None or not len(self.state["mode_theta"]):
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        best, prior = distinct_modes(self._state)[0], self.quadratic_prior
-        mean, total = self._state["mode_mean"][best], np.linalg.inv(self._state["mode_covariance"][best])
+        best, prior = distinct_modes(self.state)[0], self.quadratic_prior
+        mean, total = self.state["mode_mean"][best], np.linalg.inv(self.state["mode_covariance"][best])
         flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T

@@ -1,0 +1,128 @@
+"""Findings: what a fit, a check or a log reader noticed, as data.
+
+A ``Finding`` has a code, a severity, the parameters and the log that it is about, and a text for people. Code asks for
+the code (``findings.of(Code.NOT_MIXED)``), never for words of the text; warnings, doubts, flags and the report are
+views of one list. All texts stand in ``core.finding_texts``; whatever is put there changes no behaviour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Self
+
+from sipe_bayes.core.finding_texts import TEXTS, Code, Severity
+
+__all__ = ["Code", "Finding", "Findings", "Severity", "finding"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was noticed.
+
+    Args:
+        code: what it is.
+        severity: note, caution, or blocking: no interval is to be trusted.
+        text: one or two sentences for people, without the final full stop.
+        parameters: names of those that it is about; none for all.
+        log: name of the log that it is about, if it is about one.
+    """
+
+    code: Code
+    severity: Severity
+    text: str
+    parameters: tuple[str, ...] = ()
+    log: str | None = None
+
+    def to_dict(self) -> dict[str, object]:
+        """As JSON has it."""
+        return {k: str(v) if isinstance(v, StrEnum) else v for k, v in asdict(self).items()} | {
+            "parameters": list(self.parameters)
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, object]) -> Self:
+        """What ``to_dict`` made; raises ValueError or KeyError for anything else."""
+        names = data["parameters"]
+        if not isinstance(names, list | tuple):
+            raise ValueError(f"parameters: expected a list of names, got {names!r}")
+        log = data.get("log")
+        return cls(
+            Code(str(data["code"])),
+            Severity(str(data["severity"])),
+            str(data["text"]),
+            tuple(map(str, names)),
+            None if log is None else str(log),
+        )
+
+
+def finding(
+    code: Code,
+    *,
+    parameters: Iterable[str] = (),
+    log: str | None = None,
+    severity: Severity | None = None,
+    **values: object,
+) -> Finding:
+    """A finding with the text that ``TEXTS`` has for its code.
+
+    Args:
+        code: what it is.
+        parameters: names of those that it is about.
+        log: name of the log that it is about.
+        severity: where it is not the code's usual one.
+        **values: what the text's places stand for; ``parameters`` and ``log`` may be named in it as well.
+    """
+    text = TEXTS[code]
+    names = tuple(parameters)
+    places = {"parameters": ", ".join(names), "log": log, **values}
+    return Finding(code, severity or text.severity, text.template.format(**places), names, log)
+
+
+class Findings:
+    """Findings in the order in which they came, each once."""
+
+    def __init__(self, items: Iterable[Finding] = ()) -> None:
+        self._items: dict[Finding, None] = dict.fromkeys(items)
+
+    def add(self, item: Finding) -> None:
+        """Add one, unless it is there."""
+        self._items.setdefault(item)
+
+    def extend(self, items: Iterable[Finding]) -> None:
+        """Add several."""
+        for item in items:
+            self.add(item)
+
+    def drop(self, *codes: Code) -> None:
+        """Take back all findings of these codes."""
+        self._items = {item: None for item in self._items if item.code not in codes}
+
+    def of(self, *codes: Code) -> list[Finding]:
+        """Those of these codes."""
+        return [item for item in self._items if item.code in codes]
+
+    def __contains__(self, code: Code) -> bool:
+        return any(item.code == code for item in self._items)
+
+    def __iter__(self) -> Iterator[Finding]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def blocking(self) -> list[Finding]:
+        """Those for which no interval is to be trusted."""
+        return [item for item in self._items if item.severity is Severity.BLOCKING]
+
+    @property
+    def warnings(self) -> list[str]:
+        """The texts of all but notes."""
+        return [item.text for item in self._items if item.severity is not Severity.NOTE]
+
+    @property
+    def doubts(self) -> list[str]:
+        """The texts of those that block."""
+        return [item.text for item in self.blocking]

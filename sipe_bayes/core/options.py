@@ -1,0 +1,149 @@
+"""Options of a method: one frozen dataclass each, whose fields carry unit, reason and limits.
+
+The constructor's arguments and their check, the checkpoint's fingerprint, the command line and the documentation all
+come from the fields::
+
+    @dataclass(frozen=True)
+    class SimOptOptions(Options):
+        updates: int = option(12, "REPS updates in an iteration", least=1)
+        epsilon: float = option(0.5, "bound on the KL of an update", unit="nats", above=0)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Iterable
+from dataclasses import dataclass
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, Self
+
+from sipe_bayes.core.validation import nearest_name
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an option is and may be. least, most: inclusive; above, below: exclusive; among: the legal values."""
+
+    why: str
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    among: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """The legal range in words."""
+        bounds = (("at least", self.least), ("at most", self.most), ("above", self.above), ("below", self.below))
+        return " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
+
+    def allows(self, value: float) -> bool:
+        """Whether a number lies within."""
+        return (
+            math.isfinite(value)
+            and (self.least is None or value >= self.least)
+            and (self.most is None or value <= self.most)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+        )
+
+
+def option(
+    default: Any,
+    why: str,
+    unit: str = "",
+    *,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    among: Iterable[str] = (),
+) -> Any:
+    """A field of ``Options``: its default, what it does and why it is so, its unit and its limits."""
+    limits = Limits(why, unit, least, most, above, below, tuple(among))
+    return dataclasses.field(default=default, metadata={"limits": limits})
+
+
+@dataclass(frozen=True)
+class Options:
+    """Base of all options; checks every field by its type and limits.
+
+    Raises:
+        ValueError: for a value of another type or beyond its limits; the message names the option and the remedy.
+    """
+
+    def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
+        for field in dataclasses.fields(self):
+            limits = field.metadata.get("limits", Limits(""))
+            object.__setattr__(
+                self, field.name, _checked(field.name, getattr(self, field.name), hints[field.name], limits)
+            )
+
+    @classmethod
+    def of(cls, given: dict[str, Any], method: str) -> Self:
+        """Options from keyword arguments; raises TypeError for a name that ``method`` does not take."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        for name in given:
+            if name not in names:
+                raise TypeError(
+                    f"{method}: takes no option {name!r}{nearest_name(name, names)}; it takes {', '.join(names)}"
+                )
+        return cls(**given)
+
+    def plain(self) -> dict[str, Any]:
+        """Names and values as JSON has them, for fingerprints and records."""
+        return {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
+
+    @classmethod
+    def table(cls) -> list[tuple[str, str, str, str]]:
+        """Rows of documentation: name, default, unit, why."""
+        rows = []
+        for field in dataclasses.fields(cls):
+            limits = field.metadata.get("limits", Limits(""))
+            rows.append((field.name, repr(field.default), limits.unit, limits.why))
+        return rows
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Options):
+        return value.plain()
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _checked(name: str, value: Any, hint: Any, limits: Limits) -> Any:
+    """The value as the field's type has it."""
+    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if value is None and type(None) in choices:
+        return None
+    kind = next((c for c in choices if c is not type(None)), object)
+    if limits.among:
+        if not isinstance(value, str) or value not in limits.among:
+            raise ValueError(
+                f"{name}: expected one of {', '.join(limits.among)}, got {value!r}{nearest_name(str(value), limits.among)}"
+            )
+        return value
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise ValueError(f"{name}: expected True or False, got {value!r}")
+    elif kind in (int, float):
+        return _number(name, value, kind, limits)
+    elif kind is Path and isinstance(value, str):
+        return Path(value)
+    return value
+
+
+def _number(name: str, value: Any, kind: type, limits: Limits) -> Any:
+    whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
+    if isinstance(value, bool) or not (whole if kind is int else isinstance(value, Real)):
+        what = "a whole number" if kind is int else "a number"
+        raise ValueError(f"{name}: expected {what} {limits.text()}".rstrip() + f", got {value!r}")
+    if not limits.allows(float(value)):
+        raise ValueError(f"{name}: expected {limits.text() or 'a finite number'}, got {value!r}")
+    return kind(value)
