@@ -47,7 +47,7 @@ def independent(posterior: Posterior, diagnostics: dict[str, Any]) -> torch.Tens
 
 
 def main() -> None:
-    from tests.linear_gaussian import carts_problem, function_problem
+    from tests.problems.linear_gaussian import carts_problem, function_problem
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--budget", type=int, default=10_000)

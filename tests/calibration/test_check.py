@@ -1,0 +1,211 @@
+"""``sipe check`` passes an honest estimator, sees posteriors half and twice as wide, and goes on where it was interrupted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sipe_bayes.calibration import check as checks
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.registry import ESTIMATORS
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.posterior import GaussianMixture, Posterior
+
+MODEL = """
+<mujoco><option timestep="0.02" gravity="0 0 0" integrator="Euler"/>
+  <worldbody><body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="0.5"/>
+    <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><motor name="motor" joint="slide"/></actuator></mujoco>"""
+CONFIG = """
+model = "cart.xml"
+window = 0.6
+search = {restarts = 1, candidates = 0}
+noise = {model = "white"}
+commands = [{actuator = "motor", column = "force", unit = "N"}]
+measurements = [{column = "place", target = "joint:slide.position", unit = "m"}]
+logs = [{file = "log.csv"}]
+[[parameters]]
+name = "mass"
+target = "body:cart.mass"
+bounds = [0.5, 1.5]
+[[parameters]]
+name = "damping"
+target = "joint:slide.damping"
+bounds = [0.0, 2.0]
+"""
+
+
+class Planted(Laplace):
+    """Laplace's normals, ``width`` times as wide."""
+
+    width: ClassVar[float]
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        found = super().posterior(state, trajectories)
+        assert isinstance(found, GaussianMixture)
+        return GaussianMixture(found.log_weights, found.means, self.width**2 * found.covariances, found.space)
+
+
+class Half(Planted):
+    width = 0.5
+
+
+class Twice(Planted):
+    width = 2.0
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    import mujoco
+
+    monkeypatch.setitem(ESTIMATORS, "half", ("tests.calibration.test_check", "Half"))
+    monkeypatch.setitem(ESTIMATORS, "twice", ("tests.calibration.test_check", "Twice"))
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    rows = ["time,force,place"]
+    for k in range(91):
+        force = 2.0 * np.sin(1.3 * 0.02 * k * 2 * np.pi) + np.sin(0.6 * 0.02 * k * 2 * np.pi)
+        rows.append(f"{0.02 * k:.3f},{force:.6f},{data.qpos[0] + 0.005 * rng.standard_normal():.6f}")
+        data.ctrl[0] = force
+        mujoco.mj_step(model, data)
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "cart.xml").write_text(MODEL)
+    (tmp_path / "config.toml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "config.toml"
+
+
+def call(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+
+
+@pytest.mark.parametrize(
+    ("estimator", "verdict"), [("laplace", "calibrated"), ("half", "too narrow"), ("twice", "too wide")]
+)
+def test_planted_widths_are_seen_and_honest_ones_pass(
+    config: Path, estimator: str, verdict: str, tmp_path: Path
+) -> None:
+    """The false-alarm rate of a check is 2 % in all; halved and doubled posteriors are seen in 40 logs all but surely."""
+    result = call(config, estimator, "--truths", 40, "--out", tmp_path / "out", "--threads", 1, "--json")
+    found = json.loads(result.stdout)
+    print(found["verdict"], found["sharpness"])
+    assert [p["verdict"] for p in found["parameters"]] == [verdict] * 2
+    assert result.exit_code == (0 if verdict == "calibrated" else 1)
+    assert found["truths"] == 40
+    share = {"calibrated": (0.78, 0.98), "too narrow": (0.4, 0.75), "too wide": (0.96, 1.0)}[verdict]
+    assert share[0] <= found["coverage_90"] <= share[1]
+    said = {"calibrated": "no cause for alarm"}.get(verdict, f"{verdict}; use sipe.Recalibrated(...)")
+    assert said in found["verdict"]
+    for name in ("ranks.png", "coverage.png"):
+        assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_an_interrupted_check_goes_on(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is there is not fitted again; a damaged file is."""
+    arguments = (config, "laplace", "--truths", 20, "--threads", 1, "--json", "--out")
+    done: list[int] = []
+    fit = checks._Worker.fit
+
+    def dying(self: Any, number: int) -> Any:
+        if number == 12:
+            raise KeyboardInterrupt
+        return fit(self, number)
+
+    monkeypatch.setattr(checks._Worker, "fit", dying)
+    assert call(*arguments, tmp_path / "out").exit_code != 0
+    assert len(list((tmp_path / "out" / "fits").iterdir())) == 12
+    (tmp_path / "out" / "fits" / "00003.npz").write_bytes(b"half a file")
+    before = (tmp_path / "out" / "fits" / "00007.npz").read_bytes()
+    monkeypatch.setattr(checks._Worker, "fit", lambda self, number: (done.append(number), fit(self, number))[1])
+    assert json.loads(call(*arguments, tmp_path / "out").stdout)["truths"] == 20
+    assert done == [3, *range(12, 20)]
+    assert (tmp_path / "out" / "fits" / "00007.npz").read_bytes() == before
+    other = call(*arguments, tmp_path / "out", "--seed", 1)
+    assert other.exit_code == 2
+    assert "holds another check (it differs in seed, settings)" in other.stderr
+
+
+def test_an_amortised_estimator_is_trained_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task, its method trained once and conditioned on every log."""
+    trained: list[int] = []
+    from sipe_bayes.inference.amortised.abc import ABC
+
+    train = ABC.train
+    monkeypatch.setattr(ABC, "train", lambda self, *given: (trained.append(1), train(self, *given))[1])
+    arguments = ("Pendulum", "abc", "--truths", 20, "--budget", 200, "--steps", 20, "--threads", 1, "--json", "--out")
+    result = call(*arguments, tmp_path / "plain")
+    found = json.loads(result.stdout)
+    assert found["truths"] == 20, result.output
+    assert len(trained) == 1
+    assert found["rollouts"] == 200  # counted once
+    again = json.loads(call("Pendulum", "abc", "--truths", 22, *arguments[4:], tmp_path / "plain").stdout)  # two more
+    assert (again["truths"], again["rollouts"]) == (22, 200)
+
+
+@pytest.mark.parametrize(
+    ("method", "refits", "said"),
+    [
+        ("abc", 0, "one training of 200 rollouts, then 20 fits, kept in"),
+        ("abc", 20, "one training of 200 rollouts, then 20 fits of at most 20 rollouts each, kept in"),
+        ("laplace", 0, "20 fits of at most 200 rollouts each, kept in"),
+        ("laplace", 20, "20 fits of at most 4220 rollouts each, kept in"),
+    ],
+)
+def test_the_cost_is_said_first(
+    method: str, refits: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With refits: a fit of the log, and for each replica the replica and a fit."""
+
+    def stopped(*given: Any) -> None:
+        raise ValueError("that is all")
+
+    monkeypatch.setattr(checks, "run", stopped)
+    result = call("Pendulum", method, "--truths", 20, "--budget", 200, "--refits", refits, "--out", tmp_path / "out")
+    assert result.stdout.startswith(said), result.stdout
+
+
+def test_every_fit_has_a_seed_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    fit = Laplace.fit
+    monkeypatch.setattr(Laplace, "fit", lambda self, given: (seeds.append(self.seed), fit(self, given))[1])
+    call("Pendulum", "laplace", "--truths", 20, "--steps", 10, "--noise", 0, "--threads", 1, "--out", tmp_path / "out")
+    assert len(seeds) == len(set(seeds)) == 20
+
+
+def test_fetch_is_checked_from_its_recorded_start() -> None:
+    """Its controller has a memory, which StateSpace does not look for in measurements."""
+    given = {"steps": 4, "noise": 0.01, "budget": 300, "refits": 0, "seed": 0, "threads": 1}
+    for task, starts in (("FetchPush", "recorded"), ("Pendulum", "estimated")):
+        study = checks.study_of_task(task, "laplace", **given)  # type: ignore[arg-type]
+        assert isinstance(study.estimator.likelihood, StateSpace)
+        assert study.estimator.likelihood.starts == starts
+    study = checks.study_of_task("FetchPush", "laplace", **given)  # type: ignore[arg-type]
+    fitted = checks._Worker(study, Path(), lambda *what: None).fit(0)
+    assert fitted.error == ""
+    assert len(fitted.draws)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("config.toml", "laplace", "--truths", 10), "truths: expected at least 20, got 10"),
+        (("config.toml", "laplase"), "did you mean 'laplace'?"),
+        (("missing.toml", "laplace"), "missing.toml"),
+        (("Pendulumm", "laplace"), "Pendulumm"),
+        (("Pendulum", "abc", "--noise", -1), "--noise: expected at least 0"),
+        (("config.toml", "laplace", "--out", "."), "holds files of something else"),
+    ],
+)
+def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], words: str) -> None:
+    result = call(*arguments, "--json")
+    assert result.exit_code == 2, result.output
+    assert words in result.stderr
+    assert result.stderr.count("\n") == 1

@@ -1,0 +1,153 @@
+"""Logs that agree pass in silence; a planted disagreement is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.agreement import LogEstimate, compare_logs, disagreement
+from sipe_bayes.likelihood.settings import Segments
+from tests.problems.pendulums import log, pendulum
+
+SEEDS = range(12)
+
+
+def alarms(heavier: float, rho: float) -> list[str]:
+    """What is named, seed by seed, when the second log's rod is ``heavier`` times the first's."""
+    simulator = pendulum(Parameter("coulomb", 0.0, 0.1, targets=("joint:hinge.frictionloss",)))
+    named = []
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        mass, damping, coulomb = rng.uniform(0.5, 0.8), rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.05)
+        logs = Trajectories.stack(
+            [
+                log(simulator, [mass, damping, coulomb], 100 + seed, "monday", rho=rho),
+                log(simulator, [mass * heavier, damping, coulomb], 200 + seed, "tuesday", rho=rho),
+            ]
+        )
+        start = simulator.space.normalise(np.array([mass, damping, coulomb]))
+        found, _ = compare_logs(simulator, Segments(0.5), logs, start)
+        named.append(
+            "" if found is None else found.parameter if "disagree about" in found.text("") else "no single one"
+        )
+    return named
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_agreeing_logs_pass_in_silence(rho: float) -> None:
+    """At the 1 % level, 2 or more alarms in 12 have a probability of 0.6 %."""
+    named = alarms(1.0, rho)
+    assert named.count("") >= 11, named
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_a_heavier_rod_is_named(rho: float) -> None:
+    named = alarms(1.1, rho)
+    assert named.count("rod_mass") >= 11, named
+
+
+def test_cochrans_q_against_a_plain_reference() -> None:
+    """Gaussian estimates of two logs: p uniform when they agree (false-alarm rate of this test 1 %)."""
+    space = ParameterSpace([Parameter("a"), Parameter("b")])
+    rng = np.random.default_rng(0)
+    root = np.array([[30.0, 0.0], [12.0, 20.0]])
+    information = root @ root.T
+    alarmed = 0
+    for _ in range(2000):
+        means = [0.5 + np.linalg.solve(root.T, rng.standard_normal(2)) for _ in range(2)]
+        estimates = [LogEstimate(str(i), m, information) for i, m in enumerate(means)]
+        alarmed += disagreement(space, estimates) is not None
+    assert 8 <= alarmed <= 33  # 20 expected at the 1 % level, sd 4.5
+
+
+def agreeing(informations: list[np.ndarray], rng: np.random.Generator, shift: float = 0.0) -> list[LogEstimate]:
+    """Exact estimates of logs that agree, but for the first one's a, which is ``shift`` off; what a log does not determine is anywhere."""
+    found = []
+    for k, information in enumerate(informations):
+        eigenvalues, axes = np.linalg.eigh(information)
+        away = np.where(eigenvalues > 0, rng.standard_normal(2) / np.sqrt(np.maximum(eigenvalues, 1e-300)), 3.0)
+        found.append(LogEstimate(str(k), np.array([0.5 + shift * (k == 0), 0.5]) + axes @ away, information))
+    return found
+
+
+TURNED = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+
+
+@pytest.mark.parametrize(
+    "informations",
+    [
+        [np.diag([1e4, 5.0])] * 2,
+        [np.diag([1e4, 11.0])] * 5,
+        [np.diag([1e4, 1e3]), np.diag([1e4, 0.0]), np.diag([0.0, 1e3])],
+        [TURNED @ np.diag([1e4, 11.0]) @ TURNED.T, np.diag([1e4, 11.0]), np.diag([1e4, 1e4])],
+        [np.diag([1e4, 0.0]), TURNED @ np.diag([1e4, 0.0]) @ TURNED.T, np.diag([1e4, 0.0])],
+    ],
+)
+def test_logs_of_different_ranks_that_agree_raise_no_more_alarms_than_stated(informations: list[np.ndarray]) -> None:
+    """Of 2,000 at the 1 % level: more than 33 have a probability of 0.3 %."""
+    space, rng = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(3)
+    alarms = [disagreement(space, agreeing(informations, rng)) is not None for _ in range(2000)]
+    print(sum(alarms))
+    assert sum(alarms) <= 33
+
+
+def test_a_parameter_that_few_logs_determine_is_named_alone() -> None:
+    """a differs between the two logs that determine it; b, which three more determine as well, is the same."""
+    space, rng, single = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(4), 0
+    informations = [np.diag([1e4, 1e4])] * 2 + [np.diag([0.0, 1e4])] * 3
+    for _ in range(300):
+        found = disagreement(space, agreeing(informations, rng, shift=0.2))
+        assert found is not None
+        assert found.parameter == "a"
+        assert [log for log, _, _ in found.per_log] == ["0", "1"]
+        single += "no single parameter" not in found.text("")
+    assert single >= 290  # 297 expected at the 1 % level, sd 1.7
+
+
+def test_the_odd_log_is_named() -> None:
+    """One of four differs: without it the others agree, at the 1 % level. Where two pairs differ nobody is odd."""
+    space, rng = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(5)
+    informations = [np.diag([1e4, 1e3])] * 4
+    named = [
+        found.odd for _ in range(200) if (found := disagreement(space, agreeing(informations, rng, 0.2))) is not None
+    ]
+    assert len(named) == 200
+    assert named.count("0") >= 192  # 198 expected, sd 1.4
+    pairs = [LogEstimate(str(k), np.array([0.4 + 0.2 * (k % 2), 0.5]), np.diag([1e4, 1e3])) for k in range(4)]
+    found = disagreement(space, pairs)
+    assert found is not None
+    assert found.odd is None
+    odd = disagreement(space, agreeing(informations, rng, 0.2))
+    assert odd is not None
+    assert "; without 0 the others agree (p = " in odd.text("")
+
+
+def test_the_most_economical_parameter_is_named() -> None:
+    """Both marginals shift when a alone differs and b is free to follow; a is the one that explains it."""
+    space = ParameterSpace([Parameter("a", unit="kg"), Parameter("b")])
+    information = np.array([[4000.0, 3000.0], [3000.0, 4000.0]])
+    first = LogEstimate("one", np.array([0.40, 0.50]), information)
+    second = LogEstimate("two", np.array([0.60, 0.50]), information)
+    found = disagreement(space, [first, second])
+    assert found is not None
+    assert found.parameter == "a"
+    assert "one says 0.4" in found.text("kg")
+    assert "per_log = true" in found.text("kg")
+
+
+def test_two_differences_are_not_put_down_to_one_parameter() -> None:
+    space = ParameterSpace([Parameter("a", unit="kg"), Parameter("b")])
+    first = LogEstimate("one", np.array([0.40, 0.50]), 4000 * np.eye(2))
+    second = LogEstimate("two", np.array([0.60, 0.70]), 4000 * np.eye(2))
+    found = disagreement(space, [first, second])
+    assert found is not None
+    assert "no single parameter explains it" in found.text("kg")
+
+
+def test_a_log_that_says_nothing_disagrees_with_nobody() -> None:
+    space = ParameterSpace([Parameter("a"), Parameter("b")])
+    silent = LogEstimate("silent", np.array([5.0, -3.0]), np.zeros((2, 2)))
+    loud = LogEstimate("loud", np.array([0.5, 0.5]), 1e4 * np.eye(2))
+    assert disagreement(space, [silent, loud]) is None

@@ -1,0 +1,156 @@
+"""The learned reward: it prefers the truth where control steps tell, and does not where they say nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sipe_bayes.core.checkpoint import State, load_state, save_state
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.search.learned_reward import LearnedReward
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.discrepancy import simulate
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.models.discriminator import Discriminator, Training
+from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.pendulums import XML, log, pendulum
+
+TRUTH = np.array([[0.3, 0.6]])
+
+
+def whole_state(seeds: Iterable[int] = (3,)) -> Windows:
+    """Angle and velocity both recorded, from ``TRUTH``: single control steps tell mass and damping. seeds: of each log's actions."""
+    plain = pendulum()
+    channels = ["joint:hinge.position", "joint:hinge.velocity"]
+    environment = MjcfEnvironment.build(XML, list(plain.space), ["motor"], channels)
+    simulator = Simulator(environment, num_threads=1)
+    values = simulator.space.values(TRUTH)[0].tolist()
+    logs = [log(simulator, values, seed, str(seed), steps=400, sd=0.0) for seed in seeds]
+    return bind(Segments(noise_sd=(0.0, 0.0)), simulator, Trajectories.stack(logs))
+
+
+def windows(sd: float = 0.0, likelihood: Segments | None = None) -> Windows:
+    simulator = pendulum()
+    trajectory = log(simulator, simulator.space.values(TRUTH)[0].tolist(), 3, steps=400, sd=sd)
+    return bind(likelihood or Segments(noise_sd=(sd,)), simulator, Trajectories.stack(trajectory))
+
+
+def trained(reward: LearnedReward, features: np.ndarray, rounds: int) -> dict:
+    state = reward.start()
+    for _ in range(rounds):
+        state.update(reward.train(state, features))
+    return state
+
+
+def test_the_truth_is_rewarded_above_wrong_thetas() -> None:
+    bound = whole_state()
+    reward = LearnedReward(bound)
+    rng = np.random.default_rng(0)
+    pool = reward.features(simulate(bound, rng.uniform(size=(20, 2))))
+    state = trained(reward, pool, 20)
+    wrong = np.array([[0.9, 0.6], [0.3, 0.05], [0.8, 0.1], [0.05, 0.95]])
+    rewards = reward(state, reward.features(simulate(bound, np.concatenate([TRUTH, wrong]))))
+    print(rewards)
+    assert (rewards[0] > rewards[1:]).all(), rewards
+
+
+def test_starting_states_and_actions_need_not_match() -> None:
+    """Six recordings; it is trained on, and rewards, simulations under other actions from other states, which reach about the same."""
+    recorded, other = whole_state(range(3, 9)), whole_state(range(50, 56))
+    assert not np.isclose(recorded.actions, other.actions).any((1, 2)).all()
+    assert not np.isclose(recorded.measured[:, 0], other.measured[:, 0])[recorded.start > 0].any()
+    reward = LearnedReward(recorded)
+    pool = reward.features(simulate(other, np.random.default_rng(0).uniform(size=(20, 2))), other)
+    wrong = np.array([[0.9, 0.6], [0.3, 0.05], [0.8, 0.1]])
+    made = reward.features(simulate(other, np.concatenate([TRUTH, wrong])), other)
+    rewards = reward(trained(reward, pool, 20), made)
+    print(rewards)
+    assert (rewards[0] > rewards[1:] + 0.2).all(), rewards
+
+
+def test_noise_alone_rewards_nothing() -> None:
+    """Recorded and simulated steps from one distribution: rewards of different sets stay near log 1/2 and near each other."""
+    bound = windows()
+    reward = LearnedReward(bound, updates=20)
+    rng = np.random.default_rng(1)
+    shape = (6, 200, reward.recorded.shape[1])
+    reward.recorded = torch.from_numpy(rng.standard_normal((20_000, shape[2])).astype(np.float32))
+    state = trained(reward, rng.standard_normal(shape).astype(np.float32).repeat(5, 0), 2)
+    fresh = reward(state, rng.standard_normal(shape).astype(np.float32))
+    print(fresh)
+    assert np.abs(fresh - np.log(0.5)).max() < 0.15, fresh
+    assert np.ptp(fresh) < 0.1, fresh
+
+
+def test_noise_of_the_recording_does_not_give_simulations_away() -> None:
+    """With noise of a stated sd on the log, simulations at the truth get it too: the discriminator's loss stays near log 2;
+    without, it falls."""
+    sd = 0.05
+    losses = []
+    for stated in (sd, 1e-9):
+        bound = windows(sd, Segments(noise_sd=(sd,)))
+        reward = LearnedReward(bound)
+        reward.noise = np.array([stated])
+        features = reward.features(simulate(bound, TRUTH))
+        losses.append(float(reward(trained(reward, features, 10), features)[0]))
+    print(losses)
+    assert losses[0] > losses[1] + 0.2, losses
+
+
+def test_diverged_simulations_are_rewarded_least() -> None:
+    bound = windows()
+    reward = LearnedReward(bound)
+    predicted = simulate(bound, np.concatenate([TRUTH, TRUTH]))
+    predicted[1, -1, 3:] = np.nan
+    features = reward.features(predicted)
+    assert np.isnan(features[1]).all()
+    rewards = reward(trained(reward, features, 1), features)
+    assert np.isfinite(rewards[0])
+    assert rewards[1] == -np.inf
+    assert reward.features(None).shape == (0, *features.shape[1:])
+    before = reward.start()
+    after = reward.train(before, features[1:])
+    assert all(np.array_equal(before[k], after[k]) for k in before)
+
+
+def test_training_goes_on_exactly_from_disk(tmp_path: Path) -> None:
+    bound = windows()
+    reward = LearnedReward(bound, updates=5)
+    features = reward.features(simulate(bound, np.random.default_rng(0).uniform(size=(4, 2))))
+    once = reward.train(reward.start(), features)
+    save_state(tmp_path / "s", once, "x")
+    two = reward.train(once, features)
+    again = LearnedReward(bound, updates=5).train(load_state(tmp_path / "s", State, "x"), features)
+    assert two.keys() == again.keys()
+    assert all(np.array_equal(two[k], again[k]) for k in two)
+    assert not np.array_equal(once["reward_weights"], two["reward_weights"])
+
+
+def test_the_discriminator_learns_a_density_ratio() -> None:
+    """Recorded N(1, 1), simulated N(-1, 1): the logit is 2 x, to 0.5 within an sd and a half of either."""
+    rng = np.random.default_rng(0)
+    network = Discriminator(1)
+    network.standardise.fit(torch.from_numpy(rng.normal(1, 1, (10_000, 1)).astype(np.float32)))
+    training = Training(network, 0.003)
+    for _ in range(1500):
+        real, fake = (torch.from_numpy(rng.normal(m, 1, (160, 1)).astype(np.float32)) for m in (1, -1))
+        training.step(real, fake)
+    x = torch.linspace(-1.5, 1.5, 7)[:, None]
+    with torch.no_grad():
+        found = network(x).numpy()
+    np.testing.assert_allclose(found, 2 * x[:, 0].numpy(), atol=0.5)
+
+
+def test_a_log_without_whole_steps_says_so() -> None:
+    simulator = pendulum()
+    trajectory = log(simulator, [0.6, 0.1], 3, steps=100)
+    trajectory.observations[1::2] = np.nan
+    bound = bind(Segments(), simulator, Trajectories.stack(trajectory))
+    with pytest.raises(ValueError, match="state_difference"):
+        LearnedReward(bound)
