@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from sipe_bayes.cli.app import app
 from sipe_bayes.core import files
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
+from tests.problems.benchmarks import TIMES, what_counts
 
 SMALL = ["--suite", "all", "--budget", "60", "--steps", "20"]
 PENDULUM = [  # six cells, two of which share simulations
@@ -37,7 +38,6 @@ PENDULUM = [  # six cells, two of which share simulations
     *("--select", "pendulum/simopt/direct/in_distribution"),
     *("--select", "pendulum/regression/direct/in_distribution/seed0"),
 ]
-TIMES = ("seconds", "cpu_seconds", "simulation_cpu_seconds", "command")
 
 
 def sipe(*arguments: str) -> Result:
@@ -46,12 +46,6 @@ def sipe(*arguments: str) -> Result:
 
 def measured(folder: Path, *arguments: str) -> Result:
     return sipe("benchmark", "run", *SMALL, *arguments, "--executor", "inline", "--out", str(folder))
-
-
-def what_counts(folder: Path) -> dict[str, Any]:
-    """Records without what they took, and the bytes of their posteriors."""
-    found = {r.id: {k: v for k, v in asdict(r).items() if k not in TIMES} for r in load_all(folder)}
-    return {name: (record, posterior_path(folder, name).read_bytes()) for name, record in found.items()}
 
 
 @pytest.fixture(scope="module")

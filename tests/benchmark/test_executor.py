@@ -14,7 +14,7 @@ from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.executors.pool import Inline, Pool
 from sipe_bayes.benchmark.executors.work import Done, Unit
 from sipe_bayes.benchmark.records import Record, load_all
-from tests.benchmark.test_benchmark import what_counts
+from tests.problems.benchmarks import what_counts
 from tests.problems.workers import gave_up, told
 
 CELLS = [

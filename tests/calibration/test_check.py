@@ -4,83 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from sipe_bayes.calibration import check as checks
 from sipe_bayes.cli.app import app
-from sipe_bayes.core.checkpoint import State
-from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.posterior import GaussianMixture, Posterior
-
-MODEL = """
-<mujoco><option timestep="0.02" gravity="0 0 0" integrator="Euler"/>
-  <worldbody><body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="0.5"/>
-    <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
-  <actuator><motor name="motor" joint="slide"/></actuator></mujoco>"""
-CONFIG = """
-model = "cart.xml"
-window = 0.6
-search = {restarts = 1, candidates = 0}
-noise = {model = "white"}
-commands = [{actuator = "motor", column = "force", unit = "N"}]
-measurements = [{column = "place", target = "joint:slide.position", unit = "m"}]
-logs = [{file = "log.csv"}]
-[[parameters]]
-name = "mass"
-target = "body:cart.mass"
-bounds = [0.5, 1.5]
-[[parameters]]
-name = "damping"
-target = "joint:slide.damping"
-bounds = [0.0, 2.0]
-"""
-
-
-class Planted(Laplace):
-    """Laplace's normals, ``width`` times as wide."""
-
-    width: ClassVar[float]
-
-    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
-        found = super().posterior(state, trajectories)
-        assert isinstance(found, GaussianMixture)
-        return GaussianMixture(found.log_weights, found.means, self.width**2 * found.covariances, found.space)
-
-
-class Half(Planted):
-    width = 0.5
-
-
-class Twice(Planted):
-    width = 2.0
-
-
-@pytest.fixture
-def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    import mujoco
-
-    monkeypatch.setitem(ESTIMATORS, "half", ("tests.calibration.test_check", "Half"))
-    monkeypatch.setitem(ESTIMATORS, "twice", ("tests.calibration.test_check", "Twice"))
-    model = mujoco.MjModel.from_xml_string(MODEL)
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    rows = ["time,force,place"]
-    for k in range(91):
-        force = 2.0 * np.sin(1.3 * 0.02 * k * 2 * np.pi) + np.sin(0.6 * 0.02 * k * 2 * np.pi)
-        rows.append(f"{0.02 * k:.3f},{force:.6f},{data.qpos[0] + 0.005 * rng.standard_normal():.6f}")
-        data.ctrl[0] = force
-        mujoco.mj_step(model, data)
-    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
-    (tmp_path / "cart.xml").write_text(MODEL)
-    (tmp_path / "config.toml").write_text(CONFIG)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "config.toml"
 
 
 def call(*arguments: object) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import io
 import warnings
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,11 @@ from sipe_bayes.datasets import demonstrations as demonstration
 from sipe_bayes.datasets.acting import smooth_actions
 from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.envs.registry import TASKS
-from sipe_bayes.envs.task import Task
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import Dirac
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import log, pendulum
+from tests.problems.policies import agent
 
 SNIPPET = Path(__file__).parents[2] / "examples" / "paper_snippet.py"
 
@@ -115,15 +113,6 @@ def test_the_excitation_is_smooth() -> None:
 
 
 # Agents, random actions, noise
-
-
-def agent(task: Task, seed: int = 0) -> Policy:
-    """A small policy of random weights."""
-    rng, sizes = np.random.default_rng(seed), (len(task.channels), 8, task.num_actions)
-    layers = tuple(
-        (rng.standard_normal((m, n)).astype(np.float32) / 2, np.zeros(m, np.float32)) for n, m in pairwise(sizes)
-    )
-    return Policy(task.name, layers, task.action_low, task.action_high)
 
 
 @pytest.fixture

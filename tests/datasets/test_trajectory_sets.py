@@ -25,7 +25,7 @@ from sipe_bayes.datasets import demonstrations as demonstration
 from sipe_bayes.datasets.generation import generate
 from sipe_bayes.datasets.trajectory_sets import MANIFEST, SHIPPED, SetName, TrajectorySetError
 from sipe_bayes.simulation.simulator import Simulator
-from tests.datasets.test_demonstrations import agent
+from tests.problems.policies import agent
 
 STEPS = 15
 

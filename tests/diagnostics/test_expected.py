@@ -7,30 +7,15 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.diagnostics.expected import Plan, contraction, expect, informations
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, prior
-from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.carts import cart
 from tests.problems.pendulums import DT, log, pendulum
 
-CART = """
-<mujoco><option timestep="0.01" gravity="0 0 0"/>
-  <worldbody><body name="cart"><joint name="slide" type="slide" axis="1 0 0"/>
-    <geom size="0.1" mass="2" contype="0" conaffinity="0"/></body></worldbody>
-  <actuator><motor name="motor" joint="slide" gear="3"/></actuator></mujoco>"""
 NOISE = Noise(np.array([0.01]), np.zeros(1))
 SEGMENTS = Segments(0.5, noise="white")
-
-
-def cart(scale: str = "linear") -> Simulator:
-    parameters = [
-        Parameter("gear", 1.0, 6.0, scale=scale, targets=("actuator:motor.gear",)),  # type: ignore[arg-type]
-        Parameter("mass", 1.0, 4.0, scale=scale, targets=("body:cart.mass",)),  # type: ignore[arg-type]
-        Parameter("wind", 0.0, 5.0, targets=("option.wind_x",)),
-    ]
-    return Simulator(MjcfEnvironment.build(CART, parameters, ["motor"], ["joint:slide.position"]), num_threads=1)
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])

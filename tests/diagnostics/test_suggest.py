@@ -24,8 +24,7 @@ from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
-from tests.calibration.test_check import config  # noqa: F401
-from tests.diagnostics.test_expected import CART
+from tests.problems.carts import GEARED
 from tests.problems.pendulums import DT, pendulum
 
 BOUNDS = np.array([[-1.0, 1.0]])
@@ -102,7 +101,7 @@ def test_limits_come_from_the_model_or_the_logs() -> None:
             limits(simulator, nothing)
     np.testing.assert_allclose(limits(simulator, np.array([[0.3], [-0.7]])), [[-0.7, 0.3]])
     np.testing.assert_allclose(limits(simulator, np.array([[0.0], [3.0]])), [[0.0, 3.0]])  # never the other way
-    ranged = CART.replace('gear="3"', 'gear="3" ctrllimited="true" ctrlrange="-2 1"')
+    ranged = GEARED.replace('gear="3"', 'gear="3" ctrllimited="true" ctrlrange="-2 1"')
     parameters = [Parameter("gear", 1.0, 6.0, targets=("actuator:motor.gear",))]
     model = Simulator(MjcfEnvironment.build(ranged, parameters, ["motor"], ["joint:slide.position"]), num_threads=1)
     np.testing.assert_allclose(limits(model, np.array([[0.0], [3.0]])), [[-2, 1]])
@@ -119,7 +118,7 @@ def test_a_parameter_of_one_log_is_not_asked_for() -> None:
     assert found.contraction[2] == pytest.approx(0, abs=1e-9)
 
 
-def test_a_posterior_with_other_bounds_is_refused(config: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_posterior_with_other_bounds_is_refused(config: Path, tmp_path: Path) -> None:
     """It would be taken for other values."""
     space = prepare(config, 1).simulator.space
     other = ParameterSpace([replace(space[0], high=2 * space[0].high), *list(space)[1:]])
@@ -136,7 +135,7 @@ def call(*arguments: object) -> Any:
     return CliRunner().invoke(app, ["suggest", *map(str, arguments)])
 
 
-def test_the_command_writes_the_best_and_ranks_given_ones(config: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_the_command_writes_the_best_and_ranks_given_ones(config: Path, tmp_path: Path) -> None:
     still = pd.DataFrame({"time": np.arange(0, 2, 0.02), "force": 0.0})
     still.to_csv(tmp_path / "still.csv", index=False)
     arguments = ("--candidates", 4, "--duration", 2, "--given", tmp_path / "still.csv", "--threads", 1)
@@ -163,7 +162,7 @@ def test_the_command_writes_the_best_and_ranks_given_ones(config: Path, tmp_path
         (("--duration", -1), "--duration: expected a positive number"),
     ],
 )
-def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], words: str) -> None:  # noqa: F811
+def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], words: str) -> None:
     result = call(config, *arguments, "--json")
     assert result.exit_code == 2, result.output
     assert words in result.stderr
@@ -180,7 +179,7 @@ def test_wrong_input_is_one_line(config: Path, arguments: tuple[object, ...], wo
         ("time,force\n0,0\n1,50\n", "makes motor go from 0 to 50, beyond its control range, -3 to 3"),
     ],
 )
-def test_given_commands_are_checked(config: Path, tmp_path: Path, text: str, words: str) -> None:  # noqa: F811
+def test_given_commands_are_checked(config: Path, tmp_path: Path, text: str, words: str) -> None:
     model = config.parent / "cart.xml"
     model.write_text(model.read_text().replace('name="motor"', 'name="motor" ctrllimited="true" ctrlrange="-3 3"'))
     (tmp_path / "given.csv").write_text(text)
@@ -191,7 +190,7 @@ def test_given_commands_are_checked(config: Path, tmp_path: Path, text: str, wor
     assert not (tmp_path / "best.csv").exists()
 
 
-def test_what_the_configuration_reads_is_not_written_over(config: Path) -> None:  # noqa: F811
+def test_what_the_configuration_reads_is_not_written_over(config: Path) -> None:
     """Its own logs, its model, itself."""
     problem = prepare(config, 1)
     for path in (problem.config.logs[0].file, problem.config.model, config):

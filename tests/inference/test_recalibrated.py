@@ -25,8 +25,8 @@ from sipe_bayes.inference.recalibrated import Recalibrated
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from tests.likelihood.test_state_space import HIGH, LOW, PROCESS, spring, spring_logs
 from tests.problems.pendulums import log, pendulum
+from tests.problems.springs import HIGH, LOW, PROCESS, spring, spring_logs
 
 MIXING = np.array([[1.0, 0.6], [0.6, 1.0]])
 SD = 0.05

@@ -10,8 +10,8 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
 from sipe_bayes.simulation.simulator import Simulator
-from tests.likelihood.test_state_space import HIGH, LOW, PROCESS, spring, spring_logs, spring_step
 from tests.problems.pendulums import XML
+from tests.problems.springs import HIGH, LOW, PROCESS, spring, spring_logs, spring_step
 
 
 def test_next_to_no_process_noise_is_the_plain_replay() -> None:

@@ -23,8 +23,8 @@ from sipe_bayes.rl.loop_run import LoopRun, Plan, solves
 from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, LoopResult, train_in_the_loop
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.checkpoints import contents
 from tests.problems.quick import FORM
-from tests.rl.test_rl import contents
 
 EPISODE, HORIZON = 30, 20
 SMALL = Settings(hidden=(8, 8), batch=8, start_steps=60, updates_per_step=0.2)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 from torch import nn
 from typer.testing import CliRunner
 
@@ -28,6 +27,7 @@ from sipe_bayes.rl.replay import Batch
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import CHECKPOINT, choose, read_curve, train
 from sipe_bayes.rl.trainer import Trainer
+from tests.problems.checkpoints import contents
 
 SEEN, DONE, BATCH = 5, 2, 32
 
@@ -241,12 +241,6 @@ VARIED = Settings(
     random_share=0.2,
     updates_per_step=0.7,
 )
-
-
-def contents(path: Path) -> dict[str, Any]:
-    """A checkpoint's arrays and numbers."""
-    with safe_open(path, framework="numpy") as file:
-        return {**json.loads(file.metadata()["plain"]), **{k: file.get_tensor(k) for k in file.keys()}}  # noqa: SIM118
 
 
 @pytest.mark.parametrize(

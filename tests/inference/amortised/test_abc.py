@@ -11,14 +11,11 @@ import torch
 
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.abc import ABC
-from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.posterior import Particles, load_posterior
-from tests.inference.amortised.test_npe import exact, linear, seen
+from tests.problems.noisy_sums import QUIET, exact, linear, seen
 from tests.problems.pendulums import log, pendulum
-
-QUIET = Segments(noise_sd=(0.0, 0.0))
 
 
 def test_statistics_against_a_plain_loop() -> None:

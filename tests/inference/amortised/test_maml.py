@@ -13,9 +13,9 @@ from sipe_bayes.inference.amortised.maml import MAML
 from sipe_bayes.inference.amortised.prior_sampling import recorded_steps
 from sipe_bayes.models.training import restore
 from sipe_bayes.models.transitions import control_steps
-from tests.inference.amortised.test_regression import MATRIX, SPACE
-from tests.inference.amortised.test_regression import TRUTH as CORNER
-from tests.inference.amortised.test_simulations import TRUTH, Breaking, Counting
+from tests.problems.counted import TRUTH, Breaking, Counting
+from tests.problems.linear_map import MATRIX, SPACE
+from tests.problems.linear_map import TRUTH as CORNER
 from tests.problems.pendulums import log, pendulum
 from tests.problems.quick import FORM
 

@@ -7,10 +7,7 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.inference.amortised.regression import Regression, _Linear
-
-SPACE = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=2.0), sipe.Parameter("b", low=-1.0, high=1.0)])
-MATRIX = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, -1.0]])
-TRUTH = np.array([1.9, -0.9])
+from tests.problems.linear_map import MATRIX, SPACE, TRUTH
 
 
 def fitted(unit: np.ndarray | float = 1.0, **settings: float) -> tuple[Regression, np.ndarray]:

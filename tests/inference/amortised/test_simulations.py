@@ -21,23 +21,9 @@ from sipe_bayes.models.training import Training
 from sipe_bayes.models.transitions import control_steps
 from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.counted import TRUTH, Breaking, Counting
 from tests.problems.pendulums import DT, log, pendulum
 from tests.problems.quick import FORM
-
-TRUTH = [0.6, 0.05]
-
-
-class Counting(Simulator):
-    """Counts the lanes that are really simulated."""
-
-    def __init__(self) -> None:
-        super().__init__(pendulum().environment, num_threads=1)
-        self.lanes = 0
-
-    def rollout(self, theta: Any, *args: Any, **settings: Any) -> Trajectories:
-        made = super().rollout(theta, *args, **settings)
-        self.lanes += len(made)
-        return made
 
 
 def cache(simulator: Simulator, folder: Path | None = None, seed: int = 0) -> Cache:
@@ -123,20 +109,6 @@ def test_rounds_begin_anew_with_another_log() -> None:
     assert torch.equal(estimator.get_parameter_estimate(other).mean, fresh.fit(other).mean)
     with pytest.raises(ValueError, match="trained for other ones"):
         estimator.get_parameter_estimate(one)
-
-
-class Breaking(Counting):
-    """Diverges where the rod is heavier than three tenths of its range, and counts that too."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.broken = 0
-
-    def rollout(self, theta: Any, *args: Any, **settings: Any) -> Trajectories:
-        made = super().rollout(theta, *args, **settings)
-        bad = np.broadcast_to(np.atleast_2d(theta)[:, 0] > 0.3, (len(made),))
-        self.broken += int(bad.sum())
-        return replace(made, valid=made.valid & ~bad[:, None])
 
 
 @pytest.mark.parametrize("rounds", [1, 2])

@@ -1,0 +1,19 @@
+"""Fixtures that tests of several rooms use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file of a cart's calibration, in the working directory; estimators half and twice as wide are registered."""
+    from sipe_bayes.inference.registry import ESTIMATORS
+    from tests.problems.carts import write_configuration
+
+    for name in ("half", "twice"):
+        monkeypatch.setitem(ESTIMATORS, name, ("tests.problems.planted", name.capitalize()))
+    monkeypatch.chdir(tmp_path)
+    return write_configuration(tmp_path)

@@ -1,0 +1,29 @@
+"""Estimators that are wrong on purpose."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.posterior import GaussianMixture, Posterior
+
+
+class Planted(Laplace):
+    """Laplace's normals, ``width`` times as wide."""
+
+    width: ClassVar[float]
+
+    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        found = super().posterior(state, trajectories)
+        assert isinstance(found, GaussianMixture)
+        return GaussianMixture(found.log_weights, found.means, self.width**2 * found.covariances, found.space)
+
+
+class Half(Planted):
+    width = 0.5
+
+
+class Twice(Planted):
+    width = 2.0
