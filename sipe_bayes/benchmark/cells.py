@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
-import inspect
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +37,7 @@ from sipe_bayes.datasets.demonstrations import default_steps
 from sipe_bayes.datasets.trajectory_sets import TASKS as NINE
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Variant
-from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
+from sipe_bayes.inference.registry import ESTIMATORS, arguments
 
 BASELINES = ("prior", "prior_mean")
 PAPER = ("regression", "bayesopt", "maml", "simopt", "adr", "bayessim")
@@ -136,8 +135,7 @@ class Suite:
 @cache
 def has(estimator: str, argument: str) -> bool:
     """Whether an estimator takes an argument."""
-    classes = estimator_class(estimator).__mro__[:-1]
-    return any(argument in inspect.signature(c).parameters for c in classes)
+    return argument in arguments(estimator)
 
 
 def direct(

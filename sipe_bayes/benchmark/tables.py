@@ -13,7 +13,6 @@ A run with a policy counts only if the policy solved simulators drawn from the e
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 from collections import Counter
@@ -336,9 +335,7 @@ def _where(record: Record) -> tuple[str, str]:
 
 
 def _default(estimator: str, argument: str) -> Any:
-    from sipe_bayes.inference.registry import estimator_class
+    from sipe_bayes.inference.registry import arguments
 
-    for one in estimator_class(estimator).__mro__[:-1]:
-        if argument in inspect.signature(one).parameters:
-            return inspect.signature(one).parameters[argument].default
-    return None
+    taken = arguments(estimator)
+    return taken[argument].default if argument in taken else None

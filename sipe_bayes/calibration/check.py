@@ -29,7 +29,7 @@ from sipe_bayes.core.validation import whole
 from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draws
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, digest
-from sipe_bayes.inference.recalibrated import Recalibrated, fresh
+from sipe_bayes.inference.recalibrated import Recalibrated
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
 
@@ -262,7 +262,7 @@ class _Worker:
     def _estimator(self, number: int) -> Estimator:
         study = self.study
         if study.estimator.amortised and self._trained is None:
-            self._trained = fresh(study.estimator)
+            self._trained = study.estimator.fresh()
             self._trained.checkpoint = self.folder / "trained.safetensors"
             self._trained.progress = self.tell
             self._trained.fit(study.trajectories)
@@ -270,7 +270,7 @@ class _Worker:
             self._before = self._trained.rollouts, frozenset(self._trained.warnings)
         base = self._trained
         if base is None:
-            base = fresh(study.estimator)
+            base = study.estimator.fresh()
             base.seed = self._seed(5, number)
         return Recalibrated(base, refits=study.refits, seed=self._seed(4, number)) if study.refits else base
 

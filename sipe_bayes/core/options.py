@@ -38,8 +38,12 @@ class Limits:
 
     def text(self) -> str:
         """The legal range in words."""
-        bounds = (("at least", self.least), ("at most", self.most), ("above", self.above), ("below", self.below))
-        return " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
+        bounds = (("at least", self.least), ("above", self.above), ("at most", self.most), ("below", self.below))
+        words = " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
+        if words == "above 0":
+            return "a positive number"
+        whole_range = 0 in (self.least, self.above) and 1 in (self.most, self.below)
+        return f"a share {words}" if whole_range else words or "a finite number"
 
     def allows(self, value: float) -> bool:
         """Whether a number lies within."""
@@ -141,9 +145,8 @@ def _checked(name: str, value: Any, hint: Any, limits: Limits) -> Any:
 
 def _number(name: str, value: Any, kind: type, limits: Limits) -> Any:
     whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
-    if isinstance(value, bool) or not (whole if kind is int else isinstance(value, Real)):
-        what = "a whole number" if kind is int else "a number"
-        raise ValueError(f"{name}: expected {what} {limits.text()}".rstrip() + f", got {value!r}")
-    if not limits.allows(float(value)):
-        raise ValueError(f"{name}: expected {limits.text() or 'a finite number'}, got {value!r}")
+    if kind is int and (isinstance(value, bool) or not whole):
+        raise ValueError(f"{name}: expected a whole number, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, Real) or not limits.allows(float(value)):
+        raise ValueError(f"{name}: expected {limits.text()}, got {value!r}")
     return kind(value)

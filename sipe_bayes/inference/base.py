@@ -6,6 +6,7 @@ windows; finite differences count.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import inspect
 import json
@@ -14,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -292,6 +293,14 @@ class Estimator(ABC, Generic[S]):
         if self._observed is None or not np.array_equal(made.observations, self._observed.observations, equal_nan=True):
             self._observed = made
         return self._observed
+
+    def fresh(self) -> Self:
+        """A twin that shares what was learned, and neither files, progress, findings nor the logs in hand."""
+        twin = copy.copy(self)
+        twin.checkpoint = twin.progress = None
+        twin.findings, twin.diagnostics = Findings(), {}
+        twin._given, twin._bound = Given(), None
+        return twin
 
     @property
     def snapshot(self) -> Snapshot[S] | None:

@@ -35,7 +35,6 @@ simulating it.
 
 from __future__ import annotations
 
-import copy
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -47,10 +46,9 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
-from sipe_bayes.core.findings import Code, Finding, Findings, Severity
+from sipe_bayes.core.findings import Code, Finding, Severity
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
-from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.inference.inverse_regression import Line
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -238,7 +236,7 @@ class Recalibrated(Estimator):
     def _base(self, trajectories: Trajectories) -> tuple[Estimator, Posterior]:
         """The estimator fitted to the log itself, and what it found; after an interruption from its own checkpoint."""
         if self._fitted is None or self._fitted[0] is not trajectories:
-            base = fresh(self.estimator)
+            base = self.estimator.fresh()
             if base.amortised and base.ended:
                 found = base.get_parameter_estimate(trajectories)
             else:
@@ -261,7 +259,7 @@ class Recalibrated(Estimator):
 
     def _estimate(self, base: Estimator, replica: Trajectories) -> FloatArray | None:
         """Mean (N,) of the estimator's posterior of a replica; None where it finds none."""
-        again = base if base.amortised else fresh(base)
+        again = base if base.amortised else base.fresh()
         try:
             if base.amortised and base.snapshot is not None:
                 found = base.posterior(base.snapshot.state, replica)
@@ -337,15 +335,6 @@ def fitted_noise(
     fit = Laplace(simulator, likelihood=coloured, prior=prior, initial=theta, budget=budget)
     fit.fit(trajectories)
     return observation_noise(fit.diagnostics, trajectories, likelihood), process_noise(fit.diagnostics), fit.rollouts
-
-
-def fresh(estimator: Estimator) -> Estimator:
-    """A copy that shares what the estimator has learned, but neither files nor progress nor what was said."""
-    again = copy.copy(estimator)
-    again.checkpoint = again.progress = None
-    again.findings, again.diagnostics = Findings(), {}
-    again._given, again._bound = Given(), None
-    return again
 
 
 def _first_neighbourhood(covariance: FloatArray) -> FloatArray:

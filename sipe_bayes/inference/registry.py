@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import inspect
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
+
+from sipe_bayes.core.validation import nearest_name
 
 if TYPE_CHECKING:
+    from sipe_bayes.envs.task import Task
     from sipe_bayes.inference.base import Estimator
+    from sipe_bayes.simulation.callable_simulator import CallableSimulator
+    from sipe_bayes.simulation.simulator import Simulator
 
 ESTIMATORS = {
     "regression": ("sipe_bayes.inference.amortised.regression", "Regression"),
@@ -25,27 +30,53 @@ ESTIMATORS = {
 }
 
 
+class GymnasiumEnvironment(Protocol):
+    """What ``sipe.make`` returns, wrapped or not."""
+
+    @property
+    def unwrapped(self) -> object: ...
+
+
 def estimator_class(name: str) -> type[Estimator]:
     """The class of an estimator's name; raises ValueError that suggests the nearest."""
     if name not in ESTIMATORS:
-        close = difflib.get_close_matches(name, ESTIMATORS, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(ESTIMATORS)}"
-        raise ValueError(f"estimator: no {name!r}; {hint}")
+        hint = nearest_name(name, ESTIMATORS) or f"; known: {', '.join(ESTIMATORS)}"
+        raise ValueError(f"estimator: no {name!r}{hint}")
     module, attribute = ESTIMATORS[name]
-    found: type[Estimator] = getattr(importlib.import_module(module), attribute)
-    return found
+    method: type[Estimator] = getattr(importlib.import_module(module), attribute)
+    return method
 
 
-def get_estimator(simulator: Any, name: str, **settings: Any) -> Estimator:
-    """The estimator called ``name`` on ``simulator``, or on the simulator of a benchmark's task: its name, the Task, or the
-    Gymnasium environment of ``sipe.make``; settings as the class's own (budget, seed, prior, ...)."""
+def get_estimator(
+    simulator: Simulator | CallableSimulator | Task | GymnasiumEnvironment | str, name: str, **settings: object
+) -> Estimator:
+    """The estimator called ``name`` on a simulator.
+
+    Args:
+        simulator: what is calibrated, or what stands for the simulator of a benchmark's task: its name, the Task, or
+            the Gymnasium environment of ``sipe.make``.
+        name: one of ``ESTIMATORS``.
+        **settings: as the class's own (budget, seed, prior, ...).
+
+    Returns:
+        The estimator; nothing has been simulated yet.
+
+    Raises:
+        ValueError: for a name or a setting that there is not, or a value beyond its limits.
+    """
     from sipe_bayes.datasets.demonstrations import is_environment, simulator_of
 
     engine = simulator_of(simulator)[0] if is_environment(simulator) else simulator
-    found = estimator_class(name)
-    known = sorted({p for c in found.__mro__[:-1] for p in inspect.signature(c).parameters} - {"simulator", "settings"})
-    for unknown in sorted(set(settings) - set(known)):
-        close = difflib.get_close_matches(unknown, known, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(known)}"
-        raise ValueError(f"{name}: no setting {unknown!r}; {hint}")
-    return found(engine, **settings)
+    method: Callable[..., Estimator] = estimator_class(name)
+    known = arguments(name)
+    for unknown in sorted(settings.keys() - known):
+        hint = nearest_name(unknown, known) or f"; it has {', '.join(known)}"
+        raise ValueError(f"{name}: no setting {unknown!r}{hint}")
+    return method(engine, **settings)
+
+
+def arguments(name: str) -> dict[str, inspect.Parameter]:
+    """What the estimator called ``name`` takes besides the simulator, in alphabetical order."""
+    classes = estimator_class(name).__mro__[:-1]
+    every = {key: p for one in reversed(classes) for key, p in inspect.signature(one).parameters.items()}
+    return {key: every[key] for key in sorted(every.keys() - {"self", "simulator", "settings", "options"})}
