@@ -89,7 +89,7 @@ def test_what_a_search_makes_of_a_prior_is_said(name: str, words: str) -> None:
 
 def test_the_guides_example_is_an_estimator(tmp_path: Path) -> None:
     """Its code, as printed: it spends the budget, keeps the best, resumes, and is better than the prior mean."""
-    code = textwrap.dedent(inspect.getdoc(Estimator).split("keeps the best::")[1].split("``warn``")[0])  # type: ignore[union-attr]
+    code = textwrap.dedent(inspect.getdoc(Estimator).split("keeps the best::")[1].split("``find``")[0])  # type: ignore[union-attr]
     exec(code, names := dict[str, Any]())
     simulator = pendulum()
     truth = simulator.space.normalise(np.array([0.45, 0.16]))
