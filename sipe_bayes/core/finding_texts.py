@@ -22,19 +22,70 @@ class Code(StrEnum):
 
     # any estimator
     BUDGET_SPENT = auto()
-    AT_BOUND = auto()
+    AT_BOUND = auto()  # a median
+    NOT_MIXED = auto()
+    SEARCH_SPREAD = auto()
     REMARK = auto()  # until every sentence has a code of its own
+
+    # parameters
+    NO_EFFECT = auto()
+    DEAD_RANGE = auto()
+    NOT_DETERMINED = auto()
+    MODE_AT_BOUND = auto()
+    RIDGE = auto()
+    RIDGE_TO_RESOLVE = auto()
+    RIDGE_EXPECTED = auto()
+    NEVER_EXCITED = auto()
+    NOT_DETERMINED_EXPECTED = auto()
+    UNEVEN_TARGETS = auto()
+
+    # what the model lacks
+    NO_MISFIT = auto()
+    SMALL_MISFIT = auto()
+    MISFIT = auto()
+    MISFIT_SHIFTS = auto()
+    MISFIT_UNKNOWN = auto()
+    RESIDUALS_LEFT_OUT = auto()
+    PROCESS_NOISE = auto()
+
+    # logs
+    WITHIN_PRIOR = auto()
+    OUTSIDE_PRIOR = auto()
+    OUTSIDE_PRIOR_UNKNOWN = auto()
+    LOGS_DISAGREE = auto()
+    LOGS_DISAGREE_UNEXPLAINED = auto()
+    AGREEMENT_UNKNOWN = auto()
+    HELD_OUT_DIVERGES = auto()
+    HELD_OUT_WORSE = auto()
+    LOG_CLOCK = auto()
+    LOG_RESAMPLED = auto()
+    LOG_GAP = auto()
+    LOG_MISSING = auto()
+    LOG_BLANK_COMMANDS = auto()
+    LOG_CLIPPED = auto()
+
+    # what went in and what came out
+    PRIOR_OF_MIXTURE = auto()
+    PRIOR_COUNTED_TWICE = auto()
+    EXPORT = auto()
 
 
 @dataclass(frozen=True)
 class Text:
-    """How severe a finding usually is, and its text with {places}."""
+    """How severe a finding usually is, its text with {places}, and what a row of a table says of a parameter with it."""
 
     severity: Severity
     template: str
+    row: str = ""
 
 
 _NOTE, _CAUTION, _BLOCKING = Severity.NOTE, Severity.CAUTION, Severity.BLOCKING
+
+_LOOKS_LIKE = (
+    "{cause} ({percent:.2g} % of the residual of {channel}), most in {log} between {start:.3g} and {stop:.3g} s"
+)
+_NOT_NOISE = "the residuals are not noise (p = {p:.2g}): they look like " + _LOOKS_LIKE
+_RIDGE = "{combination} = {value:.4g} ± {width:.1g}{unit} "
 
 TEXTS: dict[Code, Text] = {
     # any estimator
@@ -43,5 +94,109 @@ TEXTS: dict[Code, Text] = {
         _CAUTION,
         "{parameters} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals",
     ),
+    Code.NOT_MIXED: Text(
+        _BLOCKING,
+        "the {what} have not mixed (R-hat {rhat:.3f}, {ess:.0f} effective{unit}): {remedy} before you trust the intervals",
+    ),
+    Code.SEARCH_SPREAD: Text(
+        _BLOCKING,
+        "the spread of {method} is that of its search, not an uncertainty: use laplace or mcmc, or in Python "
+        "sipe.Recalibrated",
+    ),
     Code.REMARK: Text(_CAUTION, "{text}"),
+    # parameters
+    Code.NO_EFFECT: Text(
+        _CAUTION, "{parameters} changes nothing in these logs; its posterior is its prior", "changes nothing"
+    ),
+    Code.DEAD_RANGE: Text(
+        _CAUTION, "{parameters} changes nothing between {ranges} {unit}", "part of its range changes nothing"
+    ),
+    Code.NOT_DETERMINED: Text(
+        _CAUTION, "{parameters} is not determined by these logs (contraction {contraction:.2f})", "not determined"
+    ),
+    Code.MODE_AT_BOUND: Text(
+        _CAUTION,
+        "{parameters} is at its bound {bound:.4g} {unit}: widen it, unless the bound is physical",
+        "at a bound",
+    ),
+    Code.RIDGE: Text(_NOTE, _RIDGE + "is determined; {alone} not"),
+    Code.RIDGE_TO_RESOLVE: Text(_CAUTION, "{ridge}: fix one of them at a measured value"),
+    Code.RIDGE_EXPECTED: Text(_CAUTION, _RIDGE + "would be determined; {alone} not"),
+    Code.NEVER_EXCITED: Text(_CAUTION, "{parameters} is never excited: its posterior will be what is known now"),
+    Code.NOT_DETERMINED_EXPECTED: Text(
+        _CAUTION, "{parameters} would not be determined (expected contraction {contraction:.2f})"
+    ),
+    Code.UNEVEN_TARGETS: Text(
+        _CAUTION,
+        "{parameters}: its targets have different values in the model, so 'the model as given' stands for all at "
+        "{default:.4g} {unit}",
+    ),
+    # what the model lacks
+    Code.NO_MISFIT: Text(
+        _NOTE, "the residuals pass for noise (p = {p:.2g}); what they resemble most is " + _LOOKS_LIKE
+    ),
+    Code.SMALL_MISFIT: Text(
+        _CAUTION,
+        _NOT_NOISE + "; a small effect that moves no parameter by more than {far:g} sd: {remedy} if you need more",
+    ),
+    Code.MISFIT: Text(_CAUTION, _NOT_NOISE + "; do not trust the intervals' width: {remedy}", "model lacks something"),
+    Code.MISFIT_SHIFTS: Text(
+        _CAUTION,
+        _NOT_NOISE + "; with it in the model the estimate would move, {moved}: {remedy}",
+        "model lacks something",
+    ),
+    Code.MISFIT_UNKNOWN: Text(_CAUTION, "whether the residuals are noise is unknown: {reason}"),
+    Code.RESIDUALS_LEFT_OUT: Text(
+        _NOTE,
+        "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "
+        "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "
+        "measured starts.",
+    ),
+    Code.PROCESS_NOISE: Text(_NOTE, "{text}"),
+    # logs
+    Code.WITHIN_PRIOR: Text(_NOTE, "log {log} is like simulations of the prior (p = {p:.2g})"),
+    Code.OUTSIDE_PRIOR: Text(
+        _BLOCKING,
+        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s: widen the "
+        "bounds, or correct the model, units or signs",
+    ),
+    Code.OUTSIDE_PRIOR_UNKNOWN: Text(_CAUTION, "whether the logs lie within the prior is unknown: {reason}"),
+    Code.LOGS_DISAGREE: Text(
+        _CAUTION,
+        "the logs disagree about {parameters} (p = {p:.1g}): {estimates} {unit}; give it per_log = true, model what "
+        "changed, or leave a log out{without}",
+        "disagrees between logs",
+    ),
+    Code.LOGS_DISAGREE_UNEXPLAINED: Text(
+        _CAUTION,
+        "the logs disagree (p = {p:.1g}) and no single parameter explains it: the model lacks something that differs "
+        "between them; {parameters} explains most ({estimates} {unit}){without}",
+        "disagrees between logs",
+    ),
+    Code.AGREEMENT_UNKNOWN: Text(_CAUTION, "log {log} could not be fitted by itself; whether it agrees is unknown"),
+    Code.HELD_OUT_DIVERGES: Text(_CAUTION, "held-out {log}, {channel}: the calibrated model diverges there"),
+    Code.HELD_OUT_WORSE: Text(
+        _CAUTION,
+        "held-out {log}, {channel}: {rmse:.3g} {unit} is not better than the model as given ({rmse_default:.3g})",
+    ),
+    Code.LOG_CLOCK: Text(
+        _NOTE, "{samples} samples passed through unchanged at {rate}; clock jitter {jitter_ms:.3g} ms"
+    ),
+    Code.LOG_RESAMPLED: Text(
+        _NOTE, "{samples} samples at {own_rate}, clock jitter {jitter_ms:.3g} ms, resampled to {rate}"
+    ),
+    Code.LOG_GAP: Text(_NOTE, "no measurement from {start:.3f} to {stop:.3f} s; commands are held there"),
+    Code.LOG_MISSING: Text(_NOTE, "{channel}: {missing} of {samples} samples missing, masked"),
+    Code.LOG_BLANK_COMMANDS: Text(_NOTE, "{channel}: {blank} blank commands, the one before is held"),
+    Code.LOG_CLIPPED: Text(_NOTE, "{channel}: {clipped} samples stuck at an extreme value, perhaps saturated"),
+    # what went in and what came out
+    Code.PRIOR_OF_MIXTURE: Text(
+        _CAUTION,
+        "the earlier posterior is a mixture of {components} normals; one with its mean and covariance stands for it",
+    ),
+    Code.PRIOR_COUNTED_TWICE: Text(
+        _CAUTION,
+        "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow",
+    ),
+    Code.EXPORT: Text(_CAUTION, "{text}"),
 }

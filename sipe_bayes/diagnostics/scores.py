@@ -28,7 +28,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sipe_bayes.inference.base import AT_BOUND
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.models.sbi_tools import import_sbi
 from sipe_bayes.posterior import Dirac, Particles, Posterior, SurrogatePosterior
 from sipe_bayes.posterior import prior as default_prior
@@ -245,7 +245,7 @@ def _noticed(posterior: Posterior, theta: FloatArray) -> tuple[bool | None, ...]
     median = posterior.quantile(0.5).numpy()
     to_bound = np.where(theta < 0, median, 1 - median)
     outside = (theta < 0) | (theta > 1)
-    return tuple(bool(d < AT_BOUND) if out else None for d, out in zip(to_bound, outside, strict=True))
+    return tuple(bool(d < THRESHOLDS.at_bound) if out else None for d, out in zip(to_bound, outside, strict=True))
 
 
 def _floats(array: FloatArray) -> tuple[float, ...]:

@@ -23,6 +23,7 @@ import torch
 from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
 from sipe_bayes.core.options import Options
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import path, whole
 from sipe_bayes.datasets.demonstrations import Given
@@ -33,9 +34,6 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
-
-AT_BOUND = 0.02  # of the range: a posterior whose median is nearer to a bound than that sits on it
-_NARROW = 0.5  # of the prior's sd: a posterior that is wider claims nothing
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
@@ -273,11 +271,11 @@ class Estimator(ABC, Generic[S]):
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
         posterior = self.posterior(state, trajectories)
         middle = posterior.quantile(torch.tensor([0.5], dtype=torch.float64))[0].numpy()
-        narrow = posterior.stddev.numpy() <= _NARROW * self.prior.stddev.numpy()
+        narrow = posterior.stddev.numpy() <= (1 - THRESHOLDS.not_determined) * self.prior.stddev.numpy()
         at = [
             n
             for n, m, sharp in zip(self.space.names, middle, narrow, strict=True)
-            if sharp and min(m, 1 - m) < AT_BOUND
+            if sharp and min(m, 1 - m) < THRESHOLDS.at_bound
         ]
         if at:
             self.find(Code.AT_BOUND, parameters=at)

@@ -1,0 +1,109 @@
+"""Every threshold of a verdict, each with its unit and its reason: the one place where they stand.
+
+A threshold decides what is said of a result: at a bound, determined, mixed, worse. How a search proceeds is an option
+of its method, and a numerical tolerance stands where it is used. A new threshold is a field of ``Thresholds``;
+``Thresholds.table()`` lists them all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sipe_bayes.core.options import Options, option
+
+
+@dataclass(frozen=True)
+class Thresholds(Options):
+    """What a number has to reach for something to be said of it."""
+
+    # one parameter
+    at_bound: float = option(
+        0.02,
+        "a median or mode nearer to a bound than this sits on it: a truth beyond would have pushed it there",
+        "of the range",
+        above=0,
+        below=1,
+    )
+    bound_sds: float = option(
+        10.0, "a mode may be as near to a bound as its sd is small: within at_bound times this many sds", "sds", above=0
+    )
+    not_determined: float = option(
+        0.5,
+        "a parameter that contracts less keeps more than half of the prior's sd: the logs do not determine it",
+        "contraction",
+        above=0,
+        below=1,
+    )
+    well_determined: float = option(
+        0.8,
+        "a parameter that contracts more has an interval of at most a fifth of the prior's",
+        "contraction",
+        above=0,
+        below=1,
+    )
+    idle: float = option(
+        0.1, "a calibrated posterior that contracts less says no more than the prior", "contraction", above=0, below=1
+    )
+    no_effect: float = option(
+        1e-7,
+        "a parameter that moves no channel by more changes nothing: ten times what rounding of a rollout does",
+        "of the signal's spread",
+        above=0,
+    )
+    sensitivity: float = option(
+        1e-3, "a change of the value by a tenth that moves observations less moves nothing", "of their spread", above=0
+    )
+
+    # several parameters
+    ridge: float = option(
+        0.03,
+        "an eigenvalue of the correlation matrix below it: the combination is six times better known than its members",
+        "of one",
+        above=0,
+        below=1,
+    )
+    ridge_member: float = option(
+        0.25, "a parameter with a smaller loading is no member of a ridge", "of the largest loading", above=0, below=1
+    )
+
+    # logs and what the model lacks
+    logs_disagree: float = option(
+        0.01, "false alarms of logs that agree; rare, since each pair of logs is a chance", "p-value", above=0, below=1
+    )
+    misfit: float = option(
+        0.05, "false alarms of residuals that are noise, and of logs that the prior gives", "p-value", above=0, below=1
+    )
+    small_misfit: float = option(
+        0.1, "a cause that explains less of every channel's residual is small", "of the residual", above=0, below=1
+    )
+    far_shift: float = option(
+        1.0,
+        "a parameter that would move further if the model had the cause is not to be trusted",
+        "posterior sds",
+        above=0,
+    )
+
+    # predictions of held-out logs
+    comparison: float = option(
+        0.05, "false alarms of two models that predict alike", "p-value of the paired t-test", above=0, below=1
+    )
+    alike: float = option(1.05, "errors within this factor of one another count as the same", "ratio", above=1)
+    starts_rule: float = option(
+        0.95,
+        "measured starts that make more of the error rule it: both models get starts of their own",
+        "of the error",
+        above=0,
+        below=1,
+    )
+
+    # chains and calibration
+    mixed: float = option(1.05, "chains with a larger R-hat have not mixed", "R-hat", above=1)
+    miscalibrated: float = option(
+        0.01, "false alarms of one check of all parameters when every posterior is right", "p-value", above=0, below=1
+    )
+    shown_interval: float = option(
+        0.9, "the central interval whose coverage sentences speak of", "of the mass", above=0, below=1
+    )
+
+
+THRESHOLDS = Thresholds()
