@@ -83,7 +83,7 @@ def load_state(path: Path, kind: type[S], fingerprint: str) -> S:
 def _flattened(name: str, value: Any, arrays: dict[str, Any]) -> Any:
     """The value as JSON; arrays go into ``arrays`` under their dotted names, and leave None."""
     if isinstance(value, np.ndarray):
-        arrays[name] = np.ascontiguousarray(value)
+        arrays[name] = np.asarray(value, order="C")  # ascontiguousarray would give one number an axis
         return None
     if dataclasses.is_dataclass(value):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
@@ -109,7 +109,7 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
     if dataclasses.is_dataclass(whole) and isinstance(whole, type):
         hints = typing.get_type_hints(whole)
         stands_for = dict(zip(getattr(whole, "__parameters__", ()), arguments, strict=False))
-        hints = {k: stands_for.get(v, v) if isinstance(v, TypeVar) else v for k, v in hints.items()}
+        hints = {k: _filled_in(v, stands_for) for k, v in hints.items()}
         return whole(
             **{
                 f.name: _restored(f"{name}.{f.name}", plain[f.name], hints[f.name], arrays)
@@ -124,6 +124,15 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
     if origin is dict:
         return {k: _restored(f"{name}.{k}", v, arguments[1], arrays) for k, v in plain.items()}
     return plain
+
+
+def _filled_in(hint: Any, stands_for: dict[Any, Any]) -> Any:
+    """A type in which type variables are replaced by what they stand for, also in ``Learned[T] | None``."""
+    if isinstance(hint, TypeVar):
+        return stands_for.get(hint, hint)
+    if isinstance(hint, type) or not getattr(hint, "__parameters__", ()):
+        return hint
+    return hint[tuple(stands_for.get(v, v) for v in hint.__parameters__)]
 
 
 def _stored(name: str, arrays: dict[str, Any]) -> bool:

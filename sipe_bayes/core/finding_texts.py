@@ -27,6 +27,20 @@ class Code(StrEnum):
     SEARCH_SPREAD = auto()
     REMARK = auto()  # until every sentence has a code of its own
 
+    # searches and Bayesian optimisation
+    PRIOR_HARDLY_USED = auto()
+    DIVERGED_COUNT_AS_WORST = auto()
+    SEARCH_STILL_WIDE = auto()
+    BEST_AT_BOUND = auto()
+    OTHER_TRAJECTORIES = auto()
+    STARTS_NOT_RECORDED = auto()
+    EPSILON_IMPROBABLE = auto()
+    DENSITY_ROUGH = auto()
+
+    # recalibration
+    REFITS_LOST = auto()
+    REFITS_NOT_NORMAL = auto()
+
     # parameters
     NO_EFFECT = auto()
     DEAD_RANGE = auto()
@@ -104,6 +118,49 @@ TEXTS: dict[Code, Text] = {
         "sipe.Recalibrated",
     ),
     Code.REMARK: Text(_CAUTION, "{text}"),
+    # searches and Bayesian optimisation
+    Code.PRIOR_HARDLY_USED: Text(_CAUTION, "{method} searches within the bounds and {use}; bayesopt and npe count it"),
+    Code.DIVERGED_COUNT_AS_WORST: Text(
+        _CAUTION,
+        "{count} of {total} simulations {failure} and counted as worst; narrow the bounds if they are many",
+    ),
+    Code.SEARCH_STILL_WIDE: Text(
+        _CAUTION,
+        "the search is still wide (sd {sd:.2f} of the bounds' range): raise the budget, or expect nothing of it",
+    ),
+    Code.BEST_AT_BOUND: Text(
+        _CAUTION, "the best point has {parameters} at a bound: the truth may lie beyond it; widen the bounds"
+    ),
+    Code.OTHER_TRAJECTORIES: Text(
+        _BLOCKING, "the costs are those of other trajectories than these: the posterior is theirs"
+    ),
+    Code.STARTS_NOT_RECORDED: Text(
+        _BLOCKING,
+        "the trajectories have no recorded states: errors of the windows' estimated starts are not in the posterior; "
+        "compare it with laplace or mcmc",
+    ),
+    Code.EPSILON_IMPROBABLE: Text(
+        _CAUTION,
+        "most of the posterior lies where a cost as low as epsilon is improbable ({probability:.1g}), because there is "
+        "so much room there: the intervals are about the prior's; take the mode, evaluate more, or free fewer "
+        "parameters",
+    ),
+    Code.DENSITY_ROUGH: Text(
+        _CAUTION,
+        "the density is known up to a factor only (log normaliser +- {error:.2f}): do not compare log_prob between "
+        "runs",
+    ),
+    # recalibration
+    Code.REFITS_LOST: Text(
+        _CAUTION,
+        "{share:.0%} of the replicas diverged or could not be fitted: the recalibrated intervals speak of the others "
+        "only",
+    ),
+    Code.REFITS_NOT_NORMAL: Text(
+        _CAUTION,
+        "the estimates of simulated logs do not scatter normally about a line in theta (p = {p:.1g}): the "
+        "recalibrated intervals are approximate; verify them with `sipe check`",
+    ),
     # parameters
     Code.NO_EFFECT: Text(
         _CAUTION, "{parameters} changes nothing in these logs; its posterior is its prior", "changes nothing"

@@ -105,5 +105,29 @@ class Thresholds(Options):
         0.9, "the central interval whose coverage sentences speak of", "of the mass", above=0, below=1
     )
 
+    # searches
+    search_wide: float = option(
+        0.15,
+        "a search whose distribution is wider was cut short: half of a uniform prior's sd",
+        "sd, of the range",
+        above=0,
+    )
+    best_at_bound: float = option(
+        2e-3, "an evaluated point nearer to a bound went there as far as it could", "of the range", above=0, below=1
+    )
+    mixed_draws: float = option(400.0, "fewer effective draws tell an interval's ends badly", "draws", above=0)
+    epsilon_probability: float = option(
+        0.01, "where epsilon is less probable at the median draw, the prior's room rules", "probability", above=0
+    )
+    rough_density: float = option(0.2, "a larger standard error of log Z moves a density by a fifth", "nats", above=0)
+
+    # recalibration
+    refits_lost: float = option(
+        0.1, "more refits that fail leave out a part of the prior", "of the refits", above=0, below=1
+    )
+    refits_odd: float = option(
+        0.01, "false alarms of estimates that scatter normally about a line", "p-value", above=0, below=1
+    )
+
 
 THRESHOLDS = Thresholds()

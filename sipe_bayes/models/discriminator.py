@@ -10,18 +10,15 @@ is least at D = p_recorded / (p_recorded + p_simulated), which is 1/2 where the 
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from sipe_bayes.core.arrays import Float32Array
 from sipe_bayes.models.transitions import Standardise
-
-FloatArray = NDArray[np.float64]
 
 HIDDEN = 128
 
@@ -46,8 +43,34 @@ class Discriminator(nn.Module):
         return out
 
 
+@dataclass(frozen=True)
+class TrainingState:
+    """What training goes on from, exactly.
+
+    Args:
+        weights: of the network (P,).
+        first_moment: Adam's running mean of the gradient (P,).
+        second_moment: Adam's running mean of its square (P,).
+        steps: steps taken.
+        mean: of the features (F,), which standardises them.
+        sd: of the features (F,).
+    """
+
+    weights: Float32Array
+    first_moment: Float32Array
+    second_moment: Float32Array
+    steps: int
+    mean: Float32Array
+    sd: Float32Array
+
+
 class Training:
-    """A discriminator with Adam, saved to and read from flat numpy arrays so that training goes on exactly."""
+    """A discriminator with Adam.
+
+    Args:
+        network: the discriminator.
+        learning_rate: of Adam.
+    """
 
     def __init__(self, network: Discriminator, learning_rate: float) -> None:
         self.network = network
@@ -63,37 +86,33 @@ class Training:
         self.steps += 1
         return float(loss.detach())
 
-    def state(self) -> dict[str, Any]:
-        """Weights and Adam's moments (P,) each, number of steps, mean and sd (F,) of the standardisation."""
+    def state(self) -> TrainingState:
+        """What ``load`` goes on from."""
         parameters = list(self.network.layers.parameters())
         moments = [self.optimiser.state.get(p, {}) for p in parameters]
-        flat = {
-            name: torch.cat(
-                [m.get(name, torch.zeros_like(p)).flatten() for m, p in zip(moments, parameters, strict=True)]
-            )
+        first, second = (
+            torch.cat([m.get(name, torch.zeros_like(p)).flatten() for m, p in zip(moments, parameters, strict=True)])
             for name in ("exp_avg", "exp_avg_sq")
-        }
-        return {
-            "weights": parameters_to_vector(parameters).detach().numpy().copy(),
-            "first_moment": flat["exp_avg"].numpy().copy(),
-            "second_moment": flat["exp_avg_sq"].numpy().copy(),
-            "steps": self.steps,
-            "mean": self.network.standardise.mean.numpy().copy(),
-            "sd": self.network.standardise.sd.numpy().copy(),
-        }
+        )
+        standardise = self.network.standardise
+        flat = (parameters_to_vector(parameters).detach(), first, second)
+        weights, first_moment, second_moment, mean, sd = (
+            x.numpy().copy() for x in (*flat, standardise.mean, standardise.sd)
+        )
+        return TrainingState(weights, first_moment, second_moment, self.steps, mean, sd)
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, state: TrainingState) -> None:
         """Go on from what ``state`` returned."""
         parameters = list(self.network.layers.parameters())
-        vector_to_parameters(torch.tensor(state["weights"]), parameters)
+        vector_to_parameters(torch.tensor(state.weights), parameters)
         sizes = [p.numel() for p in parameters]
-        first, second = (torch.tensor(state[name]).split(sizes) for name in ("first_moment", "second_moment"))
-        self.steps = int(state["steps"])
+        first, second = (torch.tensor(moment).split(sizes) for moment in (state.first_moment, state.second_moment))
+        self.steps = state.steps
         for p, a, b in zip(parameters, first, second, strict=True):
             self.optimiser.state[p] = {
                 "step": torch.tensor(float(self.steps)),
                 "exp_avg": a.view_as(p).clone(),
                 "exp_avg_sq": b.view_as(p).clone(),
             }
-        self.network.standardise.mean.copy_(torch.tensor(state["mean"]))
-        self.network.standardise.sd.copy_(torch.tensor(state["sd"]))
+        self.network.standardise.mean.copy_(torch.tensor(state.mean))
+        self.network.standardise.sd.copy_(torch.tensor(state.sd))

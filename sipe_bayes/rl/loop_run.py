@@ -17,7 +17,7 @@ from sipe_bayes.core.validation import whole
 from sipe_bayes.datasets.demonstrations import default_steps
 from sipe_bayes.envs.task import Task
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.search.gaussian_search import Search
+from sipe_bayes.inference.search.base import Search
 from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.rl.evaluation import evaluate

@@ -49,7 +49,7 @@ from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.core.findings import Finding, Findings
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import Estimator, Snapshot
-from sipe_bayes.inference.search.gaussian_search import Search
+from sipe_bayes.inference.search.base import Search
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
 from sipe_bayes.rl.settings import Settings

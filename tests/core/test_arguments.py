@@ -83,7 +83,7 @@ def test_what_a_search_makes_of_a_prior_is_said(name: str, words: str) -> None:
     fit = get_estimator(simulator, name, prior=prior, budget=6)
     fit.fit(log(simulator, [0.6, 0.05], 1, steps=60))
     assert any(words in w for w in fit.warnings), fit.warnings
-    began_there = bool((np.abs(fit.state["pool_theta"][:, 0] - 0.9) < 0.01).all())  # type: ignore[index]
+    began_there = bool((np.abs(fit.state.pool.theta[:, 0] - 0.9) < 0.01).all())  # type: ignore[union-attr]
     assert began_there == (words == "only to begin")
 
 

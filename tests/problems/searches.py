@@ -11,7 +11,7 @@ import torch
 
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.search import gaussian_search
+from sipe_bayes.inference.search import base
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import log, pendulum
 
@@ -36,7 +36,7 @@ def check_recovery(name: str, budget: int, factor: float, seeds: int = 3, **sett
     for seed in range(seeds):
         fit = get_estimator(simulator, name, budget=budget, seed=seed, **settings)
         errors.append(float(np.abs(fit.fit(trajectory).mean.numpy() - theta).mean()))
-        assert budget - fit.rollouts < 20 or fit.state["done"]
+        assert budget - fit.rollouts < 20 or fit.state.done
     trivial = float(np.abs(0.5 - theta).mean())
     print(name, settings, "mean |error|", np.round(errors, 4), "prior mean", round(trivial, 3))
     assert np.mean(errors) * factor < trivial, (errors, trivial)
@@ -83,14 +83,14 @@ def check_resumes(name: str, budget: int, tmp_path: Path, **settings: Any) -> No
 def check_divergence(name: str, budget: int, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
     """A tenth of the prior diverges: the rest is searched, and a warning says so. Where all diverge, an error does."""
     simulator, trajectory, theta = problem()
-    plain = gaussian_search.simulate
+    plain = base.simulate
 
     def partly(windows: Any, thetas: np.ndarray) -> np.ndarray:
         predicted = plain(windows, thetas).copy()
         predicted[thetas[:, 0] > limit, -1, 5:] = np.nan
         return predicted
 
-    monkeypatch.setattr(gaussian_search, "simulate", partly)
+    monkeypatch.setattr(base, "simulate", partly)
     limit = 0.9
     fit = (
         get_estimator(simulator, name, seed=0, budget=budget, initial_mean=1.0, **settings)
@@ -117,8 +117,8 @@ def check_other_trajectories(name: str, **settings: Any) -> None:
     used = fit.rollouts
     fit.update_parameter_estimate(another)
     assert fit.rollouts > used
-    assert fit.state["simulated"] == fit.rollouts
-    assert len(fit.state["pool_theta"]) <= fit.rollouts - used
+    assert fit.state.simulated == fit.rollouts
+    assert len(fit.state.pool.theta) <= fit.rollouts - used
     fit.get_parameter_estimate(another)
     with pytest.raises(ValueError, match="raise it"):
         get_estimator(simulator, name, budget=1, **settings).fit([trajectory, another])

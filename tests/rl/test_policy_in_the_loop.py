@@ -267,7 +267,7 @@ def test_a_resumed_run_is_the_undisturbed_one(tmp_path: Path, name: str, setting
     assert states[0].keys() == states[1].keys()
     for key, value in states[0].items():
         np.testing.assert_array_equal(value, states[1][key], err_msg=key)
-    assert states[0]["trainer.updates"] > 10
+    assert states[0]["trainer"]["updates"] > 10
 
 
 def test_what_the_folder_holds(tmp_path: Path) -> None:

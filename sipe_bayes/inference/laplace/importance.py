@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.inference.search.gaussian_search import log_normal
+from sipe_bayes.inference.search.gaussians import log_normal
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
 FloatArray = NDArray[np.float64]

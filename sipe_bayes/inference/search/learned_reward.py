@@ -1,64 +1,69 @@
 """A learned reward of a simulation: how well a discriminator takes it for a recording.
 
-B. Mehta, M. Diaz, F. Golemo, C. Pal, L. Paull 2019, "Active Domain Randomization", https://arxiv.org/abs/1904.04762, with
-the sign of B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators",
+B. Mehta, M. Diaz, F. Golemo, C. Pal, L. Paull 2019, "Active Domain Randomization", https://arxiv.org/abs/1904.04762,
+with the sign of B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators",
 https://arxiv.org/abs/2011.08985: simulations that cannot be told from recordings are rewarded,
 
     r(theta) = mean over the simulation's control steps of log D(s, a, s'),
 
-D being trained by binary cross-entropy on recorded control steps against those simulated at the thetas that a method looks at.
-It compares sets of control steps, not step with step, so that starting states and actions need not match: ``features`` takes
-simulations of others. But they must reach about the same states under about the same actions: D tells simulations by those as
-well, and of one short recording it soon knows every step. So ``simopt`` and ``adr`` simulate from the recorded
-starting states with the recorded actions; with others they are not offered.
+D being trained by binary cross-entropy on recorded control steps against those simulated at the thetas that a method
+looks at. It compares sets of control steps, not step with step, so that starting states and actions need not match:
+``features`` takes simulations of others. But they must reach about the same states under about the same actions: D
+tells simulations by those as well, and of one short recording it soon knows every step. So ``simopt`` and ``adr``
+simulate from the recorded starting states with the recorded actions; with others they are not offered.
 
-Deviations: a step enters as (s, a, s' - s), which is as much as (s, a, s') and shows small changes; features are
-standardised by the recorded steps; simulated steps get the recorded observations' noise, which would otherwise give them
-away; D is trained on the method's pool of recent simulations, not the latest alone; of a simulation at most 200 steps,
-evenly spread, are looked at.
+Deviations:
+
+- A step enters as (s, a, s' - s), which is as much as (s, a, s') and shows small changes.
+- Features are standardised by the recorded steps.
+- Simulated steps get the recorded observations' noise, which would otherwise give them away.
+- D is trained on the method's pool of recent simulations, not the latest alone.
+- Of a simulation at most 200 steps, evenly spread, are looked at.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.nn.functional import logsigmoid
 
+from sipe_bayes.core.arrays import Float32Array, FloatArray
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.models.discriminator import HIDDEN, Discriminator, Training
+from sipe_bayes.models.discriminator import HIDDEN, Discriminator, Training, TrainingState
 from sipe_bayes.models.transitions import control_steps
 
-FloatArray = NDArray[np.float64]
-Features = NDArray[np.float32]
-State = dict[str, Any]
+REWARDS = ("state_difference", "learned")
 
-_PREFIX = "reward_"
+
+@dataclass(frozen=True)
+class RewardOptions(Options):
+    """What a search rewards, and how a discriminator learns it."""
+
+    reward: str = option("state_difference", "minus the mean squared difference of states, or learned", among=REWARDS)
+    learning_rate: float = option(0.001, "of the discriminator's Adam", above=0)
+    discriminator_batch: int = option(320, "control steps in a batch, half recorded and half simulated", least=2)
+    discriminator_updates: int = option(30, "steps of Adam after each draw", least=1)
+    discriminator_hidden: int = option(HIDDEN, "units of each of the discriminator's two layers", least=1)
 
 
 class LearnedReward:
-    """Reward of simulations of ``windows``; what is learned lives in the entries ``reward_*`` of a flat State.
+    """Reward of simulations.
 
-    learning_rate, batch: of Adam; half of a batch is recorded, half simulated. updates: Adam's steps at each ``train``. hidden:
-    units of the discriminator's two layers.
-    Raises ValueError where fewer than two whole control steps were recorded, as in an observed x of a function.
+    Args:
+        windows: the logs, whose control steps are the recorded ones.
+        options: of the discriminator and its training.
+        seed: of its first weights, batches and noise.
+
+    Raises:
+        ValueError: where fewer than two whole control steps were recorded, as in an observed x of a function.
     """
 
-    def __init__(
-        self,
-        windows: Windows,
-        *,
-        seed: int = 0,
-        learning_rate: float = 0.001,
-        batch: int = 320,
-        updates: int = 30,
-        hidden: int = HIDDEN,
-    ) -> None:
-        self.windows, self.seed, self.hidden = windows, seed, hidden
-        self.learning_rate, self.batch, self.updates = learning_rate, batch, updates
+    def __init__(self, windows: Windows, options: RewardOptions | None = None, seed: int = 0) -> None:
+        self.windows, self.options, self.seed = windows, options or RewardOptions(), seed
         sd = noise_level(windows.trajectories, windows.settings)
         self.noise = sd[windows.channels]
         steps = int(windows.steps.sum())
@@ -66,19 +71,26 @@ class LearnedReward:
         self.recorded = torch.from_numpy(recorded[np.isfinite(recorded).all(-1)])
         if len(self.recorded) < 2:
             raise ValueError(
-                f"trajectories: expected control steps with all channels recorded, got {len(self.recorded)}; fit fewer channels, "
-                'or use reward="state_difference"'
+                f"trajectories: expected control steps with all channels recorded, got {len(self.recorded)}; fit fewer "
+                'channels, or use reward="state_difference"'
             )
 
-    def start(self) -> State:
-        """An untrained discriminator's entries of the State."""
+    def start(self) -> TrainingState:
+        """An untrained discriminator."""
         training = self._training(None)
         training.network.standardise.fit(self.recorded)
-        return _prefixed(training)
+        return training.state()
 
-    def features(self, predicted: FloatArray | None, unmatched: Windows | None = None) -> Features:
-        """Control steps (B, M, F) of predictions (B, W, L, C), NaN throughout where they diverged; none of None. unmatched: windows
-        with other starting states and actions, where the predictions are theirs."""
+    def features(self, predicted: FloatArray | None, unmatched: Windows | None = None) -> Float32Array:
+        """Control steps of simulations.
+
+        Args:
+            predicted: (B, W, L, C), or None for no simulation.
+            unmatched: windows with other starting states and actions, where the predictions are theirs.
+
+        Returns:
+            (B, M, F), NaN throughout where a simulation diverged.
+        """
         windows = unmatched or self.windows
         if predicted is None:
             predicted = np.empty((0, *windows.measured.shape))
@@ -86,20 +98,20 @@ class LearnedReward:
         good = np.all(np.isfinite(predicted).all(-1) | ~inside, axis=(1, 2))
         return control_steps(np.where(good[:, None, None, None], predicted, np.nan), windows.actions, windows.steps)
 
-    def train(self, state: State, features: Features) -> State:
-        """The entries after some steps on recorded control steps against those of ``features`` (B, M, F)."""
+    def train(self, state: TrainingState, features: Float32Array) -> TrainingState:
+        """The discriminator after some steps on recorded control steps against those of ``features`` (B, M, F)."""
         training = self._training(state)
         rows = features.reshape(-1, features.shape[-1])
         simulated = torch.from_numpy(rows[np.isfinite(rows).all(-1)])
-        half = self.batch // 2
-        for _ in range(self.updates if len(simulated) else 0):
+        half = self.options.discriminator_batch // 2
+        for _ in range(self.options.discriminator_updates if len(simulated) else 0):
             random = np.random.default_rng([self.seed, 1, training.steps])
             real = self.recorded[torch.from_numpy(random.integers(len(self.recorded), size=half))]
             fake = simulated[torch.from_numpy(random.integers(len(simulated), size=half))]
             training.step(real, self._noisy(fake, random))
-        return _prefixed(training)
+        return training.state()
 
-    def __call__(self, state: State, features: Features) -> FloatArray:
+    def __call__(self, state: TrainingState, features: Float32Array) -> FloatArray:
         """Reward (B,) of features (B, M, F): the mean of log D, -inf where the simulation diverged."""
         network = self._training(state).network
         good = np.asarray(np.isfinite(features).all(-1))
@@ -116,18 +128,17 @@ class LearnedReward:
         if not self.noise.any():
             return steps
         channels, shape = len(self.noise), (*steps.shape[-2:-1], len(self.noise))
-        here, there = (torch.from_numpy((self.noise * random.standard_normal(shape)).astype(np.float32)) for _ in "ab")
+        before, after = (
+            torch.from_numpy((self.noise * random.standard_normal(shape)).astype(np.float32)) for _ in "ab"
+        )
         out = steps.clone()
-        out[..., :channels] += here
-        out[..., -channels:] += there - here
+        out[..., :channels] += before
+        out[..., -channels:] += after - before
         return out
 
-    def _training(self, state: State | None) -> Training:
-        training = Training(Discriminator(self.recorded.shape[1], self.seed, self.hidden), self.learning_rate)
+    def _training(self, state: TrainingState | None) -> Training:
+        network = Discriminator(self.recorded.shape[1], self.seed, self.options.discriminator_hidden)
+        training = Training(network, self.options.learning_rate)
         if state is not None:
-            training.load({k[len(_PREFIX) :]: v for k, v in state.items() if k.startswith(_PREFIX)})
+            training.load(state)
         return training
-
-
-def _prefixed(training: Training) -> State:
-    return {_PREFIX + k: v for k, v in training.state().items()}

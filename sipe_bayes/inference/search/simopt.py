@@ -12,153 +12,162 @@ p_i proportional to q_i exp(R_i / eta), where the temperature eta minimises the 
 
 found as the root of its slope. A Gaussian is fitted to the weighted draws and goes on as the next q.
 
-An iteration is 12 updates of 6 particles: 72 rollouts for each recorded trajectory. Iterations go on until the budget is spent,
-or until the Gaussian is narrower than 1e-4 in every parameter.
+An iteration is 12 updates of 6 particles: 72 rollouts for each recorded trajectory. Iterations go on until the budget
+is spent, or until the Gaussian is narrower than 1e-4 in every parameter.
 
-Deviations. Draws of the last iteration's updates (72) take part in each update, q_i being the present Gaussian against the
-mixture of those that they came from: six draws alone say little in more than two dimensions. The new Gaussian takes what
-the weights p change in the mean and covariance of the draws against the weights q, instead of their plain moments under
-p: those also hold the noise of q's own weights and what the cube cuts off, and collapse far from the optimum. The covariance
-is damped: with n_eff effective draws its change counts by n_eff / (n_eff + damping (N + 1)), ``damping`` = 1 being the weight
-of as many draws as a Gaussian's scatter takes, and no variance shrinks by more than ``least_factor``, a quarter, in an update or
-below 1e-10 at all (neither paper gives a rule or a number); the mean stays in the cube, to which draws are restricted; and the step is cut back until the
-Gaussians' own KL is within epsilon. The earlier Gaussians' densities are those before the cube cuts them: their
-masses within it, which differ, are taken as equal. Diverged simulations have weight zero. "Covariance initialisation 0.2" is read as a
-variance, and epsilon is chosen here. Policy training is not part of it: other trajectories may be given at each step.
+Deviations:
+
+- Draws of the last iteration's updates (72) take part in each update, q_i being the present Gaussian against the
+  mixture of those that they came from: six draws alone say little in more than two dimensions.
+- The new Gaussian takes what the weights p change in the mean and covariance of the draws against the weights q,
+  instead of their plain moments under p: those also hold the noise of q's own weights and what the cube cuts off, and
+  collapse far from the optimum.
+- The covariance is damped: with n_eff effective draws its change counts by n_eff / (n_eff + damping (N + 1)),
+  ``damping`` = 1 being the weight of as many draws as a Gaussian's scatter takes. No variance shrinks by more than
+  ``least_factor``, a quarter, in an update or below 1e-10 at all (neither paper gives a rule or a number).
+- The mean stays in the cube, to which draws are restricted.
+- The step is cut back until the Gaussians' own KL is within epsilon.
+- The earlier Gaussians' densities are those before the cube cuts them: their masses within it, which differ, are
+  taken as equal.
+- Diverged simulations have weight zero.
+- "Covariance initialisation 0.2" is read as a variance, and epsilon is chosen here.
+- Policy training is not part of it: other trajectories may be given at each step.
 
 The result is a search distribution that narrows as long as it is fed: it finds, and does not say how sure one may be.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.special import logsumexp
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import option
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.core.validation import at_least, positive, share, whole
-from sipe_bayes.inference.search.gaussian_search import RewardSearch, draw_in_cube, gaussian_kl, log_normal
+from sipe_bayes.inference.search.base import PoolState, RewardSearch
+from sipe_bayes.inference.search.gaussians import LEAST_VARIANCE, draw_in_cube, gaussian_kl, log_normal
+from sipe_bayes.inference.search.learned_reward import RewardOptions
 from sipe_bayes.posterior import GaussianMixture, Particles
 
-FloatArray = NDArray[np.float64]
 
-_LEAST_VARIANCE = 1e-10
+@dataclass(frozen=True)
+class SimOptOptions(RewardOptions):
+    """How REPS moves the Gaussian, and what it is rewarded for."""
+
+    updates: int = option(12, "REPS updates in an iteration", least=1)
+    particles: int = option(6, "simulated in each update", least=2)
+    initial_mean: float = option(0.5, "the first mean is drawn uniformly from [0, this]^N", "theta", above=0, most=1)
+    initial_variance: float = option(0.2, "of the first Gaussian", "theta squared", above=0)
+    epsilon: float = option(0.5, "bound on the KL of an update", "nats", above=0)
+    damping: float = option(1.0, "of the covariance: the more, the slower it follows few draws", least=0)
+    least_factor: float = option(
+        0.25, "an update narrows a variance by this at most, or widens it by its inverse", above=0, below=1
+    )
+    converged_sd: float = option(1e-4, "sd of every parameter where the search ends", "theta", above=0)
 
 
-class SimOpt(RewardSearch):
-    """The last iteration's weighted draws as Particles; ``proposal`` is the Gaussian that they fit.
+@dataclass(frozen=True, kw_only=True)
+class SimOptState(PoolState):
+    """The pool and the Gaussians of all updates.
 
-    updates: REPS updates in an iteration. particles: simulated in each. initial_variance: of the first Gaussian, whose mean
-    is drawn uniformly from [0, initial_mean]^N. epsilon: bound on the KL of an update, in nats. damping: of the covariance, 0 or
-    more; the more, the slower it follows few draws. least_factor: by which an update narrows, or its inverse widens, a
-    variance at most. converged_sd: of every parameter, in theta, where the search ends. reward: see ``RewardSearch``.
+    Args:
+        means: (U + 1, N), the first and one after each of U updates.
+        covariances: (U + 1, N, N).
     """
+
+    means: FloatArray
+    covariances: FloatArray
+
+    @property
+    def updates(self) -> int:
+        """Updates so far, U."""
+        return len(self.means) - 1
+
+    @property
+    def variances(self) -> FloatArray:
+        """Of the present Gaussian, (N,)."""
+        return np.diag(self.covariances[-1])
+
+
+class SimOpt(RewardSearch[SimOptState]):
+    """The last iteration's weighted draws as Particles; ``proposal`` is the Gaussian that they fit."""
 
     name: ClassVar[str] = "simopt"
     begins_with_prior: ClassVar[bool] = False
+    options_type = SimOptOptions
+    state_type = SimOptState
+    options: SimOptOptions
+    proposal: GaussianMixture | None = None
 
-    def __init__(
-        self,
-        simulator: Any,
-        *,
-        updates: int = 12,
-        particles: int = 6,
-        initial_mean: float = 0.5,
-        initial_variance: float = 0.2,
-        epsilon: float = 0.5,
-        damping: float = 1.0,
-        least_factor: float = 0.25,
-        converged_sd: float = 1e-4,
-        **settings: Any,
-    ) -> None:
-        super().__init__(simulator, **settings)
-        self.updates, self.particles = whole("updates", updates), whole("particles", particles, 2)
-        if positive("initial_mean", initial_mean) > 1:
-            raise ValueError(f"initial_mean: expected a number in (0, 1], got {initial_mean}")
-        self.initial_mean, self.initial_variance = initial_mean, positive("initial_variance", initial_variance)
-        self.epsilon, self.damping = positive("epsilon", epsilon), at_least("damping", damping, 0)
-        self.least_factor, self.converged_sd = (
-            share("least_factor", least_factor),
-            positive("converged_sd", converged_sd),
-        )
-        self.proposal: GaussianMixture | None = None
-
-    def settings(self) -> dict[str, Any]:
-        own = ("updates", "particles", "initial_mean", "initial_variance", "epsilon")
-        ends = ("damping", "least_factor", "converged_sd")
-        return {**super().settings(), **{name: getattr(self, name) for name in own + ends}}
-
-    def start(self, trajectories: Trajectories) -> State:
+    def start(self, trajectories: Trajectories) -> SimOptState:
+        """The first Gaussian."""
         n = len(self.space)
-        state = self.empty_pool(trajectories)
-        mean = self.random(state).uniform(0.0, self.initial_mean, n)
-        return {
-            **state,
-            "draws": 1,
-            "means": mean[None],
-            "covariances": (self.initial_variance * np.eye(n))[None],
-            "temperature": np.inf,
-            "done": False,
-        }
+        return SimOptState(
+            pool=self.empty_pool(trajectories),
+            training=self.untrained(trajectories),
+            draws=1,
+            means=self.random(0).uniform(0.0, self.options.initial_mean, n)[None],
+            covariances=(self.options.initial_variance * np.eye(n))[None],
+        )
 
-    def describe(self, state: State) -> str:
-        return f"simopt: update {len(state['means']) - 1}"
+    def describe(self, state: SimOptState) -> str:
+        """For the progress bar."""
+        return f"simopt: update {state.updates}"
 
-    def step(self, state: State, trajectories: Trajectories) -> State:
+    def step(self, state: SimOptState, trajectories: Trajectories) -> SimOptState:
         """An iteration: ``updates`` REPS updates, as far as the budget goes."""
         self.check_budget(state, trajectories)
         state = self.renewed(state, trajectories)
-        for _ in range(self.updates):
-            count = self.affordable(self.particles, trajectories)
-            converged = bool((np.diag(state["covariances"][-1]) < self.converged_sd**2).all())
-            if not count or converged:
-                return {**state, "done": True}
+        for _ in range(self.options.updates):
+            count = self.affordable(self.options.particles, trajectories)
+            if not count or (state.variances < self.options.converged_sd**2).all():
+                return replace(state, done=True)
             state = self._update(state, trajectories, count)
-        return {**state, "done": not self.affordable(1, trajectories)}
+        return replace(state, done=not self.affordable(1, trajectories))
 
-    def _update(self, state: State, trajectories: Trajectories, count: int) -> State:
+    def _update(self, state: SimOptState, trajectories: Trajectories, count: int) -> SimOptState:
         """The state after ``count`` simulations and a new Gaussian."""
-        mean, covariance = state["means"][-1], state["covariances"][-1]
-        theta = draw_in_cube(mean, covariance, count, self.random(state))
-        state = self.evaluated(state, theta, trajectories, self.updates * self.particles)
-        temperature = state["temperature"]
-        if np.isfinite(state["pool_reward"]).sum() > 1:
+        mean, covariance, options = state.means[-1], state.covariances[-1], self.options
+        theta = draw_in_cube(mean, covariance, count, self.random(state.draws))
+        state = self.evaluated(state, theta, trajectories, options.updates * options.particles)
+        if state.pool.valid.sum() > 1:
             log_base = _log_base(state)
-            temperature = reps_temperature(state["pool_reward"], log_base, self.epsilon)
-            weights = reps_weights(state["pool_reward"], log_base, temperature)
-            base = np.where(np.isfinite(state["pool_reward"]), np.exp(log_base), 0.0)
-            old = (mean, covariance, self.epsilon, self.damping, self.least_factor)
-            mean, covariance = fitted(state["pool_theta"], weights, base / base.sum(), *old)
-        return {
-            **state,
-            "means": np.concatenate([state["means"], mean[None]]),
-            "covariances": np.concatenate([state["covariances"], covariance[None]]),
-            "temperature": float(temperature),
-        }
+            temperature = reps_temperature(state.pool.reward, log_base, options.epsilon)
+            weights = reps_weights(state.pool.reward, log_base, temperature)
+            base = np.where(state.pool.valid, np.exp(log_base), 0.0)
+            mean, covariance = updated_gaussian(
+                state.pool.theta, weights, base / base.sum(), mean, covariance, self.options
+            )
+        return replace(
+            state,
+            means=np.concatenate([state.means, mean[None]]),
+            covariances=np.concatenate([state.covariances, covariance[None]]),
+        )
 
-    def posterior(self, state: State, trajectories: Trajectories) -> Particles:
+    def posterior(self, state: SimOptState, trajectories: Trajectories) -> Particles:
+        """The pool, weighted as the next update would."""
         self.report(state)
-        mean, covariance = state["means"][-1], state["covariances"][-1]
-        self.proposal = GaussianMixture([0.0], mean[None], covariance[None], self.space)
-        reward = state["pool_reward"]
-        if not np.isfinite(reward).any():
+        mean, pool = state.means[-1], state.pool
+        self.proposal = GaussianMixture([0.0], mean[None], state.covariances[-1][None], self.space)
+        if not pool.valid.any():
             return Particles(np.clip(mean, 0, 1)[None], self.space)
         log_base = _log_base(state)
-        weights = reps_weights(reward, log_base, reps_temperature(reward, log_base, self.epsilon))
-        result = Particles(state["pool_theta"], self.space, weights, best=state["pool_theta"][reward.argmax()])
+        weights = reps_weights(pool.reward, log_base, reps_temperature(pool.reward, log_base, self.options.epsilon))
+        posterior = Particles(pool.theta, self.space, weights, best=pool.best)
+        largest_sd = float(np.sqrt(state.variances.max()))
         self.diagnostics["search"] = {
-            "updates": len(state["means"]) - 1,
-            "largest_sd": float(np.sqrt(np.diag(covariance).max())),
-            "effective_particles": result.effective_size,
-            "best_reward": float(reward.max()),
+            "updates": state.updates,
+            "largest_sd": largest_sd,
+            "effective_particles": posterior.effective_size,
+            "best_reward": float(pool.reward.max()),
         }
-        self.warn_if_wide(self.diagnostics["search"]["largest_sd"])
-        return result
+        self.check_width(largest_sd)
+        return posterior
 
 
 def reps_weights(reward: FloatArray, log_base: FloatArray, temperature: float) -> FloatArray:
@@ -169,9 +178,16 @@ def reps_weights(reward: FloatArray, log_base: FloatArray, temperature: float) -
 
 
 def reps_temperature(reward: FloatArray, log_base: FloatArray, epsilon: float) -> float:
-    """The eta > 0 that minimises the dual; where no eta reaches a KL of epsilon, as small a one as tells the draws apart.
+    """The eta that minimises the dual.
 
-    Draws of reward -inf are left out of the base: they can have no weight at any temperature."""
+    Args:
+        reward: (n,); draws of -inf are left out of the base, since they can have no weight at any temperature.
+        log_base: log weights (n,) of the draws under the last Gaussian, normalised.
+        epsilon: bound on the KL, in nats.
+
+    Returns:
+        eta > 0; where none reaches a KL of epsilon, as small a one as tells the draws apart.
+    """
     good = np.isfinite(reward)
     reward, log_base = reward[good], log_base[good] - logsumexp(log_base[good])
     spread = reward.max() - reward.min()
@@ -188,54 +204,61 @@ def reps_temperature(reward: FloatArray, log_base: FloatArray, epsilon: float) -
     return float(spread * np.exp(brentq(slope, low, high, xtol=1e-10)))
 
 
-def fitted(
+def updated_gaussian(
     theta: FloatArray,
     weights: FloatArray,
     base: FloatArray,
     mean: FloatArray,
     covariance: FloatArray,
-    epsilon: float,
-    damping: float = 1.0,
-    least_factor: float = 0.25,
+    options: SimOptOptions,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (N,) and covariance (N, N) after what ``weights`` (n,) of theta (n, N) change against the ``base`` weights (n,),
-    which are the last Gaussian's; within a KL of epsilon from it."""
+    """The Gaussian moved by what the weights change against the base.
+
+    Args:
+        theta: draws (n, N).
+        weights: (n,), wanted, summing to one.
+        base: weights (n,) that make the draws those of the last Gaussian.
+        mean: of the last Gaussian (N,).
+        covariance: of the last Gaussian (N, N).
+        options: ``epsilon``, ``damping`` and ``least_factor`` of them.
+
+    Returns:
+        Mean (N,), in the cube, and covariance (N, N), within a KL of epsilon from the last ones.
+    """
     n = len(mean)
     factor = np.linalg.cholesky(covariance)
     white = solve_triangular(factor, (theta - mean).T, lower=True).T
     shift = (weights - base) @ white
     change = white.T @ ((weights - base)[:, None] * white)
     effective = 1 / (weights**2).sum()
-    values, vectors = np.linalg.eigh(effective / (damping * (n + 1) + effective) * change)
-    scaled = (vectors * np.clip(1 + values, least_factor, 1 / least_factor)) @ vectors.T
+    values, vectors = np.linalg.eigh(effective / (options.damping * (n + 1) + effective) * change)
+    scaled = (vectors * np.clip(1 + values, options.least_factor, 1 / options.least_factor)) @ vectors.T
     new_mean = np.clip(mean + factor @ shift, 0.0, 1.0)
     new = factor @ scaled @ factor.T
-    new = (new + new.T) / 2 + _LEAST_VARIANCE * np.eye(n)
+    new = (new + new.T) / 2 + LEAST_VARIANCE * np.eye(n)
 
     def between(t: float) -> tuple[FloatArray, FloatArray]:
         return mean + t * (new_mean - mean), covariance + t * (new - covariance)
 
     def excess(t: float) -> float:
-        return gaussian_kl(*between(t), mean, covariance) - epsilon
+        return gaussian_kl(*between(t), mean, covariance) - options.epsilon
 
     if excess(1.0) <= 0:
         return between(1.0)
     return between(0.999 * brentq(excess, 0.0, 1.0, xtol=1e-6))
 
 
-def _log_base(state: State) -> FloatArray:
+def _log_base(state: SimOptState) -> FloatArray:
     """Normalised log weights (n,) of the pool under the present Gaussian against the mixture that it was drawn from."""
-    theta, draw = state["pool_theta"], state["pool_draw"]
-    sources = np.unique(draw)
+    theta, draw = state.pool.theta, state.pool.draw
     # draw number d came from the Gaussian after d - 1 updates
     each = [
-        log_normal(theta, state["means"][d - 1], state["covariances"][d - 1]) + np.log((draw == d).sum())
-        for d in sources
+        log_normal(theta, state.means[d - 1], state.covariances[d - 1]) + np.log((draw == d).sum())
+        for d in np.unique(draw)
     ]
-    last = len(state["means"]) - 1
-    score = log_normal(theta, state["means"][last], state["covariances"][last]) - logsumexp(each, axis=0)
-    out: FloatArray = score - logsumexp(score)
-    return out
+    score = log_normal(theta, state.means[-1], state.covariances[-1]) - logsumexp(each, axis=0)
+    log_base: FloatArray = score - logsumexp(score)
+    return log_base
 
 
 def _relative_entropy(weights: FloatArray, log_base: FloatArray) -> float:

@@ -55,11 +55,11 @@ def test_gradients_of_a_quadratic() -> None:
     rng = np.random.default_rng(2)
     theta, particles = rng.uniform(size=(200, 3)), rng.uniform(0.2, 0.8, size=(10, 3))
     target = np.array([0.9, 0.1, 0.5])
-    found = policy_gradients(particles, theta, -((theta - target) ** 2).sum(1))
+    found = policy_gradients(particles, theta, -((theta - target) ** 2).sum(1), 0.1)
     true = -2 * (particles - target)
     cosine = (found * true).sum(1) / np.linalg.norm(found, axis=1) / np.linalg.norm(true, axis=1)
     assert cosine.min() > 0.9, cosine
-    assert not policy_gradients(particles, theta, np.zeros(200)).any()
+    assert not policy_gradients(particles, theta, np.zeros(200), 0.1).any()
 
 
 def test_ranks() -> None:
@@ -80,10 +80,10 @@ def test_paths_are_kept_and_the_first_is_the_prior() -> None:
     simulator, trajectory, _ = problem()
     fit = ADR(simulator, budget=55, seed=0)
     posterior = fit.fit(trajectory)
-    assert fit.state["paths"].shape == (7, 10, 2)
-    np.testing.assert_array_equal(fit.state["paths"][-1], posterior.theta.numpy())
+    assert fit.state.paths.shape == (7, 10, 2)
+    np.testing.assert_array_equal(fit.state.paths[-1], posterior.theta.numpy())
     np.testing.assert_allclose(posterior.weights.numpy(), 0.1)
-    assert fit.state["paths"][0].std(0).min() > 0.15
+    assert fit.state.paths[0].std(0).min() > 0.15
 
 
 def test_contract() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.search.cem import CEM, elite_moments
+from sipe_bayes.inference.search.cem import CEM, CEMState, elite_moments
 from tests.problems.searches import (
     check_contract,
     check_divergence,
@@ -25,15 +26,16 @@ def test_the_minimum_of_a_quadratic(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, trajectory, _ = problem()
     target, curvature = np.array([0.85, 0.2]), np.array([[1.0, 0.9], [0.9, 1.0]]) + 0.02 * np.eye(2)
 
-    def evaluated(self: CEM, state: dict[str, Any], theta: np.ndarray, trajectories: Any, most: int) -> dict[str, Any]:
+    def evaluated(self: CEM, state: CEMState, theta: np.ndarray, trajectories: Any, most: int) -> CEMState:
         self.windows(trajectories).rollouts += len(theta)
         reward = -np.einsum("bi,ij,bj->b", theta - target, curvature, theta - target)
-        pool = {
-            "pool_theta": np.concatenate([state["pool_theta"], theta]),
-            "pool_reward": np.concatenate([state["pool_reward"], reward]),
-            "pool_draw": np.concatenate([state["pool_draw"], np.full(len(theta), state["draws"])]),
-        }
-        return {**state, **pool, "draws": state["draws"] + 1, "simulated": state["simulated"] + len(theta)}
+        pool = replace(
+            state.pool,
+            theta=np.concatenate([state.pool.theta, theta]),
+            reward=np.concatenate([state.pool.reward, reward]),
+            draw=np.concatenate([state.pool.draw, np.full(len(theta), state.draws)]),
+        )
+        return replace(state, pool=pool, draws=state.draws + 1, simulated=state.simulated + len(theta))
 
     monkeypatch.setattr(CEM, "evaluated", evaluated)
     for seed in range(3):

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.search.gaussian_search import draw_in_cube, gaussian_kl, log_normal
-from sipe_bayes.inference.search.simopt import SimOpt, fitted, reps_temperature, reps_weights
+from sipe_bayes.inference.search.gaussians import draw_in_cube, gaussian_kl, log_normal
+from sipe_bayes.inference.search.simopt import SimOpt, SimOptOptions, reps_temperature, reps_weights, updated_gaussian
 from sipe_bayes.posterior import GaussianMixture
 from tests.problems.searches import (
     check_contract,
@@ -56,10 +56,12 @@ def test_the_new_gaussian_stays_within_the_bound_and_follows_the_reward() -> Non
     for epsilon in (0.05, 0.5):
         reward = theta[:, 0]
         weights = reps_weights(reward, np.log(base), reps_temperature(reward, np.log(base), epsilon))
-        new_mean, new_covariance = fitted(theta, weights, base, mean, covariance, epsilon)
+        new_mean, new_covariance = updated_gaussian(
+            theta, weights, base, mean, covariance, SimOptOptions(epsilon=epsilon)
+        )
         assert gaussian_kl(new_mean, new_covariance, mean, covariance) <= epsilon * (1 + 1e-9)
         assert new_mean[0] > 0.55
-    unchanged = fitted(theta, base, base, mean, covariance, 0.5)
+    unchanged = updated_gaussian(theta, base, base, mean, covariance, SimOptOptions())
     np.testing.assert_allclose(unchanged[0], mean)
     np.testing.assert_allclose(unchanged[1], covariance, atol=1e-8)
 
@@ -71,11 +73,12 @@ def test_damping_slows_the_covariance_and_leaves_the_mean() -> None:
     theta, base = rng.multivariate_normal(mean, covariance, 60), np.full(60, 1 / 60)
     reward = -((theta[:, 0] - 0.5) ** 2)
     weights = reps_weights(reward, np.log(base), reps_temperature(reward, np.log(base), 1.0))
-    found = {d: fitted(theta, weights, base, mean, covariance, 10.0, d) for d in (0.0, 1.0, 1e6)}
+    options = {d: SimOptOptions(epsilon=10.0, damping=d) for d in (0.0, 1.0, 1e6)}
+    found = {d: updated_gaussian(theta, weights, base, mean, covariance, o) for d, o in options.items()}
     assert found[0.0][1][0, 0] < found[1.0][1][0, 0] < found[1e6][1][0, 0]
     np.testing.assert_allclose(found[1e6][1], covariance, rtol=1e-3, atol=1e-6)
     np.testing.assert_array_equal(found[0.0][0], found[1e6][0])
-    default = fitted(theta, weights, base, mean, covariance, 10.0)
+    default = updated_gaussian(theta, weights, base, mean, covariance, SimOptOptions(epsilon=10.0))
     np.testing.assert_array_equal(default[1], found[1.0][1])
 
 
@@ -83,10 +86,10 @@ def test_every_update_of_a_fit_respects_the_bound() -> None:
     simulator, trajectory, _ = problem()
     fit = SimOpt(simulator, budget=150, seed=0)
     fit.fit(trajectory)
-    means, covariances = fit.state["means"], fit.state["covariances"]
+    means, covariances = fit.state.means, fit.state.covariances
     moves = [gaussian_kl(means[k + 1], covariances[k + 1], means[k], covariances[k]) for k in range(len(means) - 1)]
     assert len(moves) == 25
-    assert max(moves) <= fit.epsilon * (1 + 1e-9)
+    assert max(moves) <= fit.options.epsilon * (1 + 1e-9)
     assert (means[0] <= 0.5).all()
     np.testing.assert_allclose(covariances[0], 0.2 * np.eye(2))
     assert isinstance(fit.proposal, GaussianMixture)
