@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
-from sipe_bayes.likelihood.marginal import marginal
 from sipe_bayes.likelihood.noise import Noise, whiten
+from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 

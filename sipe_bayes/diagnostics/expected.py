@@ -28,7 +28,8 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.identifiability import ridges
 from sipe_bayes.diagnostics.records import Ridge
 from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise, eliminate
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
@@ -94,8 +95,8 @@ def information(
     if not found.valid:
         return None
     normal = windows.moments(found).normal(noise)
-    arrow = eliminate(normal, windows.num_theta, windows.start_precision, windows.no_starts())
-    return _of_shared(arrow.precision, simulator.space)
+    solved = eliminate_starts(normal, windows.num_theta, windows.start_precision, windows.no_starts())
+    return _of_shared(solved.precision, simulator.space)
 
 
 def _of_shared(found: FloatArray, space: ParameterSpace) -> FloatArray:

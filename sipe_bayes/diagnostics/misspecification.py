@@ -34,7 +34,10 @@ from numpy.typing import NDArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
-from sipe_bayes.likelihood.noise import Arrow, Moments, Noise, Pulls, coefficients, eliminate, estimate_noise, whiten
+from sipe_bayes.likelihood.block_tridiagonal import Eliminated
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
 
 FloatArray = NDArray[np.float64]
@@ -142,7 +145,7 @@ class _Solved:
     information: FloatArray
     answer: FloatArray
     variance: FloatArray
-    arrow: Arrow
+    arrow: Eliminated
 
 
 class _Residuals:
@@ -231,8 +234,10 @@ class _Residuals:
             moments, self.noise, pulls, windows.fixed_sd, self.coloured, shortest, windows.trajectories.longest
         )
 
-    def _arrow(self, moments: Moments, noise: Noise) -> Arrow:
-        return eliminate(moments.normal(noise), self.count, self.windows.start_precision, self.windows.no_starts())
+    def _arrow(self, moments: Moments, noise: Noise) -> Eliminated:
+        return eliminate_starts(
+            moments.normal(noise), self.count, self.windows.start_precision, self.windows.no_starts()
+        )
 
     def solved(self, residual: FloatArray, moments: Moments, noise: Noise, pull: FloatArray | None = None) -> _Solved:
         """Cube roots of K score statistics, C sums of squared autocorrelations and C largest mean squares of a piece, with what
@@ -249,7 +254,7 @@ class _Residuals:
         usable = information > 1e-6 * np.diag(inner)[n:] + 2 * _FLAT_PRECISION
         information = np.where(usable, information, np.inf)
         base = np.concatenate([base, np.zeros(self.count - n)])
-        left = self._left(residual, base, arrow.starts(base))
+        left = self._left(residual, base, arrow.blocks(base))
         white = [self._white(left, c, noise) for c in range(len(noise.sd))]
         whiteness = [_autocorrelation(z) for z in white]
         pieces = [max((float((p**2).mean()) for p in np.array_split(z, _PIECES) if len(p)), default=0.0) for z in white]
@@ -270,7 +275,7 @@ class _Residuals:
         n, names = self.windows.num_theta, self.windows.simulator.space.names
         amplitude = seen.score[probe] / seen.information[probe]
         step = seen.step + amplitude * np.concatenate([-seen.answer[:, probe], np.eye(len(self.probes))[probe]])
-        explained = self._left(self.residual, step, seen.arrow.starts(step))
+        explained = self._left(self.residual, step, seen.arrow.blocks(step))
         gains = [
             self._white(seen.left, c, self.noise) ** 2 - self._white(explained, c, self.noise) ** 2
             for c in range(len(self.noise.sd))

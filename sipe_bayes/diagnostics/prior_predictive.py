@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sipe_bayes.diagnostics.misspecification import LEVEL
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 

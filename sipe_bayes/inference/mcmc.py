@@ -31,7 +31,7 @@ from sipe_bayes.inference.laplace.chain_state import process_diagnostics
 from sipe_bayes.inference.laplace.estimator import UNSETTLED, Laplace
 from sipe_bayes.inference.laplace.optima import distinct_modes
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Particles
 

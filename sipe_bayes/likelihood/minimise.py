@@ -1,4 +1,4 @@
-"""Minimising a smooth loss within bounds."""
+"""Minimising within bounds: a quadratic, a damped one in the unit cube, a smooth loss."""
 
 from __future__ import annotations
 
@@ -6,35 +6,80 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sipe_bayes.core.arrays import FloatArray
 
-_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-3, 100, 2.0  # nats, steps, of a coordinate
+_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-3, 100, 2.0  # nats, steps, of a coordinate: the losses are in nats of logarithms
+_RIDGE = 1e-12  # of the mean diagonal: parameters that change nothing leave a zero there
+
+
+def box_quadratic(hessian: FloatArray, slope: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray | None:
+    """Minimiser of a quadratic within a box, by MuJoCo's mju_boxQP.
+
+    Args:
+        hessian: (N, N), positive definite.
+        slope: (N,) at zero.
+        low: (N,) lower bounds.
+        high: (N,) upper bounds.
+
+    Returns:
+        (N,), or None where rounding leaves the Hessian not positive definite.
+    """
+    n = len(slope)
+    minimum, factor, index = np.zeros(n), np.zeros((n, n + 7)), np.zeros(n, np.int32)
+    rank = mujoco.mju_boxQP(minimum, factor, index, hessian, slope, low, high)
+    return minimum if rank >= 0 else None
+
+
+def damped_box_step(hessian: FloatArray, gradient: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
+    """Step within the unit cube that maximises a damped quadratic model.
+
+    Args:
+        hessian: (N, N) precision.
+        gradient: (N,) pull on theta.
+        theta: (N,) where the model was made.
+        damping: Levenberg and Marquardt's, relative.
+
+    Returns:
+        (N,), zero where rounding leaves no positive definite model.
+    """
+    n = len(theta)
+    damped = hessian + damping * np.diag(np.diag(hessian)) + _RIDGE * np.trace(hessian) / n * np.eye(n)
+    step = box_quadratic(damped, -gradient, -theta, 1 - theta)
+    return np.zeros(n) if step is None else step
 
 
 def minimise(
     loss: Callable[[FloatArray], tuple[float, FloatArray]], x: FloatArray, bounds: FloatArray, curvature: FloatArray
 ) -> FloatArray:
-    """Minimiser within bounds (2, n) of a smooth loss in nats, by BFGS steps from a first diagonal ``curvature`` (n,).
+    """Minimiser within bounds of a smooth loss, by BFGS steps.
 
-    SciPy's L-BFGS-B stops early on these losses and its steps cost more than they do."""
+    SciPy's L-BFGS-B stops early on these losses and its steps cost more than they do.
+
+    Args:
+        loss: value in nats and slope (N,) at a point (N,).
+        x: (N,) where to begin.
+        bounds: (2, N).
+        curvature: (N,), a first diagonal Hessian.
+    """
     hessian = np.diag(np.maximum(curvature, 1.0))
     value, slope = loss(x)
     for _ in range(_MOST_STEPS):
         low, high = np.maximum(bounds[0] - x, -_LONGEST_STEP), np.minimum(bounds[1] - x, _LONGEST_STEP)
-        move, factor, index = np.zeros(len(x)), np.zeros((len(x), len(x) + 7)), np.zeros(len(x), np.int32)
-        if mujoco.mju_boxQP(move, factor, index, hessian, slope, low, high) < 0:
+        move = box_quadratic(hessian, slope, low, high)
+        if move is None:
             return x
         expected = -float(slope @ move + 0.5 * move @ hessian @ move)
         if expected < _GAIN:
             return x
+        # shorter until it gains
         trial, steeper = loss(x + move)
         while value - trial < 1e-4 * expected and np.abs(move).max() > 1e-9:
             move = 0.3 * move
             trial, steeper = loss(x + move)
         if trial >= value:
             return x
+        # the Hessian learns what the slope has changed by
         bend, along = steeper - slope, hessian @ move
         if bend @ move < 0.1 * (move @ along):  # Powell's damping keeps the Hessian positive
             mix = 0.9 * (move @ along) / (move @ along - bend @ move)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.likelihood.noise import Moments, Noise, Pulls, coefficients, restricted, restricted_slopes
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, coefficients
+from sipe_bayes.likelihood.restricted import Pulls, restricted, restricted_slopes
 from sipe_bayes.likelihood.sequences import Sequence
 
 FloatArray = NDArray[np.float64]

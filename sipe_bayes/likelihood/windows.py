@@ -25,7 +25,8 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.likelihood.noise import Moments, Noise, chosen_sd, whiten
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, chosen_sd, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.simulation.callable_simulator import CallableSimulator

@@ -10,14 +10,13 @@ import pytest
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.laplace.loose_jumps import rarity, tightening
 from sipe_bayes.inference.laplace.smoother import border
-from sipe_bayes.likelihood.block_tridiagonal import (
+from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
     ChainNoise,
-    eliminate,
+    eliminate_states,
     energy,
     expected_squares,
     jump_normal,
-    neighbours,
     restricted,
 )
 
@@ -25,7 +24,7 @@ FLAT = QuadraticPrior(np.full(2, 0.5), np.zeros((2, 2)))
 
 
 def random_chain(
-    rng: np.random.Generator, some_loose: bool = False, bent: bool = False
+    rng: np.random.Generator, some_outliers: bool = False, bent: bool = False
 ) -> tuple[ChainLinearisation, ChainNoise]:
     """Two logs of 4 and 3 states with 3 coordinates, 2 channels, 2 parameters; two of the jumps may be loose, and each have an error."""
     k, d, c, n = 7, 3, 2, 2
@@ -47,32 +46,32 @@ def random_chain(
         error=np.zeros((k - 1, d)),
     )
     noise = ChainNoise(rng.uniform(0.3, 1, c), rng.uniform(0.3, 1, d))
-    if some_loose:  # wider in two coordinates, in the third no wider than all
+    if some_outliers:  # wider in two coordinates, in the third no wider than all
         wide = np.array([2.2, 2.9, 0.1])
-        noise = replace(noise, wide=wide, loose=np.array([False, True, False, False, False, True]))
+        noise = replace(noise, wide=wide, outliers=np.array([False, True, False, False, False, True]))
     if bent:
         found = replace(found, error=rng.uniform(0, 1, (k - 1, d)))
     return found, noise
 
 
 def test_tightening_is_the_difference_of_evidence() -> None:
-    """What `tightening` says of each loose jump against two restricted likelihoods and the price of one more loose jump."""
-    found, noise = random_chain(np.random.default_rng(8), some_loose=True)
+    """What `tightening` says of each outlying jump against two restricted likelihoods and the price of one more outlying jump."""
+    found, noise = random_chain(np.random.default_rng(8), some_outliers=True)
     theta, prior = np.full(2, 0.4), FLAT
     hold = border(prior, theta, np.zeros(2))
     gains = tightening(found, noise, prior, theta)
-    assert noise.loose is not None
-    for gain, at in zip(gains, np.flatnonzero(noise.loose), strict=True):
-        tighter = replace(noise, loose=noise.loose & (np.arange(6) != at))
+    assert noise.outliers is not None
+    for gain, at in zip(gains, np.flatnonzero(noise.outliers), strict=True):
+        tighter = replace(noise, outliers=noise.outliers & (np.arange(6) != at))
         values = [restricted(found, one, hold)[0] - rarity(one) for one in (tighter, noise)]
         assert gain == pytest.approx(values[0] - values[1], abs=1e-9)
         print(gain)
 
 
-@pytest.mark.parametrize(("some_loose", "bent"), [(False, False), (True, False), (False, True), (True, True)])
-def test_the_chain_is_the_dense_least_squares(some_loose: bool, bent: bool) -> None:
+@pytest.mark.parametrize(("some_outliers", "bent"), [(False, False), (True, False), (False, True), (True, True)])
+def test_the_chain_is_the_dense_least_squares(some_outliers: bool, bent: bool) -> None:
     """Eliminated equations, covariances and the likelihood's gradient against one dense matrix of all rows."""
-    found, noise = random_chain(np.random.default_rng(2), some_loose, bent)
+    found, noise = random_chain(np.random.default_rng(2), some_outliers, bent)
     jump_sd = np.sqrt(np.broadcast_to(noise.jump_sd, found.jump.shape) ** 2 + found.error)
     (k, c, d), n = found.measurement.shape, found.measurement_theta.shape[2]
     rows, right = [], []
@@ -99,7 +98,7 @@ def test_the_chain_is_the_dense_least_squares(some_loose: bool, bent: bool) -> N
     normal, force = design.T @ design, design.T @ target
     states = k * d
     inverse = np.linalg.inv(normal[:states, :states])
-    solved = eliminate(found, noise)
+    solved = eliminate_states(found, noise)
     schur = normal[states:, states:] - normal[states:, :states] @ inverse @ normal[:states, states:]
     np.testing.assert_allclose(solved.precision, schur, rtol=1e-9)
     np.testing.assert_allclose(
@@ -107,9 +106,9 @@ def test_the_chain_is_the_dense_least_squares(some_loose: bool, bent: bool) -> N
     )
     assert solved.log_determinant == pytest.approx(np.linalg.slogdet(normal[:states, :states])[1])
     best = np.linalg.solve(normal, force)
-    np.testing.assert_allclose(solved.states(best[states:]).ravel(), best[:states], rtol=1e-8)
+    np.testing.assert_allclose(solved.blocks(best[states:]).ravel(), best[:states], rtol=1e-8)
     blocks = inverse.reshape(k, d, k, d)
-    own, cross = neighbours(solved.factor, d)
+    own, cross = solved.covariances()
     np.testing.assert_allclose(own, [blocks[i, :, i] for i in range(k)], rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(cross, [blocks[i + 1, :, i] for i in range(k - 1)], rtol=1e-8, atol=1e-12)
     covariance = np.linalg.inv(normal)
@@ -133,13 +132,13 @@ def test_the_chain_is_the_dense_least_squares(some_loose: bool, bent: bool) -> N
 
 
 @pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize(("some_loose", "bent"), [(False, False), (True, False), (False, True), (True, True)])
-def test_fishers_gradient_of_the_noise(some_loose: bool, bent: bool, held: bool) -> None:
+@pytest.mark.parametrize(("some_outliers", "bent"), [(False, False), (True, False), (False, True), (True, True)])
+def test_fishers_gradient_of_the_noise(some_outliers: bool, bent: bool, held: bool) -> None:
     """Against central differences of the restricted likelihood, which held back lacks just what the best step would gain."""
-    found, noise = random_chain(np.random.default_rng(3), some_loose, bent)
+    found, noise = random_chain(np.random.default_rng(3), some_outliers, bent)
     hold = border(FLAT, np.full(2, 0.4), np.zeros(2))
     value, by_sd, by_process = restricted(found, noise, hold, held)
-    solved = eliminate(found, noise)
+    solved = eliminate_states(found, noise)
     step, _, _ = hold.solve(solved)
     promised = 0.5 * (solved.explained + step @ (solved.gradient + hold.pull))
     assert promised > 1

@@ -13,17 +13,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sipe_bayes.likelihood.marginal import marginal
-from sipe_bayes.likelihood.noise import (
-    Moments,
-    Noise,
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
+from sipe_bayes.likelihood.restricted import (
     Pulls,
-    coefficients,
-    eliminate,
+    eliminate_starts,
     estimate_noise,
+    marginal,
     restricted,
     restricted_slopes,
-    whiten,
 )
 from sipe_bayes.likelihood.sequences import sequences
 
@@ -188,7 +186,7 @@ def test_elimination_is_the_schur_complement(name: str, noise: Noise, damping: f
     case = PROBLEMS[name]
     pull = np.random.default_rng(1).normal(size=(len(case.log), D))
     matrix, right, _, square = system(case, noise, PRECISION, pull, damping)
-    arrow = eliminate(case.moments().normal(noise), N, PRECISION, pull, damping)
+    arrow = eliminate_starts(case.moments().normal(noise), N, PRECISION, pull, damping)
     inner, border = matrix[N:, N:], matrix[N:, :N]
     close(arrow.precision, matrix[:N, :N] - border.T @ np.linalg.solve(inner, border))
     close(arrow.gradient, right[:N] - border.T @ np.linalg.solve(inner, right[N:]))
@@ -196,11 +194,11 @@ def test_elimination_is_the_schur_complement(name: str, noise: Noise, damping: f
     close(arrow.log_determinant, np.linalg.slogdet(inner)[1])
     close(arrow.square, square)
     step = np.array([0.3, -1.0, 0.2])
-    close(arrow.starts(step).ravel(), np.linalg.solve(inner, right[N:] - border @ step))
+    close(arrow.blocks(step).ravel(), np.linalg.solve(inner, right[N:] - border @ step))
     best = np.linalg.solve(matrix + 1e-3 * np.eye(len(matrix)) * (np.arange(len(matrix)) < N), right)
     found = np.linalg.solve(arrow.precision + 1e-3 * np.eye(N), arrow.gradient)
     close(found, best[:N])
-    close(arrow.starts(found).ravel(), best[N:])
+    close(arrow.blocks(found).ravel(), best[N:])
 
 
 @ALL
@@ -246,10 +244,10 @@ def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tu
     for white in (False,) if coloured else (False, True):
         moments = Moments(case.residual, case.jacobian[..., :N], N, case.sequences, white)
         assert moments.windows == 1
-        arrow = eliminate(moments.normal(noise), N, np.zeros(0), none)
+        arrow = eliminate_starts(moments.normal(noise), N, np.zeros(0), none)
         close(arrow.precision, jacobian.T @ np.linalg.solve(covariance, jacobian))
         close(arrow.gradient, jacobian.T @ np.linalg.solve(covariance, residual))
-        assert (arrow.starts(np.ones(N)).shape, arrow.start_slope.shape) == (none.shape, (*none.shape, N))
+        assert (arrow.blocks(np.ones(N)).shape, arrow.slope.shape) == (none.shape, (*none.shape, N))
         value, by_sd, by_tau = restricted_slopes(moments, noise, pulls)
         close([value, restricted(moments, noise, pulls)], expected(noise))
         h = 1e-6

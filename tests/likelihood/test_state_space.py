@@ -22,13 +22,13 @@ from sipe_bayes.inference.laplace.smoother import Point, descend, first_noise, i
 from sipe_bayes.inference.laplace.state_space_target import ChainTarget, at_optimum
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.block_tridiagonal import (
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.state_space.chain import KNOWN_SD, Chain
+from sipe_bayes.likelihood.state_space.linearisation import (
     ChainNoise,
-    eliminate,
+    eliminate_states,
     log_likelihood,
 )
-from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.likelihood.state_space import KNOWN_SD, Chain
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import log as pendulum_log
 from tests.problems.pendulums import pendulum
@@ -50,7 +50,7 @@ def test_the_marginal_likelihood_is_the_kalman_filters(theta: float) -> None:
     for states in (chain.reference, away):
         found = chain.linearise(np.array([theta]), states)
         assert found is not None
-        value = log_likelihood(found, noise, eliminate(found, noise))
+        value = log_likelihood(found, noise, eliminate_states(found, noise))
         assert value == pytest.approx(kalman(logs, firsts, LOW + theta * (HIGH - LOW)), abs=1e-6)
 
 
@@ -64,7 +64,7 @@ def test_a_recorded_start_is_believed_and_the_other_states_are_not() -> None:
     np.testing.assert_array_equal(chain.reference[~chain.first], measured[~chain.first])
     found = chain.linearise(np.array([0.35]), chain.reference)
     assert found is not None
-    value = log_likelihood(found, MADE_WITH, eliminate(found, MADE_WITH))
+    value = log_likelihood(found, MADE_WITH, eliminate_states(found, MADE_WITH))
     assert value == pytest.approx(
         kalman(logs, np.array([[0.3, 0.0]] * 2), LOW + 0.35 * (HIGH - LOW), start_sd=KNOWN_SD), abs=1e-6
     )
@@ -142,12 +142,12 @@ def test_noise_that_rounding_cannot_bear_is_raised() -> None:
     assert sound(found, fair) is fair
     never = ChainNoise(np.array([0.01]), np.full(4, 1e-14))
     with pytest.raises(np.linalg.LinAlgError):
-        eliminate(found, never)
+        eliminate_states(found, never)
     raised = sound(found, never)
     assert raised.sd is never.sd
     assert (raised.process > never.process).all()
     with pytest.raises(np.linalg.LinAlgError):
-        eliminate(found, ChainNoise(raised.sd, raised.process / 3))
+        eliminate_states(found, ChainNoise(raised.sd, raised.process / 3))
 
 
 def _flat(n: int):  # type: ignore[no-untyped-def]
@@ -237,7 +237,7 @@ def test_the_target_with_fresh_jacobians_is_the_kalman_filter(lengths: float) ->
     noise, theta = MADE_WITH, np.array([0.35])
     found = chain.linearise(theta, chain.reference)
     assert found is not None
-    solved = eliminate(found, noise)
+    solved = eliminate_states(found, noise)
     states = chain.moved(chain.reference, solved.states(np.zeros(1)))
     mode = {"theta": theta, "states": states, "slope": solved.slope, "sd": noise.sd, "tau": np.zeros(len(noise.sd))}
     mode |= {"process": noise.process, "movement": PROCESS, "loose": np.zeros(len(chain.linked), bool)}

@@ -7,7 +7,7 @@ import numpy as np
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.likelihood.block_tridiagonal import ChainNoise
+from sipe_bayes.likelihood.state_space.linearisation import ChainNoise
 from sipe_bayes.likelihood.windows import START_SD
 from sipe_bayes.simulation.simulator import Simulator
 

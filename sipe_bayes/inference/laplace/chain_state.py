@@ -12,8 +12,8 @@ from sipe_bayes.core.checkpoint import State
 from sipe_bayes.inference.laplace.loose_jumps import rarity
 from sipe_bayes.inference.laplace.optima import Search
 from sipe_bayes.inference.laplace.smoother import border, penalty, process_penalty, scale
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation, ChainNoise, eliminate, restricted
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -91,7 +91,7 @@ def evidence_of(search: Search, state: State, found: ChainLinearisation, noise: 
     """log p(noise | y), states and theta integrated out, up to a constant; unless ``settled`` without what the next step would
     gain, were the model linear."""
     theta, prior = state["theta"], search.quadratic_prior
-    hold = border(prior, theta, eliminate(found, noise).gradient)
+    hold = border(prior, theta, eliminate_states(found, noise).gradient)
     value = restricted(found, noise, hold, held=not settled)[0]
     return value - penalty(prior, theta) - rarity(noise) - process_penalty(noise, state["movement"])
 
@@ -107,7 +107,7 @@ def recorded(
 ) -> State:
     """The optimum at its linearisation, in place of this starting point's earlier one: the normal about the best step from here, and where
     no step has been tried yet, also as wide as that step is long."""
-    theta, solved = state["theta"], eliminate(found, noise)
+    theta, solved = state["theta"], eliminate_states(found, noise)
     mean, covariance = search.normal(theta, solved.precision, solved.gradient)
     if untried:
         covariance = covariance + np.outer(mean - theta, mean - theta)

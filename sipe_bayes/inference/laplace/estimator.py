@@ -48,7 +48,7 @@ from sipe_bayes.inference.laplace.optima import distinct_modes
 from sipe_bayes.inference.laplace.poll import SHORTEST
 from sipe_bayes.inference.laplace.window_target import WindowTarget, at_optimum
 from sipe_bayes.likelihood.settings import BudgetTooSmall
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
 

@@ -25,7 +25,7 @@ from sipe_bayes.inference.laplace.optima import Search, distinct_modes
 from sipe_bayes.inference.laplace.smoother import roughness
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 
 FloatArray = NDArray[np.float64]

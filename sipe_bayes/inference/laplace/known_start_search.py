@@ -24,9 +24,9 @@ from sipe_bayes.inference.laplace.growing_horizon import grown
 from sipe_bayes.inference.laplace.optima import Search
 from sipe_bayes.inference.laplace.posterior_linearisation import linearise
 from sipe_bayes.inference.laplace.smoother import Point, border, descend, first_noise, infer_noise, quietest, sound
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation, ChainNoise, eliminate, neighbours, restricted
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
 
 FloatArray = NDArray[np.float64]
 
@@ -98,12 +98,12 @@ def _estimated(
 ) -> tuple[ChainNoise, State, bool]:
     """The noise estimated anew, the state with it and with what is worth recording, and whether the search ends."""
     theta, prior, movement = state["theta"], search.quadratic_prior, state["movement"]
-    hold = border(prior, theta, eliminate(found, noise).gradient)
+    hold = border(prior, theta, eliminate_states(found, noise).gradient)
     promised = restricted(found, noise, hold)[0] - restricted(found, noise, hold, held=True)[0]
     better, gain = infer_noise(chain, found, noise, prior, theta, movement, held=promised > _TOLERANCE)
     better = sound(found, better)
     away = theta - state["round_theta"]
-    moved = float(away @ eliminate(found, better).precision @ away) / len(theta)
+    moved = float(away @ eliminate_states(found, better).precision @ away) / len(theta)
     enough = max(_SETTLED, _ROUGH * float(found.observed.sum()))
     settled = bool(state["round"] > 0 and gain < enough and moved < _STILL)
     best = state["mode_evidence"][state["mode_point"] == state["point"]].max(initial=-np.inf)
@@ -116,8 +116,8 @@ def _estimated(
 
 def _steps(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
     """How long the next differences are, by theta (N,) and by the states (K, D)."""
-    solved = eliminate(found, noise)
-    spread = np.einsum("kdd->kd", neighbours(solved.factor, found.jump.shape[1])[0])
+    solved = eliminate_states(found, noise)
+    spread = np.einsum("kdd->kd", solved.covariances()[0])
     _, covariance = search.normal(state["theta"], solved.precision, solved.gradient)
     longest = np.maximum(_STATE_STEP[1] * state["movement"], _STATE_STEP[0])
     return {

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.likelihood.noise import Moments, Noise, eliminate
+from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
@@ -96,14 +98,14 @@ def step(
     pull = -windows.start_precision * fit.starts
     damping, refused = fit.damping, 0.0
     while damping <= _DAMPING_MAX:
-        arrow = eliminate(normal, moments.num_theta, windows.start_precision, pull, damping)
-        hessian = arrow.precision + prior.precision
-        gradient = arrow.gradient + prior.pull(fit.theta)
-        move = box_step(hessian, gradient, fit.theta, damping)
-        expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * arrow.explained
+        solved = eliminate_starts(normal, moments.num_theta, windows.start_precision, pull, damping)
+        hessian = solved.precision + prior.precision
+        gradient = solved.gradient + prior.pull(fit.theta)
+        move = damped_box_step(hessian, gradient, fit.theta, damping)
+        expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * solved.explained
         if expected < tolerance:
             return replace(fit, converged=True)
-        theta, starts = np.clip(fit.theta + move, 0.0, 1.0), fit.starts + arrow.starts(move)
+        theta, starts = np.clip(fit.theta + move, 0.0, 1.0), fit.starts + solved.blocks(move)
         residual, valid = windows.residuals(theta[None], starts[None])
         value = energy_of(windows, noise, prior, theta, starts, residual[0]) if valid[0] else np.inf
         gained = fit.energy - value
@@ -114,12 +116,3 @@ def step(
             return replace(fit, expected=np.inf)
         damping, refused = damping * _DAMPING_UP, max(refused, expected)
     return replace(fit, converged=True, refused=refused)
-
-
-def box_step(hessian: FloatArray, gradient: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
-    """Minimiser of the damped quadratic model within the unit cube."""
-    n = len(theta)
-    damped = hessian + damping * np.diag(np.diag(hessian)) + 1e-12 * np.trace(hessian) / n * np.eye(n)
-    result, factor, index = np.zeros(n), np.zeros((n, n + 7)), np.zeros(n, np.int32)
-    rank = mujoco.mju_boxQP(result, factor, index, damped, -gradient, -theta, 1 - theta)
-    return result if rank >= 0 else np.zeros(n)

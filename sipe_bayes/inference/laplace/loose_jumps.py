@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.laplace.smoother import border, sound
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation, ChainNoise, eliminate, jump_normal
+from sipe_bayes.likelihood.state_space.linearisation import (
+    ChainLinearisation,
+    ChainNoise,
+    eliminate_states,
+    jump_normal,
+)
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,14 +43,14 @@ def outstanding(found: ChainLinearisation, noise: ChainNoise) -> BoolArray:
 
 def rarity(noise: ChainNoise) -> float:
     """Nats that loose jumps cost because they are rare."""
-    return 0.0 if noise.loose is None else -float(noise.loose.sum()) * np.log(_MOST)
+    return 0.0 if noise.outliers is None else -float(noise.outliers.sum()) * np.log(_MOST)
 
 
 def needed(found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray) -> BoolArray:
     """Of the loose jumps (K-1,) those that have to be: the others are made tight one by one, first the one that gains most."""
-    loose = np.zeros(len(found.linked), bool) if noise.loose is None else noise.loose.copy()
+    loose = np.zeros(len(found.linked), bool) if noise.outliers is None else noise.outliers.copy()
     while loose.any():
-        gains = tightening(found, sound(found, replace(noise, loose=loose)), prior, theta)
+        gains = tightening(found, sound(found, replace(noise, outliers=loose)), prior, theta)
         best = int(gains.argmax())
         if gains[best] <= 0:
             break
@@ -57,12 +62,12 @@ def tightening(found: ChainLinearisation, noise: ChainNoise, prior: QuadraticPri
     """Nats of evidence (J,) that each of the J loose jumps gains when made tight, exact for one linearisation: the
     Savage-Dickey ratio of what all else says of it (J. M. Dickey, "The weighted likelihood ratio, linear hypotheses on normal
     location parameters", 1971, https://doi.org/10.1214/aoms/1177693507)."""
-    assert noise.loose is not None
-    tight, loose = noise.process, noise.loose_sd
+    assert noise.outliers is not None
+    tight, loose = noise.process, noise.outlier_sd
     wider = loose > tight  # elsewhere a loose jump is none
-    solved = eliminate(found, noise)
+    solved = eliminate_states(found, noise)
     step, covariance, _ = border(prior, theta, solved.gradient).solve(solved)
-    mean, spread = jump_normal(found, solved, step, covariance, np.flatnonzero(noise.loose))
+    mean, spread = jump_normal(found, solved, step, covariance, np.flatnonzero(noise.outliers))
     mean, spread = mean[:, wider], spread[:, wider][:, :, wider]
     ratio = (
         tight[wider] * loose[wider] / np.sqrt(loose[wider] ** 2 - tight[wider] ** 2)

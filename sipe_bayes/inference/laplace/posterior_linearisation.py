@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation
 
 FloatArray = NDArray[np.float64]
 

@@ -35,17 +35,17 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior, box_step
-from sipe_bayes.likelihood.block_tridiagonal import (
-    Border,
+from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior
+from sipe_bayes.likelihood.block_tridiagonal import Border
+from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
     ChainNoise,
-    eliminate,
+    eliminate_states,
     energy,
-    neighbours,
     restricted,
 )
-from sipe_bayes.likelihood.state_space import Chain
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -96,17 +96,17 @@ def descend(
     hold = border(prior, here.theta, np.zeros_like(here.theta))
     while damping <= _DAMPING_MAX:
         try:
-            solved = eliminate(found, noise, damping)
+            solved = eliminate_states(found, noise, damping)
         except np.linalg.LinAlgError:
             damping = max(damping, 1e-4) * _DAMPING_UP
             continue
         hessian, gradient = solved.precision + hold.precision, solved.gradient + hold.pull
-        move = box_step(hessian, gradient, here.theta, damping)
+        move = damped_box_step(hessian, gradient, here.theta, damping)
         expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * solved.explained
         if expected < tolerance:
             return replace(here, energy=value), True
         theta = np.clip(here.theta + move, 0.0, 1.0)
-        states = chain.moved(here.states, solved.states(move))
+        states = chain.moved(here.states, solved.blocks(move))
         there = chain.compare(theta[None], states[None], found)[0]
         after = np.inf if there is None else energy(there, noise) + penalty(prior, theta)
         if after < value:
@@ -119,7 +119,7 @@ def sound(found: ChainLinearisation, noise: ChainNoise) -> ChainNoise:
     """The noise, its process noise raised as far as the normal equations need it to be solved in spite of rounding."""
     while True:
         try:
-            eliminate(found, noise)
+            eliminate_states(found, noise)
         except np.linalg.LinAlgError:
             noise = replace(noise, process=_LOUDER * noise.process)
         else:
@@ -144,7 +144,7 @@ def infer_noise(
     """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten, and the nats
     that it gains. movement (D,): scales of the process noises' priors. held: as in ``restricted``."""
     channels, fixed = len(noise.sd), chain.fixed_sd
-    hold = border(prior, theta, eliminate(found, noise).gradient)
+    hold = border(prior, theta, eliminate_states(found, noise).gradient)
     least_sd, least_process = chain.least
     least = np.log(np.concatenate([least_sd, np.maximum(least_process, _STIFFEST * movement)]))
     start = np.maximum(np.log(np.concatenate([noise.sd, noise.process])), least)
@@ -178,7 +178,7 @@ def regress(found: ChainLinearisation, prior: QuadraticPrior, theta: FloatArray)
     slopes, hold = found.transition_theta, border(prior, theta, np.zeros_like(theta))
     hessian = np.einsum("kdn,kd,kdm->nm", slopes, weights, slopes, optimize=True) + hold.precision
     gradient = np.einsum("kdn,kd->n", slopes, weights * found.jump) + hold.pull
-    return np.asarray(np.clip(theta + box_step(hessian, gradient, theta, 1e-6), 0.0, 1.0))
+    return np.asarray(np.clip(theta + damped_box_step(hessian, gradient, theta, 1e-6), 0.0, 1.0))
 
 
 def scale(found: ChainLinearisation) -> FloatArray:
@@ -207,7 +207,7 @@ def quietest(
 
     def value(one: ChainNoise) -> float:
         try:
-            return restricted(found, one, border(prior, theta, eliminate(found, one).gradient))[0]
+            return restricted(found, one, border(prior, theta, eliminate_states(found, one).gradient))[0]
         except np.linalg.LinAlgError:
             return -np.inf
 
@@ -237,7 +237,7 @@ def filtered(
     Measurements are linear about ``states``, where ``found`` was taken; each control step is linearised where the filter
     stands."""
     size, timed = chain.num_start, ~chain.late
-    covariance = neighbours(eliminate(found, noise).factor, size)[0][chain.first] * _WIDER
+    covariance = eliminate_states(found, noise).covariances()[0][chain.first] * _WIDER
     at, out = np.flatnonzero(chain.first), states.copy()
     here, thetas = states[at], np.tile(theta, (1 + size, 1))
     steps = np.concatenate([np.zeros((1, size)), _FILTER_STEP * np.eye(size)])

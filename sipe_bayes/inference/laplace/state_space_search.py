@@ -32,9 +32,9 @@ from sipe_bayes.inference.laplace.smoother import (
     regress,
     sound,
 )
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation, ChainNoise
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -165,7 +165,7 @@ def _ended(
     loose = needed(found, noise, search.quadratic_prior, state["theta"])
     if not np.array_equal(loose, state["loose"]):
         state = {**state, "loose": loose, "refused": state["refused"] | (state["loose"] & ~loose)}
-        noise = replace(noise, loose=loose)
+        noise = replace(noise, outliers=loose)
         likelier = loose.any() or evidence_of(search, state, found, noise, True) > before + _SETTLED
         if likelier and state["round"] < _ROUNDS:
             return {**state, "inner": 0, "due": False}
@@ -194,7 +194,7 @@ def _closed(
     search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
 ) -> tuple[Point, float] | None:
     """Where the filter leads with no jump loose, and the evidence there; None where the budget ends or it diverges."""
-    tight, prior = sound(found, replace(noise, loose=np.zeros_like(state["loose"]))), search.quadratic_prior
+    tight, prior = sound(found, replace(noise, outliers=np.zeros_like(state["loose"]))), search.quadratic_prior
     try:
         there = _refiltered(chain, found, tight, prior, state["theta"], state["states"])
         taken = None if there is None else chain.linearise(there.theta, there.states)

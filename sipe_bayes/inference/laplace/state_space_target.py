@@ -11,14 +11,19 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import numpy as np
-import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
 from sipe_bayes.inference.laplace.posterior_linearisation import linearise
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation, ChainNoise, eliminate, log_likelihood, pull
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.linearisation import (
+    ChainLinearisation,
+    ChainNoise,
+    eliminate_states,
+    log_likelihood,
+    pull,
+)
 from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]
@@ -52,7 +57,7 @@ class ChainTarget:
         self.prior, self.chain, self.state = prior, chain, state
         self.fit = ChainLinearisation(**{f.name: state[f"fit_{f.name}"] for f in fields(ChainLinearisation)})
         self.sd = ChainNoise(state["fit_sd"], state["fit_process"], state["fit_movement"], state["fit_loose"])
-        self.solved = eliminate(self.fit, self.sd)
+        self.solved = eliminate_states(self.fit, self.sd)
 
     def states(self, theta: FloatArray) -> FloatArray:
         """States (B, K, S) that follow theta (B, N)."""
@@ -76,7 +81,7 @@ class ChainTarget:
     def _marginal(self, found: list[ChainLinearisation]) -> FloatArray:
         """log p(y | theta) of comparisons that share the optimum's Jacobians."""
         forces = np.stack([pull(one, self.sd).ravel() for one in found], axis=1)
-        moved = scipy.linalg.cho_solve_banded((self.solved.factor, True), forces, check_finite=False)
+        moved = self.solved.solve(forces)
         gains = (forces * moved).sum(0)
         solved = [replace(self.solved, explained=float(g)) for g in gains]
         return np.array([log_likelihood(one, self.sd, s) for one, s in zip(found, solved, strict=True)])
@@ -95,7 +100,7 @@ class ChainTarget:
             found = _linearised(self.chain, point, states, self.state["fit_theta_step"], self.state["fit_state_step"])
             if found is None:
                 return -np.inf
-            solved = eliminate(found, self.sd)
+            solved = eliminate_states(found, self.sd)
             value = log_likelihood(found, self.sd, solved)
             states = self.chain.moved(states, solved.shift)
         return value + float(self.prior.log_prob(torch.from_numpy(point)))

@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.noise import Moments, Noise, Pulls, eliminate, estimate_noise
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 
 FloatArray = NDArray[np.float64]
@@ -54,8 +56,8 @@ def updated_noise(
     coloured: bool,
 ) -> Noise:
     start_pull = -windows.start_precision * starts
-    arrow = eliminate(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
-    context = pulls(windows, prior, theta, starts, arrow.gradient)
+    solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
+    context = pulls(windows, prior, theta, starts, solved.gradient)
     shortest, longest = float(windows.dt.min()), windows.trajectories.longest
     found = estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest)
     sd = np.where(np.isnan(windows.fixed_sd), np.maximum(found.sd, windows.rounding), found.sd)

@@ -44,8 +44,11 @@ from sipe_bayes.inference.laplace.window_noise import (
     same_noise,
     updated_noise,
 )
-from sipe_bayes.likelihood.noise import Arrow, Moments, Noise, eliminate, restricted
+from sipe_bayes.likelihood.block_tridiagonal import Eliminated
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
+from sipe_bayes.likelihood.restricted import eliminate_starts, restricted
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
@@ -326,8 +329,8 @@ def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
     """What is recorded of an optimum: the normal's mean and covariance over the noise's uncertainty, and the evidence."""
     theta, starts, noise, moments = optimum.theta, optimum.starts, optimum.noise, optimum.moments
     prior, pull, sandwiched = search.quadratic_prior, -windows.start_precision * starts, _sandwiches(windows)
-    arrow = eliminate(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
-    here = pulls(windows, prior, theta, starts, arrow.gradient)
+    solved = eliminate_starts(moments.normal(noise), moments.num_theta, windows.start_precision, pull)
+    here = pulls(windows, prior, theta, starts, solved.gradient)
     prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
     evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True))) - prior_energy
     white = noise.sd
@@ -337,18 +340,18 @@ def _summary(search: Search, windows: Windows, optimum: _Optimum) -> State:
     centres = []
     for weight, point in noise_cloud(moments, noise, here, free_noise(windows), windows.trajectories.longest):
         if sandwiched:
-            middle = sandwich(optimum.jacobian, arrow.start_slope, white, windows.sequences, point)
-            centre, spread = search.normal(theta, *_sandwiched(arrow, middle))
+            middle = sandwich(optimum.jacobian, solved.slope, white, windows.sequences, point)
+            centre, spread = search.normal(theta, *_sandwiched(solved, middle))
         else:
             point = beyond_rounding(windows, point)
-            inner = eliminate(moments.normal(point), moments.num_theta, windows.start_precision, pull)
+            inner = eliminate_starts(moments.normal(point), moments.num_theta, windows.start_precision, pull)
             centre, spread = search.normal(theta, inner.precision, inner.gradient)
         mean += weight * centre
         covariance += weight * spread
         centres.append((weight, centre))
     for weight, centre in centres:
         covariance += weight * np.outer(centre - mean, centre - mean)
-    found = {"theta": theta, "starts": starts, "slope": arrow.start_slope, "mean": mean, "covariance": covariance}
+    found = {"theta": theta, "starts": starts, "slope": solved.slope, "mean": mean, "covariance": covariance}
     return {**found, "sd": noise.sd, "tau": noise.tau, "evidence": np.array(evidence)}
 
 
@@ -440,10 +443,10 @@ def _middle(search: Search, windows: Windows, found: State) -> FloatArray | None
     return trials[good[0]] if good else None
 
 
-def _sandwiched(arrow: Arrow, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sandwiched(solved: Eliminated, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Precision and gradient of plain least squares when the residuals' covariance gives ``middle``."""
-    shift = np.linalg.pinv(arrow.precision, rcond=1e-12, hermitian=True) @ arrow.gradient
-    precision = arrow.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ arrow.precision
+    shift = np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
+    precision = solved.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ solved.precision
     # rounding leaves some of an open direction negative
     eigenvalues, axes = np.linalg.eigh(0.5 * (precision + precision.T))
     precision = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
 from sipe_bayes.inference.laplace.window_noise import beyond_rounding, free_noise
-from sipe_bayes.likelihood.marginal import marginal
-from sipe_bayes.likelihood.noise import Moments, Noise, Pulls, estimate_noise
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.restricted import Pulls, estimate_noise, marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 

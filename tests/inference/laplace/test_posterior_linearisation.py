@@ -11,7 +11,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace.posterior_linearisation import linearise
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.likelihood.state_space import Chain
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.simulation.simulator import Simulator
 
 STEP = 0.01

@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.likelihood.block_tridiagonal import ChainLinearisation
 from sipe_bayes.likelihood.noise import chosen_sd
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation
 from sipe_bayes.likelihood.windows import (
     START_SD,
     chosen_channels,

@@ -1,0 +1,199 @@
+"""Restricted likelihood of the windows' noise, and the normal equations of theta with the starts marginalised.
+
+The normal equations of (theta, starts) are dense in theta and block-tridiagonal in the starts, as a window's first
+sample is whitened with the last of the window before (``likelihood.block_tridiagonal``).
+
+Restricted likelihood (Patterson & Thompson 1971, "Recovery of inter-block information when block sizes are unequal",
+Biometrika 58): -2 l_R = log|V| + log|A| + r' V^-1 r - b' A^-1 b, A = J' V^-1 J + prior precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.likelihood.block_tridiagonal import Eliminated, eliminate
+from sipe_bayes.likelihood.minimise import minimise
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, coefficients
+
+_RIDGE = 1e-12  # of a parameter's own precision: what rounding leaves of two that do the same may be negative
+_SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
+
+
+@dataclass(frozen=True)
+class Pulls:
+    """What besides the data pulls at the linearisation point.
+
+    prior (N, N) and prior_pull (N,): precision of theta's prior and its negative gradient; start_precision (D,) and
+    start_pull (W, D) likewise; free (N,): parameters that may move. One held at a bound against its pull is no
+    unknown of the linear model: with it the residuals would be credited with an optimum that is not allowed.
+    """
+
+    prior: FloatArray
+    prior_pull: FloatArray
+    start_precision: FloatArray
+    start_pull: FloatArray
+    free: BoolArray
+
+
+def eliminate_starts(
+    normal: FloatArray,
+    num_theta: int,
+    start_precision: FloatArray,
+    start_pull: FloatArray,
+    damping: float = 0.0,
+) -> Eliminated:
+    """Normal equations of theta with the windows' starts marginalised.
+
+    Args:
+        normal: products (W, K, K) as ``Moments.normal`` gives them; (1, K, K) without starts.
+        num_theta: N.
+        start_precision: (D,) of the starts' weak prior.
+        start_pull: its negative gradient (W, D).
+        damping: Levenberg and Marquardt's, relative, of the starts' block.
+
+    Raises:
+        numpy.linalg.LinAlgError: where the starts' block is not positive definite.
+    """
+    width = normal.shape[1]
+    n, d = num_theta, (width - 1 - num_theta) // 2
+    theta, own, prev, r = slice(0, n), slice(n, n + d), slice(n + d, n + 2 * d), width - 1
+    precision, gradient = normal[:, theta, theta].sum(0), normal[:, theta, r].sum(0)
+    if not d:  # recorded starts
+        none = np.zeros((len(start_pull), 0, n))
+        return eliminate(none, none, none, start_pull[:, :0], precision, gradient)
+    # a window's start is in its own rows, and in the first ones of the next window
+    diagonal, force = normal[:, own, own].copy(), normal[:, own, r] + start_pull
+    diagonal[:-1] += normal[1:, prev, prev]
+    force[:-1] += normal[1:, prev, r]
+    coupling = normal[:, own, theta].copy()
+    coupling[:-1] += normal[1:, prev, theta]
+    index = np.arange(d)
+    diagonal[:, index, index] = diagonal[:, index, index] * (1 + damping) + start_precision
+    below = np.swapaxes(normal[1:, prev, own], 1, 2)
+    return eliminate(diagonal, below, coupling, force, precision, gradient)
+
+
+def marginal(moments: Moments, noise: Noise, starts: FloatArray, precision: FloatArray) -> tuple[float, FloatArray]:
+    """Log-likelihood of residuals with the windows' starts integrated out, theta as it is.
+
+    Args:
+        moments: of residuals at ``starts`` and their Jacobian by the starts alone.
+        noise: of the residuals.
+        starts: (W, D).
+        precision: (D,) of the starts' prior.
+
+    Returns:
+        The value up to a constant, and the change (W, D) of the starts that minimises the squares.
+    """
+    normal = moments.normal(noise)
+    solved = eliminate_starts(normal, 0, precision, -precision * starts)
+    pull, square = float((starts**2 @ precision).sum()), float(normal[:, -1, -1].sum())
+    total = moments.log_determinant(noise) + solved.log_determinant + square - solved.explained + pull
+    return -0.5 * total, solved.shift
+
+
+def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> float:
+    """Restricted log-likelihood of the noise, up to a constant."""
+    return _restricted(moments, noise, pulls)[0]
+
+
+def _restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray, Eliminated]:
+    """Restricted log-likelihood; best step (N,) and covariance (N, N) of theta, zero where it may not move."""
+    normal = moments.normal(noise)
+    solved = eliminate_starts(normal, moments.num_theta, pulls.start_precision, pulls.start_pull)
+    square = float(normal[:, -1, -1].sum())
+    value = moments.log_determinant(noise) + solved.log_determinant + square - solved.explained
+    n = moments.num_theta
+    move, covariance = np.zeros(n), np.zeros((n, n))
+    if pulls.free.any():
+        free = np.ix_(pulls.free, pulls.free)
+        precision = solved.precision[free] + pulls.prior[free]
+        # what rounding leaves of two parameters that do the same may be negative
+        factor = np.linalg.cholesky(precision + _RIDGE * np.diag(np.diag(precision)))
+        inverse = np.linalg.inv(factor)
+        half = inverse @ (solved.gradient + pulls.prior_pull)[pulls.free]
+        value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)
+        move[pulls.free], covariance[free] = inverse.T @ half, inverse.T @ inverse
+    return -0.5 * value, move, covariance, solved
+
+
+def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray]:
+    """Restricted log-likelihood and its derivatives (C,) by log sd and by log tau.
+
+    With A the precision of all unknowns u = (theta, starts), v_w = (u_w, -1) and dM_w the change of the products of
+    window w, -2 dl = d log|V| + sum_w <A^-1 of that window + v_w v_w', dM_w>."""
+    value, move, covariance, solved = _restricted(moments, noise, pulls)
+    n, d, windows = moments.num_theta, moments.num_start, moments.windows
+    size = n + 2 * d
+    by_start = np.zeros((windows, size, n))  # how the window's unknowns follow theta
+    by_start[:, :n] = np.eye(n)
+    v = np.zeros((windows, size + 1))
+    v[:, :n], v[:, -1] = move, -1.0
+    inner = np.zeros((windows, size + 1, size + 1))
+    if d:
+        slope, starts = solved.slope, solved.blocks(move)
+        by_start[:, n : n + d], by_start[1:, n + d :] = -slope, -slope[:-1]
+        v[:, n : n + d], v[1:, n + d : size] = starts, starts[:-1]
+        same, apart = solved.covariances()
+        inner[:, n : n + d, n : n + d] += same
+        inner[1:, n + d : size, n + d : size] += same[:-1]
+        inner[1:, n : n + d, n + d : size] += apart
+        inner[1:, n + d : size, n : n + d] += np.swapaxes(apart, 1, 2)
+    inner[:, :size, :size] += by_start @ covariance @ np.swapaxes(by_start, 1, 2)
+    inner += v[:, :, None] * v[:, None, :]
+    by_sd, by_tau = moments.slopes(noise, inner)
+    return value, -0.5 * by_sd, -0.5 * by_tau
+
+
+def estimate_noise(
+    moments: Moments,
+    noise: Noise,
+    pulls: Pulls,
+    fixed_sd: FloatArray,
+    coloured: bool,
+    shortest: float,
+    longest: float,
+) -> Noise:
+    """Noise that maximises the restricted likelihood, started from ``noise``.
+
+    fixed_sd (C,): given sds, NaN where to be estimated. coloured: whether tau is estimated, from a tenth of
+    ``shortest`` to ``longest`` seconds. (log innovation sd, log tau) of all channels are searched, whose information
+    is all but diagonal.
+    """
+    channels, estimated = len(noise.sd), np.isnan(fixed_sd)
+
+    def unpack(x: FloatArray) -> Noise:
+        tau = np.exp(x[channels:]) if coloured else np.zeros(channels)
+        innovation = 1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
+        return Noise(np.where(estimated, np.exp(x[:channels]) / np.sqrt(innovation), fixed_sd), tau)
+
+    def loss(x: FloatArray) -> tuple[float, FloatArray]:
+        here = unpack(x)
+        try:
+            value, by_sd, by_tau = restricted_slopes(moments, here, pulls)
+        except np.linalg.LinAlgError:
+            return 1e12, np.zeros_like(x)
+        by_sd = np.where(estimated, by_sd, 0.0)
+        slope = by_sd
+        if coloured:
+            ratio = shortest / here.tau
+            a = np.exp(-ratio)
+            slope = np.concatenate([by_sd, by_tau + by_sd * a**2 * ratio / (1 - a**2)])
+        return (-value, -slope) if np.isfinite(value) and np.isfinite(slope).all() else (1e12, np.zeros_like(x))
+
+    low, high = np.log(_SHORTEST_TAU * shortest), np.log(longest)
+    tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
+    if coloured and (noise.tau <= 0).all():
+        tau = np.clip(np.log(moments.correlation_times()), low, high)
+    innovation = 1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
+    x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation)), tau if coloured else []])
+    free_sd, free_tau = np.full(channels, 12.0), np.tile([[low], [high]], channels if coloured else 0)
+    bounds = np.concatenate([[x0[:channels] - free_sd, x0[:channels] + free_sd], free_tau], axis=1)
+    counts = np.array([len(s.index) for s in moments.sequences], float)
+    ratio = shortest / np.exp(tau)
+    information = [2 * counts, counts * ratio**2 / np.maximum(np.expm1(2 * ratio), 1e-300)][: 1 + coloured]
+    return unpack(minimise(loss, x0, bounds, np.concatenate(information)))
