@@ -186,19 +186,20 @@ def test_elimination_is_the_schur_complement(name: str, noise: Noise, damping: f
     case = PROBLEMS[name]
     pull = np.random.default_rng(1).normal(size=(len(case.log), D))
     matrix, right, _, square = system(case, noise, PRECISION, pull, damping)
-    arrow = eliminate_starts(case.moments().normal(noise), N, PRECISION, pull, damping)
+    products = case.moments().normal(noise)
+    solved = eliminate_starts(products, N, PRECISION, pull, damping)
     inner, border = matrix[N:, N:], matrix[N:, :N]
-    close(arrow.precision, matrix[:N, :N] - border.T @ np.linalg.solve(inner, border))
-    close(arrow.gradient, right[:N] - border.T @ np.linalg.solve(inner, right[N:]))
-    close(arrow.explained, right[N:] @ np.linalg.solve(inner, right[N:]))
-    close(arrow.log_determinant, np.linalg.slogdet(inner)[1])
-    close(arrow.square, square)
+    close(solved.precision, matrix[:N, :N] - border.T @ np.linalg.solve(inner, border))
+    close(solved.gradient, right[:N] - border.T @ np.linalg.solve(inner, right[N:]))
+    close(solved.explained, right[N:] @ np.linalg.solve(inner, right[N:]))
+    close(solved.log_determinant, np.linalg.slogdet(inner)[1])
+    close(products[:, -1, -1].sum(), square)
     step = np.array([0.3, -1.0, 0.2])
-    close(arrow.blocks(step).ravel(), np.linalg.solve(inner, right[N:] - border @ step))
+    close(solved.blocks(step).ravel(), np.linalg.solve(inner, right[N:] - border @ step))
     best = np.linalg.solve(matrix + 1e-3 * np.eye(len(matrix)) * (np.arange(len(matrix)) < N), right)
-    found = np.linalg.solve(arrow.precision + 1e-3 * np.eye(N), arrow.gradient)
+    found = np.linalg.solve(solved.precision + 1e-3 * np.eye(N), solved.gradient)
     close(found, best[:N])
-    close(arrow.blocks(found).ravel(), best[N:])
+    close(solved.blocks(found).ravel(), best[N:])
 
 
 @ALL
@@ -244,10 +245,10 @@ def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tu
     for white in (False,) if coloured else (False, True):
         moments = Moments(case.residual, case.jacobian[..., :N], N, case.sequences, white)
         assert moments.windows == 1
-        arrow = eliminate_starts(moments.normal(noise), N, np.zeros(0), none)
-        close(arrow.precision, jacobian.T @ np.linalg.solve(covariance, jacobian))
-        close(arrow.gradient, jacobian.T @ np.linalg.solve(covariance, residual))
-        assert (arrow.blocks(np.ones(N)).shape, arrow.slope.shape) == (none.shape, (*none.shape, N))
+        solved = eliminate_starts(moments.normal(noise), N, np.zeros(0), none)
+        close(solved.precision, jacobian.T @ np.linalg.solve(covariance, jacobian))
+        close(solved.gradient, jacobian.T @ np.linalg.solve(covariance, residual))
+        assert (solved.blocks(np.ones(N)).shape, solved.slope.shape) == (none.shape, (*none.shape, N))
         value, by_sd, by_tau = restricted_slopes(moments, noise, pulls)
         close([value, restricted(moments, noise, pulls)], expected(noise))
         h = 1e-6
