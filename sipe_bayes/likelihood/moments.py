@@ -20,10 +20,16 @@ from sipe_bayes.likelihood.sequences import Sequence
 class Moments:
     """Noise-free products of the rows of a linearisation, per channel and gap.
 
-    residual (W, L, C); jacobian (W, L, C, N + D): derivatives of the prediction by theta and the window's start.
     With x a row and y the row before it, each of the G pairs of channel and gap has the sums x x', x y' + y x' and
-    y y' over its samples: ``products`` (3 G, W K K). gaps, owner (its channel) and counts are (G,). white: for white noise
-    alone, quickly: one endless gap a channel. Without starts (D = 0) only sums over all windows matter: W is 1 then.
+    y y' over its samples: ``products`` (3 G, W K K), K = N + 2 D + 1. ``gaps`` in seconds, ``owner`` (its channel) and
+    ``counts`` are (G,). Without starts (D = 0) only sums over all windows matter: W is 1 then.
+
+    Args:
+        residual: (W, L, C).
+        jacobian: (W, L, C, N + D), derivatives of the prediction by theta and the window's start.
+        num_theta: N.
+        all_sequences: the samples of each channel in a row.
+        white: for white noise alone, quickly: one endless gap a channel.
     """
 
     def __init__(
@@ -57,8 +63,10 @@ class Moments:
         self.products = self._spread(squares).reshape(3 * len(self.gaps), -1)
 
     def _squares(self, rows: FloatArray, s: Sequence) -> FloatArray:
-        """Sums of z z', z = (a row, the row before it), of the samples of each of a channel's gaps, each window and each
-        side of a window's edge: (its gaps, 2, W, 2 q, 2 q); rows (W L, q), q = N + D + 1."""
+        """Sums of z z', z = (a row, the row before it), over a channel's samples (W L, q), q = N + D + 1.
+
+        Of each of its gaps, each side of a window's edge and each window: (its gaps, 2, W, 2 q, 2 q).
+        """
         before = np.where((s.previous >= 0)[:, None], rows[s.previous], 0.0)
         both = np.concatenate([rows[s.index], before], axis=1)
         out = np.zeros((len(s.gaps), 2, self.windows, both.shape[1], both.shape[1]))
@@ -73,8 +81,10 @@ class Moments:
         return out
 
     def _spread(self, squares: FloatArray) -> FloatArray:
-        """Products (G, 3, W, K, K) of ``squares`` (G, 2, W, 2 q, 2 q): the row before belongs to the window's own start or,
-        across an edge, to the start of the window before."""
+        """Products (G, 3, W, K, K) of ``squares`` (G, 2, W, 2 q, 2 q).
+
+        The row before belongs to the window's own start or, across an edge, to the start of the window before.
+        """
         n, d = self.num_theta, self.num_start
         size, width = n + d + 1, n + 2 * d + 1
         own = np.append(np.arange(n + d), width - 1)
