@@ -1,60 +1,72 @@
 """sipe_bayes: calibrate robot simulators with honest uncertainty.
 
-``import sipe_bayes as sipe``. Public names are imported when first used, so the import itself is instant.
+``import sipe_bayes as sipe``. The imports below are the one list of public names: type checkers and completion read
+them as they stand; at run time each name is imported when it is first used, so that the import itself is instant.
 """
 
 import importlib
 import sys
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sipe_bayes.calibration.config import load_config as load_config
+    from sipe_bayes.calibration.problem import prepare as prepare
+    from sipe_bayes.calibration.run import calibrate as calibrate
+    from sipe_bayes.core.parameters import Parameter as Parameter
+    from sipe_bayes.core.parameters import ParameterSpace as ParameterSpace
+    from sipe_bayes.core.trajectory import Trajectories as Trajectories
+    from sipe_bayes.core.trajectory import Trajectory as Trajectory
+    from sipe_bayes.datasets.demonstrations import demonstrations as demonstrations
+    from sipe_bayes.datasets.minari_data import from_minari as from_minari
+    from sipe_bayes.envs.mjcf import Channel as Channel
+    from sipe_bayes.envs.mjcf import MjcfEnvironment as MjcfEnvironment
+    from sipe_bayes.envs.registry import make_task as make_task
+    from sipe_bayes.inference import get_estimator as get_estimator
+    from sipe_bayes.inference.recalibrated import Recalibrated as Recalibrated
+    from sipe_bayes.likelihood.settings import Segments as Segments
+    from sipe_bayes.likelihood.settings import StateSpace as StateSpace
+    from sipe_bayes.posterior import Dirac as Dirac
+    from sipe_bayes.posterior import GaussianMixture as GaussianMixture
+    from sipe_bayes.posterior import Particles as Particles
+    from sipe_bayes.posterior import Posterior as Posterior
+    from sipe_bayes.posterior import load_posterior as load_posterior
+    from sipe_bayes.report.show import show_results as show_results
+    from sipe_bayes.rl.policy_in_the_loop import train_in_the_loop as train_in_the_loop
+    from sipe_bayes.rl.randomization import Randomization as Randomization
+    from sipe_bayes.rl.randomization import load_randomization as load_randomization
+    from sipe_bayes.rl.randomized_env import RandomizedEnv as RandomizedEnv
+    from sipe_bayes.simulation import gym as gym
+    from sipe_bayes.simulation.callable_simulator import CallableSimulator as CallableSimulator
+    from sipe_bayes.simulation.gym import make as make
+    from sipe_bayes.simulation.gym import make_vec as make_vec
+    from sipe_bayes.simulation.simulator import Simulator as Simulator
 
 __version__ = "0.1.0"
 
-_PUBLIC = {
-    "Parameter": "sipe_bayes.core.parameters",
-    "ParameterSpace": "sipe_bayes.core.parameters",
-    "Trajectory": "sipe_bayes.core.trajectory",
-    "Trajectories": "sipe_bayes.core.trajectory",
-    "Channel": "sipe_bayes.envs.mjcf",
-    "MjcfEnvironment": "sipe_bayes.envs.mjcf",
-    "make": "sipe_bayes.simulation.gym",
-    "make_vec": "sipe_bayes.simulation.gym",
-    "make_task": "sipe_bayes.envs.registry",
-    "Simulator": "sipe_bayes.simulation.simulator",
-    "CallableSimulator": "sipe_bayes.simulation.callable_simulator",
-    "Segments": "sipe_bayes.likelihood.settings",
-    "StateSpace": "sipe_bayes.likelihood.settings",
-    "Posterior": "sipe_bayes.posterior",
-    "Dirac": "sipe_bayes.posterior",
-    "Particles": "sipe_bayes.posterior",
-    "GaussianMixture": "sipe_bayes.posterior",
-    "load_posterior": "sipe_bayes.posterior",
-    "demonstrations": "sipe_bayes.datasets.demonstrations",
-    "from_minari": "sipe_bayes.datasets.minari_data",
-    "get_estimator": "sipe_bayes.inference",
-    "Recalibrated": "sipe_bayes.inference.recalibrated",
-    "show_results": "sipe_bayes.report.show",
-    "load_config": "sipe_bayes.calibration.config",
-    "train_in_the_loop": "sipe_bayes.rl.policy_in_the_loop",
-    "RandomizedEnv": "sipe_bayes.rl.randomized_env",
-    "Randomization": "sipe_bayes.rl.randomization",
-    "load_randomization": "sipe_bayes.rl.randomization",
-    "prepare": "sipe_bayes.calibration.problem",
-    "calibrate": "sipe_bayes.calibration.run",
-}
+if not TYPE_CHECKING:
 
-__all__ = ["__version__", *_PUBLIC]
+    @cache
+    def _public() -> dict[str, str]:
+        """Name -> module that has it, read from the imports above."""
+        import ast
 
+        block = next(node for node in ast.parse(__loader__.get_source(__name__)).body if isinstance(node, ast.If))
+        return {alias.asname: node.module for node in block.body for alias in node.names}
 
-def __getattr__(name: str) -> Any:
-    if name == "gym":
-        return importlib.import_module("sipe_bayes.simulation.gym")
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(_PUBLIC[name]), name)
-    raise AttributeError(f"module 'sipe_bayes' has no attribute {name!r}")
+    def __getattr__(name):
+        if name == "__all__":
+            return ["__version__", *_public()]
+        if name.startswith("_") or name not in _public():
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = importlib.import_module(_public()[name])
+        if not hasattr(module, name):
+            importlib.import_module(f"{module.__name__}.{name}")
+        globals()[name] = value = getattr(module, name)
+        return value
 
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    def __dir__():
+        return sorted(__getattr__("__all__"))
 
 
 if "gymnasium" in sys.modules:  # its ids are wanted; importing it here would double the time of the import

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,13 @@ class ParameterSpace(Sequence[Parameter]):
         if twice:
             raise ValueError(f"parameters: the names must differ, but {twice} appear more than once")
 
-    def __getitem__(self, key: Any) -> Any:
+    @overload
+    def __getitem__(self, key: int) -> Parameter: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> tuple[Parameter, ...]: ...
+
+    def __getitem__(self, key: int | slice) -> Parameter | tuple[Parameter, ...]:
         return self._parameters[key]
 
     def __len__(self) -> int:

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,7 +160,16 @@ class Trajectories(Sequence[Trajectory]):
     def __len__(self) -> int:
         return len(self.actions)
 
-    def __getitem__(self, key: Any) -> Any:
+    @overload
+    def __getitem__(self, key: int | np.integer) -> Trajectory: ...
+
+    @overload
+    def __getitem__(self, key: slice | Sequence[int] | NDArray[np.int64] | BoolArray) -> Trajectories: ...
+
+    def __getitem__(
+        self, key: int | np.integer | slice | Sequence[int] | NDArray[np.int64] | BoolArray
+    ) -> Trajectory | Trajectories:
+        """One trajectory, cut to its own length, or a batch of those that are chosen."""
         if isinstance(key, (slice, Sequence, np.ndarray)):
             return self._subset(np.arange(len(self))[key])
         n = int(self.length[key])
