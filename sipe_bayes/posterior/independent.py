@@ -55,15 +55,15 @@ class IndependentPrior(Posterior):
         return -(((theta - self.normal_mean) / self.normal_sd) ** 2).sum(-1) / 2 - self._log_normaliser
 
     def _quantile(self, q: Tensor) -> Tensor:
-        return self._inverse(q[:, None].expand(-1, len(self.space)))
+        return self.inverse(q[:, None].expand(-1, len(self.space)))
 
-    def _inverse(self, q: Tensor) -> Tensor:
-        """Quantiles at levels q (n, N), one level for each parameter."""
+    def inverse(self, q: Tensor) -> Tensor:
+        """Quantiles theta (n, N) at levels q (n, N), one level for each parameter."""
         normal = self.normal_mean + self.normal_sd * torch.from_numpy(interval_quantile(*self._limits, q.numpy()))
         return torch.where(self._flat, q, normal).clamp(0.0, 1.0)
 
     def _sample(self, n: int, generator: Generator | None) -> Tensor:
-        return self._inverse(torch.rand(n, len(self.space), dtype=torch.float64, generator=generator))
+        return self.inverse(torch.rand(n, len(self.space), dtype=torch.float64, generator=generator))
 
     def _moments(self) -> tuple[Tensor, Tensor]:
         zero = np.zeros(len(self.space))

@@ -8,6 +8,7 @@ import torch
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.models.gaussian_process import GaussianProcess
 from sipe_bayes.posterior import IndependentPrior, SurrogatePosterior
+from sipe_bayes.posterior.ensemble import EnsembleOptions
 
 
 def bowl(n: int, count: int = 30) -> GaussianProcess:
@@ -22,7 +23,9 @@ def example_surrogate(space: ParameterSpace, exact_draws: int = 40_000) -> Surro
     n = len(space)
     process, epsilon = bowl(n), float(np.log(0.15 + 0.05 * n))
     prior = IndependentPrior(np.linspace(0.3, 0.7, n), np.full(n, 0.4), space)
-    sampled = SurrogatePosterior.sampled(process, epsilon, prior, effective=300, most_steps=600)
+    sampled = SurrogatePosterior.sampled(
+        process, epsilon, prior, options=EnsembleOptions(effective=300, most_steps=600)
+    )
     generator, kept = torch.Generator().manual_seed(n), []
     while sum(len(part) for part in kept) < exact_draws:
         theta = prior.sample((20_000,), generator=generator)

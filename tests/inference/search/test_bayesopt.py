@@ -16,9 +16,11 @@ import torch
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.inference.search import bayesopt
-from sipe_bayes.inference.search.bayesopt import BayesOpt, independent_residuals, log_improvement
+from sipe_bayes.inference.search.acquisition import CandidateOptions, CandidateSearch, log_improvement
+from sipe_bayes.inference.search.bayesopt import BayesOpt, BayesOptState, independent_residuals
 from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
 from sipe_bayes.posterior import SurrogatePosterior, load_posterior, uniform
+from sipe_bayes.posterior.ensemble import EnsembleOptions
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import DT, log, pendulum
 from tests.problems.surrogates import bowl, example_surrogate
@@ -97,7 +99,9 @@ def test_fitted_hyper_parameters_predict() -> None:
 def test_the_density_integrates_to_one_and_draws_agree(n: int, tmp_path: Path) -> None:
     """Five standard errors, of the normaliser too; the chains' means within five of theirs (effective draws as reported)."""
     prior = uniform(space_of(n))
-    posterior = SurrogatePosterior.sampled(bowl(n), math.log(0.1 + 0.03 * n), prior, effective=500)
+    posterior = SurrogatePosterior.sampled(
+        bowl(n), math.log(0.1 + 0.03 * n), prior, options=EnsembleOptions(effective=500)
+    )
     theta = torch.rand(60_000, n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     density = posterior.log_prob(theta).exp()
     error = math.hypot(float(density.std()) / math.sqrt(60_000), posterior.normaliser_error)
@@ -139,7 +143,7 @@ def test_epsilon_gives_a_quadratic_log_cost_its_gaussians_covariance() -> None:
     cost = 0.02 * np.exp((((theta - 0.5) / sd) ** 2).sum(1) / residuals)
     method = BayesOpt(pendulum(), floor=1e-9)
     process: Any = SimpleNamespace(x=theta, predict=lambda _: (torch.from_numpy(np.log(cost)), None))
-    epsilon = method._threshold({"cost": cost, "independent": residuals}, process)
+    epsilon = method.threshold(BayesOptState("", theta, cost, np.ones(1), residuals), process)
     below = theta[np.log(cost) < epsilon]
     np.testing.assert_allclose(np.cov(below.T).diagonal(), sd**2, rtol=0.08)
 
@@ -147,12 +151,13 @@ def test_epsilon_gives_a_quadratic_log_cost_its_gaussians_covariance() -> None:
 def test_expected_improvement_is_that_of_its_definition() -> None:
     """By quadrature, over the lowest value less xi."""
     process, theta = bowl(2), torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    method = BayesOpt(pendulum(), acquisition="expected_improvement", xi=0.2)
+    acquisition = BayesOpt(pendulum(), acquisition="expected_improvement", xi=0.2).acquisition
+    search = CandidateSearch(acquisition, np.zeros(2), np.ones(2), CandidateOptions())
     mean, sd = process.predict(theta)
     y = mean + sd * torch.linspace(-12, 12, 200_001, dtype=torch.float64)[:, None]
     gain = (process.y.min() - 0.2 - y).clamp_min(0) * torch.exp(-(((y - mean) / sd) ** 2) / 2) / (2 * math.pi) ** 0.5
     expected = gain.sum(0) * 24 / 200_000
-    torch.testing.assert_close(method._merit(process, theta).exp(), expected, rtol=1e-4, atol=1e-300)
+    torch.testing.assert_close(search.merit(process, theta).exp(), expected, rtol=1e-4, atol=1e-300)
 
 
 def test_hyper_parameters_are_fitted_where_the_data_have_grown(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,9 +170,9 @@ def test_hyper_parameters_are_fitted_where_the_data_have_grown(monkeypatch: pyte
 
     monkeypatch.setattr(bayesopt, "fit_gaussian_process", fit)
     method, rng = BayesOpt(pendulum()), np.random.default_rng(0)
-    state = {"fitted": 0}
+    state = BayesOptState("", np.empty((0, 2)), np.empty(0), np.ones(1))
     for count in range(10, 20):
-        state = method._fitted({**state, "theta": rng.random((count, 2)), "cost": rng.random(count)})
+        state = method.fitted(replace(state, theta=rng.random((count, 2)), cost=rng.random(count)))
     assert fits == [10, 12, 15, 18]
 
 
@@ -181,7 +186,7 @@ def test_other_trajectories_start_a_new_process() -> None:
     method.update_parameter_estimate(other)
     fresh = BayesOpt(simulator, budget=200, **ROUGH)
     fresh.update_parameter_estimate(other)
-    assert np.array_equal(method.state["cost"], fresh.state["cost"])
+    assert np.array_equal(method.state.cost, fresh.state.cost)
     assert method.rollouts == before + fresh.rollouts
     method.get_parameter_estimate(other)
     assert not any("other trajectories" in w for w in method.warnings)
