@@ -2,7 +2,7 @@
 
 Fields may be arrays, numbers, text, booleans, None, enumerations, ``Finding``-like plain dictionaries of JSON, other
 frozen dataclasses, and tuples or dictionaries by name of all these. The dataclass that is asked for says how to read
-them; nothing in the file does.
+them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there.
 """
 
 from __future__ import annotations
@@ -103,8 +103,9 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
         return arrays[name]
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
-        chosen = [a for a in arguments if a is not type(None)]
-        return None if plain is None and not _stored(name, arrays) else _restored(name, plain, chosen[0], arrays)
+        if plain is None and not _stored(name, arrays):
+            return None
+        return _restored(name, plain, _member([a for a in arguments if a is not type(None)], plain), arrays)
     whole = origin if dataclasses.is_dataclass(origin) else kind
     if dataclasses.is_dataclass(whole) and isinstance(whole, type):
         hints = typing.get_type_hints(whole)
@@ -133,6 +134,12 @@ def _filled_in(hint: Any, stands_for: dict[Any, Any]) -> Any:
     if isinstance(hint, type) or not getattr(hint, "__parameters__", ()):
         return hint
     return hint[tuple(stands_for.get(v, v) for v in hint.__parameters__)]
+
+
+def _member(kinds: list[Any], plain: Any) -> Any:
+    """Of a union the dataclass that has the fields which are stored, else the first."""
+    fitting = [k for k in kinds if dataclasses.is_dataclass(k) and isinstance(plain, dict)]
+    return next((k for k in fitting if {f.name for f in dataclasses.fields(k)} == plain.keys()), kinds[0])
 
 
 def _stored(name: str, arrays: dict[str, Any]) -> bool:

@@ -41,6 +41,20 @@ class Code(StrEnum):
     REFITS_LOST = auto()
     REFITS_NOT_NORMAL = auto()
 
+    # laplace
+    DIVERGES_AS_GIVEN = auto()
+    SEPARATE_OPTIMA = auto()
+    PROCESS_NOISE_UNSETTLED = auto()
+    SEARCH_CUT_SHORT = auto()
+    SEARCH_UNSETTLED = auto()
+    NOT_SMOOTH = auto()
+    ROUGH_EVERYWHERE = auto()
+    NOT_LOOKED_AROUND = auto()
+    TOO_FEW_DRAWS = auto()
+    # mcmc
+    NONLINEAR_STARTS = auto()
+    NONLINEAR_STATES = auto()
+
     # parameters
     NO_EFFECT = auto()
     DEAD_RANGE = auto()
@@ -160,6 +174,51 @@ TEXTS: dict[Code, Text] = {
         _CAUTION,
         "the estimates of simulated logs do not scatter normally about a line in theta (p = {p:.1g}): the "
         "recalibrated intervals are approximate; verify them with `sipe check`",
+    ),
+    # laplace
+    Code.DIVERGES_AS_GIVEN: Text(_CAUTION, "the model as given diverges on these logs; the search started elsewhere"),
+    Code.SEPARATE_OPTIMA: Text(
+        _CAUTION, "the search found {count} separate optima; the posterior is a mixture of them"
+    ),
+    Code.PROCESS_NOISE_UNSETTLED: Text(
+        _BLOCKING, "the process noise had not settled: do not rely on the intervals; more restarts may help"
+    ),
+    Code.SEARCH_CUT_SHORT: Text(
+        _BLOCKING,
+        "the budget ended before the search had settled: the estimate is the best so far, and its intervals are "
+        "guessed from the way it has come; raise the budget",
+    ),
+    Code.SEARCH_UNSETTLED: Text(
+        _BLOCKING,
+        "the search had not settled after {steps} steps: look at the residuals before you trust the intervals",
+    ),
+    Code.NOT_SMOOTH: Text(
+        _BLOCKING,
+        "at the optimum the linearisation still foretold a gain of {gain:.1f} nats that no step found: the "
+        "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the "
+        "intervals",
+    ),
+    Code.ROUGH_EVERYWHERE: Text(
+        _BLOCKING,
+        "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse "
+        "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim",
+    ),
+    Code.NOT_LOOKED_AROUND: Text(
+        _BLOCKING,
+        "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow",
+    ),
+    Code.TOO_FEW_DRAWS: Text(
+        _BLOCKING,
+        "the posterior is no normal, and {draws} draws from it came to {effective:.1f} effective ones: compare with "
+        "mcmc before you trust the intervals",
+    ),
+    # mcmc
+    Code.NONLINEAR_STARTS: Text(
+        _CAUTION, "the windows' starts are strongly nonlinear (error {error:.2f} nats): use shorter windows"
+    ),
+    Code.NONLINEAR_STATES: Text(
+        _CAUTION,
+        "the states are strongly nonlinear (error {error:.2f} nats): hold the intervals against those of laplace",
     ),
     # parameters
     Code.NO_EFFECT: Text(

@@ -21,6 +21,8 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from sipe_bayes.core.validation import nearest_name
 
 
@@ -118,6 +120,8 @@ def _plain(value: Any) -> Any:
         return value.plain()
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
     return str(value) if isinstance(value, Path) else value
 
 

@@ -169,6 +169,10 @@ class Estimator(ABC, Generic[S]):
             raise ValueError(
                 f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
             )
+        self.check_options()
+
+    def check_options(self) -> None:
+        """Hold the options against simulator and likelihood, once all are set; raises ValueError."""
 
     def stored(self, name: str, given: Any) -> Path | None:
         """The path that an argument gives; raises ValueError for a simulator that others there cannot be told from."""

@@ -16,202 +16,285 @@ walkers share information, so R-hat is an optimistic diagnostic.
 from __future__ import annotations
 
 import warnings
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import state_space_target, window_target
-from sipe_bayes.inference.laplace.chain_state import process_diagnostics
-from sipe_bayes.inference.laplace.estimator import UNSETTLED, Laplace
-from sipe_bayes.inference.laplace.optima import distinct_modes
+from sipe_bayes.inference.laplace.chain_state import ChainOptimum, process_diagnostics
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.state_space_target import ChainFit, ChainTarget
+from sipe_bayes.inference.laplace.strategy import distinct
+from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Particles
 
-FloatArray = NDArray[np.float64]
-
-_BLOCK = 20  # steps of the ensemble between checkpoints
-_WARM_UP = 1 / 3  # of the chain is dropped
-_MIXED_RHAT = 1.05
-_WIDER = 1.2  # of the sds of the independent proposal against laplace's
-_DRAWS = 4000  # at most kept
-_PLACINGS = 20  # rounds in which walkers look for a valid place
-_CHECKED, _CHECKS_SHARE = 16, 0.1  # walkers on which the linearisation is checked; of the budget, at most
+_MOVES = (0.6, 0.3, 0.1)  # shares of independent Metropolis-Hastings, differential evolution, and its snooker
+_FEWEST_CHECKED = 4  # walkers that make an sd
+_LONG = 10  # autocorrelation times in a chain from which on its estimate is believed
 
 
-class MCMC(Estimator):
+@dataclass(frozen=True)
+class MCMCTuning(Options):
+    """How the ensemble is placed, moved and judged."""
+
+    block: int = option(20, "steps of the ensemble between checkpoints", least=1)
+    warm_up: float = option(1 / 3, "share of the chain that is dropped", least=0, below=1)
+    wider: float = option(
+        1.2, "width of the independent proposal over laplace's: heavier tails than the target", above=0
+    )
+    most_draws: int = option(4000, "draws kept at most", least=1)
+    placings: int = option(20, "rounds in which walkers look for a valid place", least=1)
+    checked: int = option(16, "walkers on which the linearisation is checked", least=1)
+    check_share: float = option(0.1, "share of the budget that this may cost", above=0, below=1)
+    search_share: float = option(0.8, "share of the budget that the laplace fit may cost", above=0, below=1)
+    least_walkers: int = option(24, "walkers by default, or twice the dimensions plus two", least=2)
+    nonlinear: float = option(0.5, "error of the linearisation that is worth a finding", "nats", above=0)
+
+
+@dataclass(frozen=True)
+class MCMCOptions(Options):
+    """What ``MCMC`` takes beside what every estimator takes."""
+
+    walkers: int | None = option(None, "chains of the ensemble; default twice the dimensions plus two, at least 24")
+    effective: int = option(400, "effective draws at which it stops early, once R-hat is small too", least=1)
+    restarts: int = option(2, "starting points of the laplace fit that comes first", least=1)
+    candidates: int = option(8, "points among which they are chosen", least=0)
+    tuning: MCMCTuning = option(MCMCTuning(), "numbers of the chains themselves")
+
+
+@dataclass(frozen=True)
+class RandomState:
+    """A ``numpy.random.RandomState``, as emcee wants it, as plain data."""
+
+    kind: str
+    keys: np.ndarray
+    position: int
+    has_gauss: int
+    cached: float
+
+    @classmethod
+    def of(cls, random: np.random.RandomState) -> RandomState:
+        """Its present state."""
+        kind, keys, position, has_gauss, cached = random.get_state(legacy=True)
+        return cls(str(kind), np.asarray(keys), int(position), int(has_gauss), float(cached))
+
+    def plain(self) -> tuple[str, np.ndarray, int, int, float]:
+        """As ``set_state`` takes it."""
+        return self.kind, self.keys, self.position, self.has_gauss, self.cached
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The widened normals of ``laplace``: log weights (K,), means (K, N), covariances (K, N, N)."""
+
+    weights: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+
+
+@dataclass(frozen=True)
+class MCMCState:
+    """An ensemble of W walkers after S steps.
+
+    Args:
+        fit: the laplace optimum that the target is made of.
+        proposal: of the independent move.
+        walkers: (W, N), where they stand.
+        log_prob: (W,), the target there.
+        best: (N,), the best draw.
+        best_log_prob: the target there.
+        linearisation_error: sd of what fresh Jacobians change, in nats; NaN where that was too dear.
+        chain: (S, W, N).
+        chain_log_prob: (S, W).
+        accepted: (W,), moves that were.
+        random: of the moves to come.
+        done: whether there are enough effective draws.
+    """
+
+    fit: WindowFit | ChainFit
+    proposal: Proposal
+    walkers: FloatArray
+    log_prob: FloatArray
+    best: FloatArray
+    best_log_prob: float
+    linearisation_error: float
+    chain: FloatArray
+    chain_log_prob: FloatArray
+    accepted: FloatArray
+    random: RandomState
+    done: bool = False
+
+
+class MCMC(Estimator[MCMCState]):
     """Particles of an emcee ensemble; see the module's docstring.
 
-    restarts, candidates: of the ``laplace`` fit that comes first. walkers: default twice the dimensions plus two, at least
-    24. effective: effective draws at which it stops early,
-    once R-hat is small too.
+    Args:
+        walkers: chains of the ensemble; default twice the dimensions plus two, at least 24.
+        effective: effective draws at which it stops early, once R-hat is small too.
+        restarts, candidates: of the ``laplace`` fit that comes first.
+        tuning: numbers of the chains themselves.
     """
 
     name: ClassVar[str] = "mcmc"
     searches: ClassVar[bool] = True
     default_budget: ClassVar[int] = 50_000
+    options_type = MCMCOptions
+    state_type = MCMCState
+    options: MCMCOptions
 
-    def __init__(
-        self,
-        simulator: Any,
-        *,
-        walkers: int | None = None,
-        effective: int = 400,
-        restarts: int = 2,
-        candidates: int = 8,
-        **settings: Any,
-    ) -> None:
-        super().__init__(simulator, **settings)
+    def check_options(self) -> None:
+        """Refuse a likelihood that is none, and too few walkers."""
         if self.likelihood.noise == "sandwich":
             raise ValueError("noise: 'sandwich' is a width without a likelihood, for laplace only; use 'ar1' with mcmc")
-        self.walkers = None if walkers is None else whole("walkers", walkers, 2 * len(self.space) + 2)
-        self.effective = whole("effective", effective)
-        self.restarts, self.candidates = whole("restarts", restarts), whole("candidates", candidates, 0)
+        if self.options.walkers is not None:
+            whole("walkers", self.options.walkers, 2 * len(self.space) + 2)
 
-    def settings(self) -> dict[str, Any]:
-        own = ("walkers", "effective", "restarts", "candidates")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
-
-    def start(self, trajectories: Trajectories) -> State:
-        """Fit ``laplace``, with at most four fifths of the budget, which places the walkers and supplies the starts' Jacobian."""
-        first = Laplace(
+    def start(self, trajectories: Trajectories) -> MCMCState:
+        """Fit ``laplace``, which places the walkers and supplies the starts' Jacobian."""
+        tuning, windows = self.options.tuning, self.windows(trajectories)
+        search = Laplace(
             self.simulator,
             prior=self.prior,
-            budget=max(1, 4 * self.budget // 5),
+            budget=max(1, int(tuning.search_share * self.budget)),
             seed=self.seed,
             likelihood=self.likelihood,
-            restarts=self.restarts,
-            candidates=self.candidates,
+            restarts=self.options.restarts,
+            candidates=self.options.candidates,
         )
-        windows = self.windows(trajectories)
         try:
-            found = first.fit(trajectories)
+            normals = search.fit(trajectories)
         except BudgetTooSmall:
             raise BudgetExhausted(
                 f"{self.budget} rollouts did not suffice for the laplace fit that comes first"
             ) from None
-        windows.rollouts += first.rollouts
-        assert first.snapshot is not None
-        searched = first.snapshot.state
-        for sentence in (
-            f.text for f in first.snapshot.findings
-        ):  # of the search; its posterior's do not hold of the chains
-            self.warn(sentence)
-        best = distinct_modes(searched)[0]
-        mode = {k[5:]: v[best] for k, v in searched.items() if k.startswith("mode_")}
-        if not mode.get("settled", True):
-            self.doubt(UNSETTLED)  # the chains hold that noise
-        at_optimum = (state_space_target if isinstance(windows, Chain) else window_target).at_optimum
-        picked, proposal = at_optimum(windows, mode), found
-        if "draws_share" in searched:  # kernels, which are slow to draw from
-            mean, covariance = found.gaussian_moments()
-            proposal = GaussianMixture([0.0], mean[None], covariance[None], self.space)
+        windows.rollouts += search.rollouts
+        assert search.snapshot is not None
+        # what was noticed on the way holds; what its posterior says of itself does not hold of the chains
+        self.findings.extend(search.snapshot.findings)
+        optima = search.snapshot.state.search.optima
+        fit = self._fit(windows, optima[distinct(optima)[0]])
+        if search.snapshot.state.draws is not None:  # kernels, which are slow to draw from
+            mean, covariance = normals.gaussian_moments()
+            normals = GaussianMixture([0.0], mean[None], covariance[None], self.space)
+        spread = tuning.wider**2 * normals.covariances.numpy()
+        proposal = Proposal(normals.log_weights.numpy(), normals.means.numpy(), spread)
         random = np.random.RandomState(self.seed)
-        state = {
-            "done": False,
-            **picked,
-            "proposal_weights": proposal.log_weights.numpy(),
-            "proposal_means": proposal.means.numpy(),
-            "proposal_covariances": _WIDER**2 * proposal.covariances.numpy(),
-        }
-        count = self.walkers or max(24, 2 * len(self.space) + 2)
-        walkers, log_prob = self._place(windows, state, count, random)
-        return {
-            **state,
-            "walkers": walkers,
-            "log_prob": log_prob,
-            "best": state["fit_theta"],
-            "best_log_prob": float(self._target(windows, state)(state["fit_theta"][None])[0]),
-            "linearisation_error": self._linearisation_error(windows, state, walkers),
-            "chain": np.empty((0, *walkers.shape)),
-            "chain_log_prob": np.empty((0, count)),
-            "accepted": np.zeros(count),
-            **_random_state(random),
-        }
+        count = self.options.walkers or max(tuning.least_walkers, 2 * len(self.space) + 2)
+        target = self._target(windows, fit)
+        walkers, log_prob = self._place(target, proposal, count, random)
+        best = fit.optimum.theta
+        return MCMCState(
+            fit,
+            proposal,
+            walkers,
+            log_prob,
+            best,
+            best_log_prob=float(target(best[None])[0]),
+            linearisation_error=self._linearisation_error(windows, target, walkers),
+            chain=np.empty((0, *walkers.shape)),
+            chain_log_prob=np.empty((0, count)),
+            accepted=np.zeros(count),
+            random=RandomState.of(random),
+        )
 
-    def _target(self, windows: Windows | Chain, state: State) -> Any:
+    def _fit(self, windows: Windows | Chain, optimum: WindowOptimum | ChainOptimum) -> WindowFit | ChainFit:
+        """What the target needs of an optimum."""
+        if isinstance(windows, Chain):
+            assert isinstance(optimum, ChainOptimum)
+            if not optimum.settled:
+                self.find(Code.PROCESS_NOISE_UNSETTLED)  # the chains hold that noise
+            return ChainFit.at(windows, optimum)
+        assert isinstance(optimum, WindowOptimum)
+        return WindowFit.at(windows, optimum)
+
+    def _target(self, windows: Windows | Chain, fit: WindowFit | ChainFit) -> WindowTarget | ChainTarget:
         """log p(theta | y) of walkers, of either likelihood."""
         if isinstance(windows, Chain):
-            return state_space_target.ChainTarget(self.prior, windows, state)
-        return window_target.WindowTarget(self.prior, windows, state)
+            assert isinstance(fit, ChainFit)
+            return ChainTarget(self.prior, windows, fit)
+        assert isinstance(fit, WindowFit)
+        return WindowTarget(self.prior, windows, fit)
 
     def _place(
-        self, windows: Windows, state: State, count: int, random: np.random.RandomState
+        self, target: WindowTarget | ChainTarget, proposal: Proposal, count: int, random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
         """Walkers (count, N) drawn from the proposal, each where the target is finite, and its values there."""
-        proposal, target = _Proposal(self, state), self._target(windows, state)
-        walkers = proposal.draw(count, random)
+        draws = IndependentMove(proposal, self.space)
+        walkers = draws.sample(count, random)
         log_prob = target(walkers)
-        for _ in range(_PLACINGS):
+        for _ in range(self.options.tuning.placings):
             lost = np.flatnonzero(~np.isfinite(log_prob))
             if not len(lost):
                 return walkers, log_prob
-            walkers[lost] = proposal.draw(len(lost), random)
+            walkers[lost] = draws.sample(len(lost), random)
             log_prob[lost] = target(walkers[lost])
         raise ValueError(
             f"mcmc: {len(lost)} of {count} walkers found no valid place around the laplace fit; "
             "the simulation diverges there: narrow the bounds or shorten the model's timestep"
         )
 
-    def describe(self, state: State) -> str:
-        return f"mcmc: step {len(state['chain'])}"
+    def describe(self, state: MCMCState) -> str:
+        """Steps until now."""
+        return f"mcmc: step {len(state.chain)}"
 
-    def step(self, state: State, trajectories: Trajectories) -> State:
+    def step(self, state: MCMCState, trajectories: Trajectories) -> MCMCState:
         """A block of steps of the whole ensemble."""
         import emcee
 
         windows = self.windows(trajectories)
-        walkers, dimensions = state["walkers"].shape
-        steps = min(_BLOCK, (self.budget - windows.rollouts) // (walkers * len(trajectories)))
+        walkers, dimensions = state.walkers.shape
+        room = (self.budget - windows.rollouts) // (walkers * len(trajectories))
+        steps = min(self.options.tuning.block, room)
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")
-        proposal, target = _Proposal(self, state), self._target(windows, state)
-        sampler = emcee.EnsembleSampler(
-            walkers,
-            dimensions,
-            target,
-            vectorize=True,
-            moves=[
-                (emcee.moves.MHMove(proposal), 0.6),
-                (emcee.moves.DEMove(), 0.3),
-                (emcee.moves.DESnookerMove(), 0.1),
-            ],
+        target = self._target(windows, state.fit)
+        moves = (
+            emcee.moves.MHMove(IndependentMove(state.proposal, self.space)),
+            emcee.moves.DEMove(),
+            emcee.moves.DESnookerMove(),
         )
+        shares = list(zip(moves, _MOVES, strict=True))
+        sampler = emcee.EnsembleSampler(walkers, dimensions, target, vectorize=True, moves=shares)
         sampler.log_prob_fn = target  # bare: emcee's wrapper prints the walkers when it is interrupted
-        begin = emcee.State(state["walkers"], log_prob=state["log_prob"], random_state=_restore_random(state))
+        begin = emcee.State(state.walkers, log_prob=state.log_prob, random_state=state.random.plain())
         end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
         random = np.random.RandomState()
         random.set_state(end.random_state)
         chain, log_prob = sampler.get_chain(), sampler.get_log_prob()
         top = np.unravel_index(log_prob.argmax(), log_prob.shape)
-        better = log_prob[top] > state["best_log_prob"]
-        state = {
-            **state,
-            "walkers": end.coords,
-            "log_prob": end.log_prob,
-            "best": chain[top] if better else state["best"],
-            "best_log_prob": float(max(log_prob[top], state["best_log_prob"])),
-            "chain": np.concatenate([state["chain"], chain]),
-            "chain_log_prob": np.concatenate([state["chain_log_prob"], log_prob]),
-            "accepted": state["accepted"] + sampler.backend.accepted,
-            **_random_state(random),
-        }
+        state = replace(
+            state,
+            walkers=end.coords,
+            log_prob=end.log_prob,
+            best=chain[top] if log_prob[top] > state.best_log_prob else state.best,
+            best_log_prob=float(max(log_prob[top], state.best_log_prob)),
+            chain=np.concatenate([state.chain, chain]),
+            chain_log_prob=np.concatenate([state.chain_log_prob, log_prob]),
+            accepted=state.accepted + sampler.backend.accepted,
+            random=RandomState.of(random),
+        )
         mixing = self._mixing(state)
-        enough = mixing["ess"] >= self.effective and mixing["rhat"] <= _MIXED_RHAT
-        return {**state, "done": bool(enough)}
+        enough = mixing["ess"] >= self.options.effective and mixing["rhat"] <= THRESHOLDS.mixed
+        return replace(state, done=bool(enough))
 
-    def _mixing(self, state: State) -> dict[str, float]:
+    def _mixing(self, state: MCMCState) -> dict[str, float]:
         """Worst R-hat over the parameters, effective draws and acceptance of the chain after warm-up."""
         kept = self._kept(state)
-        if len(kept) < 2 * _BLOCK:
-            return {"rhat": np.inf, "ess": 0.0, "acceptance": 0.0, "steps": len(state["chain"])}
+        if len(kept) < 2 * self.options.tuning.block:
+            return {"rhat": np.inf, "ess": 0.0, "acceptance": 0.0, "steps": len(state.chain)}
         import arviz
         import emcee
 
@@ -221,98 +304,88 @@ class MCMC(Estimator):
             time = emcee.autocorr.integrated_time(kept, quiet=True, tol=0, has_walkers=True)
         steps, walkers = kept.shape[:2]
         tau = max(1.0, float(np.nanmax(time))) if np.isfinite(time).any() else float(steps)
+        ess = steps * walkers / tau
         return {
             "rhat": rhat,
-            "ess": steps * walkers / tau if steps >= 10 * tau else min(steps * walkers / tau, 10.0 * walkers),
+            "ess": ess if steps >= _LONG * tau else min(ess, float(_LONG * walkers)),
             "autocorrelation_steps": tau,
-            "acceptance": float(state["accepted"].sum()) / (len(state["chain"]) * walkers),
-            "steps": len(state["chain"]),
+            "acceptance": float(state.accepted.sum()) / (len(state.chain) * walkers),
+            "steps": len(state.chain),
         }
 
-    def _kept(self, state: State) -> FloatArray:
-        """The chain after warm-up (steps, walkers, N)."""
-        return state["chain"][int(_WARM_UP * len(state["chain"])) :]
+    def _kept(self, state: MCMCState) -> FloatArray:
+        """The chain after warm-up (steps, W, N)."""
+        return state.chain[int(self.options.tuning.warm_up * len(state.chain)) :]
 
-    def posterior(self, state: State, trajectories: Trajectories) -> Particles:
-        if not len(state["chain"]):
+    def posterior(self, state: MCMCState, trajectories: Trajectories) -> Particles:
+        """The chain after warm-up, thinned.
+
+        Args:
+            state: of a fit.
+            trajectories: the logs.
+
+        Raises:
+            BudgetTooSmall: where there is no step yet.
+        """
+        if not len(state.chain):
             raise BudgetTooSmall(f"budget: {self.budget} rollouts were not enough for one block of steps; raise it")
-        n = len(self.space)
-        chain = self._kept(state)
-        thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / _DRAWS)))
+        chain, tuning = self._kept(state), self.options.tuning
+        thin = max(1, int(np.ceil(chain.shape[0] * chain.shape[1] / tuning.most_draws)))
         theta = np.swapaxes(chain[::-thin][::-1], 0, 1)
-        log_prob = state["chain_log_prob"][-len(chain) :][::-thin][::-1].T
-        rates = np.repeat(state["accepted"] / len(state["chain"]), theta.shape[1])
+        log_prob = state.chain_log_prob[-len(chain) :][::-thin][::-1].T
+        rates = np.repeat(state.accepted / len(state.chain), theta.shape[1])
         stats = {"lp": log_prob.ravel(), "acceptance_rate": rates}
-        mixing = self._mixing(state)
-        mixing["linearisation_error"] = state["linearisation_error"]
-        self.diagnostics = {"mixing": mixing, **_noise_of(state)}
-        if not (mixing["rhat"] <= _MIXED_RHAT and mixing["ess"] >= self.effective / 2):
-            self.doubt(
-                f"the chains have not mixed (R-hat {mixing['rhat']:.3f}, {mixing['ess']:.0f} effective draws): "
-                "raise the budget before you trust the intervals"
-            )
-        if mixing["linearisation_error"] > 0.5:
-            what, remedy = "windows' starts", "use shorter windows"
-            if isinstance(self.windows(trajectories), Chain):
-                what, remedy = "states", "hold the intervals against those of laplace"
-            self.warn(f"the {what} are strongly nonlinear (error {mixing['linearisation_error']:.2f} nats): {remedy}")
-        flat = np.clip(theta.reshape(-1, n), 0, 1)
-        return Particles(flat, self.space, chains=len(theta), best=np.clip(state["best"], 0, 1), sample_stats=stats)
+        mixing, error = self._mixing(state), state.linearisation_error
+        self.diagnostics = {"mixing": {**mixing, "linearisation_error": error}, **_noise_of(state.fit)}
+        if not (mixing["rhat"] <= THRESHOLDS.mixed and mixing["ess"] >= self.options.effective / 2):
+            words = {"what": "chains", "unit": " draws", "remedy": "raise the budget"}
+            self.find(Code.NOT_MIXED, rhat=mixing["rhat"], ess=mixing["ess"], **words)
+        if error > tuning.nonlinear:
+            chained = isinstance(self.windows(trajectories), Chain)
+            self.find(Code.NONLINEAR_STATES if chained else Code.NONLINEAR_STARTS, error=error)
+        flat = np.clip(theta.reshape(-1, len(self.space)), 0, 1)
+        return Particles(flat, self.space, chains=len(theta), best=np.clip(state.best, 0, 1), sample_stats=stats)
 
-    def _linearisation_error(self, windows: Windows, state: State, walkers: FloatArray) -> float:
+    def _linearisation_error(
+        self, windows: Windows | Chain, target: WindowTarget | ChainTarget, walkers: FloatArray
+    ) -> float:
         """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""
+        tuning = self.options.tuning
         if not windows.num_start:
             return 0.0
-        target = self._target(windows, state)
         cost = len(windows.trajectories) * target.check_cost
-        count = min(_CHECKED, int(_CHECKS_SHARE * self.budget) // cost)
-        if count < 4 or windows.rollouts + count * cost > self.budget:
+        count = min(tuning.checked, int(tuning.check_share * self.budget) // cost)
+        if count < _FEWEST_CHECKED or windows.rollouts + count * cost > self.budget:
             return float("nan")
         points = walkers[np.linspace(0, len(walkers) - 1, count).astype(int)]
         return float(np.std([float(target(p[None])[0]) - target.refreshed(p) for p in points]))
 
 
-def _noise_of(state: State) -> dict[str, Any]:
+def _noise_of(fit: WindowFit | ChainFit) -> dict[str, object]:
     """The noise of the laplace fit."""
-    found = {"noise_sd": state["fit_sd"].tolist(), "noise_tau": state["fit_tau"].tolist()}
-    if "fit_process" not in state:
-        return found
-    return found | process_diagnostics(*(state[f"fit_{name}"] for name in ("process", "movement", "loose")))
+    optimum = fit.optimum
+    noise = {"noise_sd": optimum.sd.tolist(), "noise_tau": optimum.tau.tolist()}
+    if isinstance(optimum, ChainOptimum):
+        return noise | process_diagnostics(optimum.process, optimum.movement, optimum.loose)
+    return noise
 
 
-class _Proposal:
-    """Independent draws of theta, and the log density ratio that Metropolis-Hastings needs."""
+class IndependentMove:
+    """Independent draws of theta, and the log density ratio that Metropolis-Hastings needs, as emcee asks for it."""
 
-    def __init__(self, owner: MCMC, state: State) -> None:
-        self.theta = GaussianMixture(
-            state["proposal_weights"], state["proposal_means"], state["proposal_covariances"], owner.space
-        )
+    def __init__(self, proposal: Proposal, space: ParameterSpace) -> None:
+        self.theta = GaussianMixture(proposal.weights, proposal.means, proposal.covariances, space)
 
-    def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
-        """(count, N)."""
+    def sample(self, count: int, random: np.random.RandomState) -> FloatArray:
+        """Draws (count, N)."""
         generator = torch.Generator().manual_seed(int(random.randint(2**31)))
         return self.theta.sample((count,), generator=generator).numpy()
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """(count,), up to a constant."""
+        """Of points (B, N) the log density (B,), up to a constant."""
         return self.theta.log_prob(torch.from_numpy(np.clip(points, 0, 1))).numpy()
 
     def __call__(self, coords: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
-        proposed = self.draw(len(coords), random)
+        """Proposals (W, N) for walkers (W, N), and the log ratio of densities (W,)."""
+        proposed = self.sample(len(coords), random)
         return proposed, self.log_density(coords) - self.log_density(proposed)
-
-
-def _random_state(random: np.random.RandomState) -> State:
-    kind, keys, position, has_gauss, cached = random.get_state(legacy=True)
-    return {
-        "random_kind": str(kind),
-        "random_keys": np.asarray(keys),
-        "random_position": int(position),
-        "random_has_gauss": int(has_gauss),
-        "random_cached": float(cached),
-    }
-
-
-def _restore_random(state: State) -> tuple[Any, ...]:
-    names = ("kind", "keys", "position", "has_gauss", "cached")
-    return tuple(state[f"random_{n}"] for n in names)

@@ -156,7 +156,7 @@ class Windows:
     def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
         self.rollouts, self.budget = 0, math.inf
-        self._glimpse: Windows | None = None
+        self._subset: Windows | None = None
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
         if settings.starts == "recorded" and trajectories.states is None:
             raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
@@ -217,17 +217,17 @@ class Windows:
     def _timestep(self) -> FloatArray:
         return np.array([self.simulator.physics_steps(float(d))[1] for d in self.dt])
 
-    def glimpse(self) -> Windows:
+    def every_other(self) -> Windows:
         """Every other window, for a rough search; the windows themselves where a log has fewer than four. Its rollouts are
         counted by themselves, as if whole."""
         if np.bincount(self.log).min() < 4:
             return self
-        if self._glimpse is None:
-            self._glimpse = self._every_other()
-        self._glimpse.rollouts, self._glimpse.budget = self.rollouts, self.budget
-        return self._glimpse
+        if self._subset is None:
+            self._subset = self._cut_subset()
+        self._subset.rollouts, self._subset.budget = self.rollouts, self.budget
+        return self._subset
 
-    def _every_other(self) -> Windows:
+    def _cut_subset(self) -> Windows:
         within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
         view, keep = copy.copy(self), np.flatnonzero(within % 2 == 0)
         for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):

@@ -17,9 +17,10 @@ import sipe_bayes as sipe
 from sipe_bayes.core.checkpoint import CheckpointError, State, load_state, save_state
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace.chain_state import ChainOptimum
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.smoother import Point, descend, first_noise, infer_noise, sound
-from sipe_bayes.inference.laplace.state_space_target import ChainTarget, at_optimum
+from sipe_bayes.inference.laplace.state_space_target import ChainFit, ChainTarget
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
@@ -168,7 +169,9 @@ def test_laplace_and_mcmc_find_the_kalman_filters_posterior() -> None:
     firsts = chain.reference[chain.first][:, 1:3]
     state = estimators["laplace"].state
     assert state is not None
-    noise = ChainNoise(state["mode_sd"][0], state["mode_process"][0])
+    (optimum, *_) = state.search.optima
+    assert isinstance(optimum, ChainOptimum)
+    noise = ChainNoise(optimum.sd, optimum.process)
     print("noise", noise, "made with", MADE_WITH)
     assert noise.sd[0] == pytest.approx(SD, rel=0.3)
     assert noise.process[1] == pytest.approx(PROCESS[1], rel=0.5)
@@ -221,7 +224,7 @@ def test_no_budget_loses_what_was_found() -> None:
         estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0, budget=budget)
         estimator.fit(kicked_logs())
         assert estimator.state is not None
-        found.append((float(estimator.state["mode_evidence"][0]), len(estimator.diagnostics["loose"])))
+        found.append((estimator.state.search.optima[0].evidence, len(estimator.diagnostics["loose"])))
     print(found)
     evidence = np.array([value for value, _ in found])
     assert (np.diff(evidence) >= 0).all()
@@ -239,11 +242,24 @@ def test_the_target_with_fresh_jacobians_is_the_kalman_filter(lengths: float) ->
     assert found is not None
     solved = eliminate_states(found, noise)
     states = chain.moved(chain.reference, solved.states(np.zeros(1)))
-    mode = {"theta": theta, "states": states, "slope": solved.slope, "sd": noise.sd, "tau": np.zeros(len(noise.sd))}
-    mode |= {"process": noise.process, "movement": PROCESS, "loose": np.zeros(len(chain.linked), bool)}
-    mode |= {"theta_step": np.full(1, lengths), "state_step": np.full((len(states), 2), lengths)}
-    state = at_optimum(chain, mode)
-    target = ChainTarget(sipe.get_estimator(spring(), "laplace").prior, chain, state)
+    optimum = ChainOptimum(
+        theta=theta,
+        mean=theta,
+        covariance=np.eye(1),
+        evidence=0.0,
+        sd=noise.sd,
+        tau=np.zeros(len(noise.sd)),
+        states=states,
+        slope=solved.slope,
+        process=noise.process,
+        movement=PROCESS,
+        loose=np.zeros(len(chain.linked), bool),
+        theta_step=np.full(1, lengths),
+        state_step=np.full((len(states), 2), lengths),
+        settled=True,
+        point=0,
+    )
+    target = ChainTarget(sipe.get_estimator(spring(), "laplace").prior, chain, ChainFit.at(chain, optimum))
     sd = solved.precision[0, 0] ** -0.5
     points = theta + sd * np.array([[-2.0], [-1.0], [0.0], [1.0], [2.0]])
     exact = np.array([kalman(logs, firsts, LOW + p[0] * (HIGH - LOW)) for p in points])
@@ -330,7 +346,9 @@ def test_quaternions_stay_of_length_one() -> None:
     posterior = estimator.fit(log)
     state = estimator.state
     assert state is not None
-    lengths = np.linalg.norm(state["mode_states"][0][:, 1:5], axis=1)
+    (optimum, *_) = state.search.optima
+    assert isinstance(optimum, ChainOptimum)
+    lengths = np.linalg.norm(optimum.states[:, 1:5], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-9)
     print(float(posterior.mean[0]), float(posterior.stddev[0]))
     assert abs(float(posterior.mean[0]) - 0.3) < 4 * float(posterior.stddev[0]) < 0.2

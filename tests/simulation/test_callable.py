@@ -245,7 +245,7 @@ def test_many_candidates_find_a_narrow_valley() -> None:
         simulator = sipe.CallableSimulator(steps, space, name="steps", likelihood=0.01)
         estimator = Laplace(simulator, seed=seed, candidates=100)
         trajectories = Trajectories.stack([simulator.trajectory(steps(truth[None])[0])])
-        start = screen(estimator, estimator.windows(trajectories))[1]
+        start = screen(estimator.problem, estimator.windows(trajectories))[1]
         draws = estimator.prior.sample((100,), generator=torch.Generator().manual_seed(seed)).numpy()
         reached.append(np.abs(start - truth).mean())
         drawn.append(np.abs(draws - truth).mean(1).min())
@@ -253,9 +253,9 @@ def test_many_candidates_find_a_narrow_valley() -> None:
     assert np.mean(reached) < 0.6 * np.mean(drawn)
 
 
-def test_poll_leaves_the_false_optima_of_a_rough_misfit() -> None:
+def test_pattern_search_leaves_the_false_optima_of_a_rough_misfit() -> None:
     """Kinks every 1e-3, as contact makes them: linearised steps alone stop in one for 4 of these 10 truths, the nearest 4e-5 off and 24
-    sd wrong; with the poll every truth is found."""
+    sd wrong; with the pattern search every truth is found."""
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "ab")
     mix, phase = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0).uniform(size=30)
 
@@ -275,7 +275,7 @@ def test_poll_leaves_the_false_optima_of_a_rough_misfit() -> None:
 
 def test_intervals_stay_honest_where_the_simulation_is_chaotic() -> None:
     """A line with noise of sd .014 that is another one at every theta: the curvature that finite differences see says sd 1e-6, thousands of
-    times too narrow; the poll's intervals hold all of 10 truths within three sds, and still tell them to a tenth of the prior's range."""
+    times too narrow; the pattern search's intervals hold all of 10 truths within three sds, and still tell them to a tenth of the prior's range."""
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "ab")
     mix, rate = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0).uniform(1e8, 1e9, size=(2, 30))
 
@@ -330,7 +330,7 @@ def test_poll_widens_to_what_fits_as_well() -> None:
 
 @pytest.mark.parametrize(("centre", "sd"), [(0.5, 0.0378), (0.5, 0.033), (0.45, 0.0005)])
 def test_poll_keeps_two_optima_apart(centre: float, sd: float) -> None:
-    """theta enters squared; an optimum of which another lies just where the poll looks stays narrow, and both are found. The saddle between,
+    """theta enters squared; an optimum of which another lies just where the pattern search looks stays narrow, and both are found. The saddle between,
     where the search may begin, is none."""
     space, away = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=1.0)]), 0.3 if centre == 0.5 else 0.05
     simulator = sipe.CallableSimulator(lambda v: (v - centre) ** 2, space, likelihood=sd)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,68 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.loose_jumps import rarity
-from sipe_bayes.inference.laplace.optima import Search
 from sipe_bayes.inference.laplace.smoother import border, penalty, process_penalty, scale
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ChainOptimum(Optimum):
+    """An optimum of a chain of states.
+
+    Args:
+        states: (K, S).
+        slope: (K, D, N): states follow theta by minus this.
+        process: (D,), sd of the process noise.
+        movement: (D,), of a coordinate in a control step.
+        loose: (K-1,), jumps that are let go.
+        theta_step: (N,), of the finite differences; zero: short ones.
+        state_step: (K, D).
+        settled: whether the noise had.
+        point: number of the starting point.
+    """
+
+    states: FloatArray
+    slope: FloatArray
+    process: FloatArray
+    movement: FloatArray
+    loose: BoolArray
+    theta_step: FloatArray
+    state_step: FloatArray
+    settled: bool
+    point: int
+
+
+@dataclass(frozen=True)
+class ChainState:
+    """The state of a search over a chain of states, still as a dictionary."""
+
+    data: State
+
+    @property
+    def done(self) -> bool:
+        """Whether the last starting point has been followed to its end."""
+        return bool(self.data["done"])
+
+    @property
+    def optima(self) -> tuple[ChainOptimum, ...]:
+        """Those recorded."""
+        data = {f.name: self.data[f"mode_{f.name}"] for f in fields(ChainOptimum)}
+        scalars = {"evidence": float, "settled": bool, "point": int}
+        return tuple(
+            ChainOptimum(**{k: scalars[k](v[m]) if k in scalars else v[m] for k, v in data.items()})
+            for m in range(len(data["evidence"]))
+        )
+
+    def describe(self) -> str:
+        """Starting point and step."""
+        return f"start {self.data['point'] + 1} of {len(self.data['points'])}, step {self.data['iteration']}"
 
 
 def opening(chain: Chain, points: FloatArray) -> State:
@@ -60,11 +115,11 @@ def begin(chain: Chain, theta: FloatArray) -> State:
     }
 
 
-def screened(search: Search, chain: Chain) -> FloatArray:
+def screened(search: SearchProblem, chain: Chain) -> FloatArray:
     """Starting points (R, N): the model as given and the best of a few draws from the prior, by the jumps that they leave
     between states as measured; raises ValueError where all diverge."""
     generator = torch.Generator().manual_seed(search.seed)
-    draws = search.prior.sample((search.candidates,), generator=generator).numpy()
+    draws = search.prior.sample((search.options.candidates,), generator=generator).numpy()
     points = np.concatenate([search.space.default_theta[None], draws])
     found = chain.compare(points, np.tile(chain.reference, (len(points), 1, 1)))
     good = [k for k, one in enumerate(found) if one is not None]
@@ -74,11 +129,11 @@ def screened(search: Search, chain: Chain) -> FloatArray:
             "or shorten the model's timestep"
         )
     if good[0] != 0:
-        search.warn("the model as given diverges on these logs; the search started elsewhere")
+        search.find(finding(Code.DIVERGES_AS_GIVEN))
     sizes = np.array([scale(one) for one in found if one is not None])
     order = np.argsort(np.log(sizes).sum(1), kind="stable")
     chosen = [good[k] for k in order if good[k] != 0]
-    return points[([0] if good[0] == 0 else []) + chosen][: search.restarts]
+    return points[([0] if good[0] == 0 else []) + chosen][: search.options.restarts]
 
 
 def process_diagnostics(process: FloatArray, movement: FloatArray, loose: BoolArray) -> dict[str, Any]:
@@ -87,7 +142,9 @@ def process_diagnostics(process: FloatArray, movement: FloatArray, loose: BoolAr
     return {name: values.tolist() for name, values in found.items()}
 
 
-def evidence_of(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool) -> float:
+def evidence_of(
+    search: SearchProblem, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool
+) -> float:
     """log p(noise | y), states and theta integrated out, up to a constant; unless ``settled`` without what the next step would
     gain, were the model linear."""
     theta, prior = state["theta"], search.quadratic_prior
@@ -97,7 +154,7 @@ def evidence_of(search: Search, state: State, found: ChainLinearisation, noise: 
 
 
 def recorded(
-    search: Search,
+    search: SearchProblem,
     state: State,
     found: ChainLinearisation,
     noise: ChainNoise,

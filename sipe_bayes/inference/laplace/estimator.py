@@ -30,197 +30,196 @@ simulation's own rounding leaves are no independent evidence: such a channel cou
 
 from __future__ import annotations
 
-from types import ModuleType
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import importance, known_start_search, state_space_search, window_search
-from sipe_bayes.inference.laplace.chain_state import process_diagnostics
+from sipe_bayes.inference.laplace import importance
+from sipe_bayes.inference.laplace.chain_state import ChainOptimum, ChainState, process_diagnostics
+from sipe_bayes.inference.laplace.importance import Draws
+from sipe_bayes.inference.laplace.known_start_search import KnownStartSearch
 from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.inference.laplace.optima import distinct_modes
-from sipe_bayes.inference.laplace.poll import SHORTEST
-from sipe_bayes.inference.laplace.window_target import WindowTarget, at_optimum
+from sipe_bayes.inference.laplace.options import LaplaceOptions
+from sipe_bayes.inference.laplace.pattern_search import SHORTEST
+from sipe_bayes.inference.laplace.state_space_search import StateSpaceSearch
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
+from sipe_bayes.inference.laplace.window_search import WindowSearch
+from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
+from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.settings import BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
 
-FloatArray = NDArray[np.float64]
-
-_LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal
 _SHARP = 10 * SHORTEST  # an sd that the look around the optimum may have set
-_LEAST_BATCHES = 6  # of importance draws for which the budget must have room, and before they are called hopeless
-UNSETTLED = "the process noise had not settled: do not rely on the intervals; more restarts may help"
+_RANK = 1e-9  # of the largest eigenvalue of the data's information: below it a direction is open
 
 
-class Laplace(Estimator):
-    """Mixture of truncated normals at the optima of the windowed likelihood; see the module's docstring.
+@dataclass(frozen=True)
+class LaplaceState:
+    """A fit of ``laplace``.
 
-    restarts: starting points followed, at most. candidates: points among which they are chosen: draws from the prior and, of 40 or more,
-    later ones around the best; without effect where ``known_start_search`` finds them. initial (R, N): the starting points themselves instead.
+    Args:
+        search: the state of its ``Strategy``.
+        draws: those that take the normal's place; None before them, and where it stands.
+        done: whether both have ended.
+    """
+
+    search: WindowState | ChainState
+    draws: Draws | None = None
+    done: bool = False
+
+
+class Laplace(Estimator[LaplaceState]):
+    """Mixture of truncated normals at the optima of the likelihood; see the package's docstring.
+
+    Args:
+        restarts: starting points followed, at most.
+        candidates: points among which they are chosen: draws from the prior and, of 40 or more, later ones around the
+            best; without effect where ``known_start_search`` finds them.
+        initial: (R, N), the starting points themselves instead.
+        tuning: numbers of the search itself.
     """
 
     name: ClassVar[str] = "laplace"
     searches: ClassVar[bool] = True
     default_budget: ClassVar[int] = 5000
+    options_type = LaplaceOptions
+    state_type = LaplaceState
+    options: LaplaceOptions
 
-    def __init__(
-        self,
-        simulator: Any,
-        *,
-        restarts: int = 2,
-        candidates: int = 8,
-        initial: FloatArray | None = None,
-        **settings: Any,
-    ) -> None:
-        super().__init__(simulator, **settings)
-        self.restarts, self.candidates = whole("restarts", restarts), whole("candidates", candidates, 0)
-        self.initial = None if initial is None else np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
-
-    def settings(self) -> dict[str, Any]:
-        initial = None if self.initial is None else self.initial.tolist()
-        return {
-            **super().settings(),
-            "restarts": self.restarts,
-            "candidates": self.candidates,
-            "initial": initial,
-        }
+    def check_options(self) -> None:
+        """Hold the starting points against the parameters, and into the cube."""
+        initial = self.options.initial
+        if initial is not None:
+            inside = np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
+            self.options = replace(self.options, initial=inside)
 
     @property
-    def quadratic_prior(self) -> QuadraticPrior:
-        """The prior's normal, before truncation."""
-        return QuadraticPrior.of(self.prior)
+    def problem(self) -> SearchProblem:
+        """What its search is given."""
+        return SearchProblem(self.space, self.prior, self.seed, self.options, self.options.initial, self.findings.add)
 
-    def start(self, trajectories: Trajectories) -> State:
+    def start(self, trajectories: Trajectories) -> LaplaceState:
+        """The first state of the search that fits the likelihood."""
+        return LaplaceState(self._strategy(self.windows(trajectories)).start())
+
+    def describe(self, state: LaplaceState) -> str:
+        """Starting point and step, or draws."""
+        if state.draws is not None:
+            return f"laplace: {len(state.draws.values)} importance draws"
+        return f"laplace: {state.search.describe()}"
+
+    def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
+        """A step of the search, or, where it has ended, one more batch of draws."""
         windows = self.windows(trajectories)
-        return self._how(windows).start(self, windows)
+        if state.draws is not None:
+            return self._drawn(windows, state, state.draws)
+        search = self._strategy(windows).step(state.search)
+        state = replace(state, search=search)
+        return self._probed(windows, state) if search.done else state
 
-    def describe(self, state: State) -> str:
-        if "draws_share" in state:
-            return f"laplace: {len(state['draws_values'])} importance draws"
-        return f"laplace: start {state['point'] + 1} of {len(state['points'])}, step {state['iteration']}"
-
-    def step(self, state: State, trajectories: Trajectories) -> State:
-        windows = self.windows(trajectories)
-        if "draws_share" in state:
-            return self._draw(windows, state)
-        state = self._how(windows).step(self, windows, state)
-        return self._probed(windows, state) if state["done"] else state
-
-    def _probed(self, windows: Any, state: State) -> State:
-        """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
-        if isinstance(windows, Chain) or windows.num_start or windows.settings.noise == "sandwich":
-            return state
-        kept, n, count = distinct_modes(state), len(self.space), len(windows.trajectories)
-        least = (importance.cost(n) + _LEAST_BATCHES * importance.batch(n)) * count
-        if len(kept) != 1 or state["mode_guessed"][kept[0]] or windows.rollouts + least > windows.budget:
-            return state
-        if np.sqrt(np.diag(state["mode_covariance"][kept[0]])).min() < _SHARP:
-            return state
-        target = self._target(windows, state, kept[0])
-        optimum = (state[f"mode_{k}"][kept[0]] for k in ("theta", "mean", "covariance"))
-        if target.silent or importance.normal(target, *optimum):
-            return state
-        return {**state, "done": False, **importance.begin(n)}
-
-    def _draw(self, windows: Windows, state: State) -> State:
-        """One more batch of draws, as long as they promise something and the budget lasts."""
-        kept = distinct_modes(state)
-        found, n = self._normals(state, kept), len(self.space)
-        state = importance.draw(state, self._target(windows, state, kept[0]), found, self.prior, self.seed)
-        batches, effective = len(state["draws_share"]), importance.effective(importance.weights(state, self.prior))
-        hopeless = batches >= _LEAST_BATCHES and effective < batches
-        room = windows.rollouts + importance.batch(n) * len(windows.trajectories) <= windows.budget
-        done = effective >= importance.ENOUGH or batches >= importance.MOST or hopeless or not room
-        return {**state, "done": done}
-
-    def _target(self, windows: Windows, state: State, mode: int) -> WindowTarget:
-        picked = {k[5:]: v[mode] for k, v in state.items() if k.startswith("mode_")}
-        return WindowTarget(self.prior, windows, at_optimum(windows, picked))
-
-    def _how(self, windows: Any) -> ModuleType:
-        """The search that fits the likelihood: its functions ``start`` and ``step``."""
+    def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
+        """The search that fits the likelihood."""
         if not isinstance(windows, Chain):
-            return window_search
-        return known_start_search if windows.settings.starts == "recorded" else state_space_search
+            return WindowSearch(self.problem, windows)
+        known = windows.settings.starts == "recorded"
+        return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
 
-    def posterior(self, state: State, trajectories: Trajectories) -> GaussianMixture:
-        if not len(state["mode_theta"]):
+    def _probed(self, windows: Windows | Chain, state: LaplaceState) -> LaplaceState:
+        """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
+        ended, tuning, n = replace(state, done=True), self.options.tuning.importance, len(self.space)
+        if isinstance(windows, Chain) or windows.num_start or windows.settings.noise == "sandwich":
+            return ended
+        kept = _kept(state)
+        batches = tuning.hopeless_after * importance.batch_size(n, tuning)
+        least = (importance.probe_size(n) + batches) * len(windows.trajectories)
+        if len(kept) != 1 or not isinstance(kept[0], WindowOptimum) or kept[0].guessed:
+            return ended
+        if windows.rollouts + least > windows.budget or np.sqrt(np.diag(kept[0].covariance)).min() < _SHARP:
+            return ended
+        target = self._target(windows, kept[0])
+        if target.silent or importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
+            return ended
+        return replace(state, draws=Draws.none(n))
+
+    def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
+        """One more batch of draws, as long as they promise something and the budget lasts."""
+        kept, tuning, n = _kept(state), self.options.tuning.importance, len(self.space)
+        normal, target = mixture(kept, self.space), self._target(windows, kept[0])
+        draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
+        effective = importance.effective(importance.weights(draws, self.prior))
+        hopeless = draws.batches >= tuning.hopeless_after and effective < draws.batches
+        room = windows.rollouts + importance.batch_size(n, tuning) * len(windows.trajectories) <= windows.budget
+        done = effective >= tuning.enough or draws.batches >= tuning.most_batches or hopeless or not room
+        return replace(state, draws=draws, done=done)
+
+    def _target(self, windows: Windows, optimum: Optimum) -> WindowTarget:
+        assert isinstance(optimum, WindowOptimum)
+        return WindowTarget(self.prior, windows, WindowFit.at(windows, optimum))
+
+    def posterior(self, state: LaplaceState, trajectories: Trajectories) -> GaussianMixture:
+        """The optima's normals, or kernels on the draws that take their place.
+
+        Args:
+            state: of a fit.
+            trajectories: the logs.
+
+        Raises:
+            BudgetTooSmall: where there is no optimum yet.
+        """
+        kept = _kept(state)
+        if not kept:
+            step = self._strategy(self.windows(trajectories)).step_rollouts
             raise BudgetTooSmall(
                 f"budget: {self.budget} rollouts were not enough for one optimum; "
-                f"one step takes {self._cost(trajectories)} rollouts, so raise the budget"
+                f"one step takes {step} rollouts, so raise the budget"
             )
-        kept = distinct_modes(state)
-        self.diagnostics = {
-            "modes": len(kept),
-            "noise_sd": state["mode_sd"][kept[0]].tolist(),
-            "noise_tau": state["mode_tau"][kept[0]].tolist(),
-        }
-        if "mode_process" in state:
-            noise = (state[f"mode_{name}"][kept[0]] for name in ("process", "movement", "loose"))
-            self.diagnostics |= process_diagnostics(*noise)
-            if not state["mode_settled"][kept[0]]:
-                self.doubt(UNSETTLED)
-        for reason in (state["mode_reason"][k] for k in kept if "mode_reason" in state):
-            if reason:
-                self.doubt(reason)
-        if len(kept) > 1:
-            self.warn(f"the search found {len(kept)} separate optima; the posterior is a mixture of them")
-        found = self._normals(state, kept)
-        if "draws_share" not in state:
-            return found
-        weight = importance.weights(state, self.prior)
+        self._report(kept)
+        normals = mixture(kept, self.space)
+        if state.draws is None:
+            return normals
+        tuning, weight = self.options.tuning.importance, importance.weights(state.draws, self.prior)
         effective = importance.effective(weight)
         self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
-        if effective >= importance.LEAST:
-            return importance.kernels(state, weight, self.space, self.seed)
-        if state["done"]:
-            self.doubt(
-                f"the posterior is no normal, and {len(weight)} draws from it came to {effective:.1f} effective ones: compare with mcmc before you "
-                "trust the intervals"
-            )
-        return found
+        if effective >= tuning.least:
+            return importance.kernels(state.draws.points, weight, self.space, self.seed, tuning)
+        if state.done:
+            self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
+        return normals
 
-    def _normals(self, state: State, kept: list[int]) -> GaussianMixture:
-        """Those of the optima, weighted by their evidence."""
-        evidence = state["mode_evidence"][kept]
-        weights = torch.from_numpy(evidence - evidence.max())
-        return GaussianMixture(weights, state["mode_mean"][kept], state["mode_covariance"][kept], self.space)
-
-    def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance, before truncation, of the quadratic model of data and prior at theta."""
-        prior = self.quadratic_prior
-        covariance = _inverse(precision + prior.precision + FLAT_PRECISION * np.eye(len(theta)))
-        pull = gradient + prior.pull(theta) + FLAT_PRECISION * (0.5 - theta)
-        return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
+    def _report(self, kept: list[Optimum]) -> None:
+        """Diagnostics of the best optimum, and what is to be said against any that is kept."""
+        best = kept[0]
+        self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
+        if isinstance(best, ChainOptimum):
+            self.diagnostics |= process_diagnostics(best.process, best.movement, best.loose)
+            if not best.settled:
+                self.find(Code.PROCESS_NOISE_UNSETTLED)
+        for optimum in kept:
+            if isinstance(optimum, WindowOptimum) and optimum.finding is not None:
+                self.findings.add(optimum.finding)
+        if len(kept) > 1:
+            self.find(Code.SEPARATE_OPTIMA, count=len(kept))
 
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
-        if self.state is None or not len(self.state["mode_theta"]):
+        kept = [] if self.state is None else _kept(self.state)
+        if not kept:
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        best, prior = distinct_modes(self.state)[0], self.quadratic_prior
-        mean, total = self.state["mode_mean"][best], np.linalg.inv(self.state["mode_covariance"][best])
+        prior, mean, total = QuadraticPrior.of(self.prior), kept[0].mean, np.linalg.inv(kept[0].covariance)
         flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
-        return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information
-
-    def _cost(self, trajectories: Trajectories) -> int:
-        windows = self.windows(trajectories)
-        sides = 2 if self._how(windows) is known_start_search else 1
-        return (sides * (windows.num_theta + windows.num_start) + 2) * len(trajectories)
+        return np.linalg.pinv(information, rcond=_RANK, hermitian=True) @ right, information
 
 
-def _inverse(precision: FloatArray) -> FloatArray:
-    """Positive definite also where rounding leaves a precision that is not, between parameters that do the same."""
-    sd = 1 / np.sqrt(np.diag(precision))
-    eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)
-    return sd[:, None] * ((axes / np.maximum(eigenvalues, _LEAST_EIGENVALUE)) @ axes.T) * sd
+def _kept(state: LaplaceState) -> list[Optimum]:
+    """The optima worth keeping, best first."""
+    return [state.search.optima[k] for k in distinct(state.search.optima)]

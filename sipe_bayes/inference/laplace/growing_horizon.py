@@ -10,7 +10,6 @@ far above the noise, the beginnings grow once more, in smaller steps.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterator
 
@@ -18,11 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace import window_search
-from sipe_bayes.inference.laplace.optima import Search, distinct_modes
 from sipe_bayes.inference.laplace.smoother import roughness
+from sipe_bayes.inference.laplace.strategy import SearchProblem, distinct, mixture
+from sipe_bayes.inference.laplace.window_search import WindowSearch
+from sipe_bayes.inference.laplace.window_state import WindowState
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -38,7 +38,7 @@ _MOST, _GUESSING = 600, 0.3  # rollouts of one beginning of each log, and the sh
 _DRAWS, _FOLLOWED = 60, 2  # guesses for a beginning, and how many of them are followed
 
 
-def grown(search: Search, chain: Chain) -> FloatArray | None:
+def grown(search: SearchProblem, chain: Chain) -> FloatArray | None:
     """Starting points (R, N), perhaps fewer than asked for; None where even the shortest beginnings diverge, or the budget is too small
     for them. What is said on the way is not of the fit, but that the model as given diverges."""
     limit = chain.rollouts + _SHARE * (chain.budget - chain.rollouts)
@@ -60,7 +60,7 @@ def grown(search: Search, chain: Chain) -> FloatArray | None:
 
 
 def _attempt(
-    search: Search, chain: Chain, limit: float, longer: float, generator: torch.Generator
+    search: SearchProblem, chain: Chain, limit: float, longer: float, generator: torch.Generator
 ) -> FloatArray | None:
     likelihood = Segments(None, "white", chain.settings.fit, chain.settings.noise_sd, starts="recorded")
     points, posterior = search.space.default_theta[None], search.prior
@@ -81,11 +81,12 @@ def _attempt(
         if found is None:
             break
         fitted = True
-        if len(found["mode_theta"]):
-            points = found["mode_theta"][distinct_modes(found)[: search.restarts]]
-            posterior = _quiet(search).posterior(found, logs)
+        if found.optima:
+            kept = [found.optima[k] for k in distinct(found.optima)]
+            points = np.stack([one.theta for one in kept[: search.options.restarts]])
+            posterior = mixture(kept, search.space)
         else:
-            points = found["theta"][None]
+            points = found.here.theta[None]
     return points if fitted else None
 
 
@@ -112,28 +113,21 @@ def _horizons(chain: Chain, longer: float) -> Iterator[int]:
     yield longest
 
 
-def _fitted(search: Search, windows: Windows, guesses: FloatArray, first: bool) -> State | None:
+def _fitted(search: SearchProblem, windows: Windows, guesses: FloatArray, first: bool) -> WindowState | None:
     """The search's state where it or its budget ends; None where all guesses (B, N) diverge. first: whether the first of them is the model
     as given. Raises BudgetExhausted before any step."""
     residual, valid = windows.residuals(guesses, np.tile(windows.no_starts(), (len(guesses), 1, 1, 1)))
     if not valid.any():
         return None
     if first and not valid[0]:
-        search.warn("the model as given diverges on these logs; the search started elsewhere")
+        search.find(finding(Code.DIVERGES_AS_GIVEN))
     squares = np.maximum((residual**2).sum((1, 2)), 1e-300)
     order = np.argsort(np.where(valid, np.log(squares).sum(1), np.inf), kind="stable")
-    quiet = _quiet(search)
-    quiet.initial = guesses[order[: min(_FOLLOWED, int(valid.sum()))]]
-    state = window_search.start(quiet, windows)
+    strategy = WindowSearch(search.within(guesses[order[: min(_FOLLOWED, int(valid.sum()))]]), windows)
+    state = strategy.start()
     try:
-        while not state["done"]:
-            state = window_search.step(quiet, windows, state)
+        while not state.done:
+            state = strategy.step(state)
     except BudgetExhausted:
         pass
     return state
-
-
-def _quiet(search: Search) -> Search:
-    quiet = copy.copy(search)
-    quiet.warn = lambda sentence: None  # type: ignore[method-assign]
-    return quiet

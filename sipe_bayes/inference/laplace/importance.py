@@ -14,93 +14,142 @@ Deviation: the batches' covariance is drawn towards the first normal's by the ef
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.inference.search.gaussians import log_normal
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
-FloatArray = NDArray[np.float64]
+_JITTER = 1e-9  # of the variances: rounding leaves some kernels' covariance singular
+_TINY = 1e-300  # so that nothing is divided by zero
 
-_SDS = 2.0  # of a parameter, to which the probe goes
-_SLACK, _RANGE = 0.5, (0.6, 2.0)  # nats; how falls may compare, both with the slack
-_BATCH, _FIRST_SHARE, _SHARE = 24, 0.5, 0.2  # draws; of the prior
-_FIRST_WIDER, _WIDER = 1.5, 1.3  # times the sds
-ENOUGH, LEAST = 100, 30  # effective draws: with which it ends, and with which it may be relied on
-MOST = 20  # batches
-_KERNELS, _NARROWER, _JITTER = 60, 0.5, 1e-9  # the last of the variances
+
+@dataclass(frozen=True)
+class ImportanceTuning(Options):
+    """When draws take the normal's place, how they are drawn, and when they are enough."""
+
+    probe: float = option(2.0, "how far from the optimum the log posterior is looked at", "sd", above=0)
+    slack: float = option(0.5, "by which falls of the log posterior may differ for rounding's sake", "nats", least=0)
+    least_fall: float = option(0.6, "a fall, over that of the normal, with which it stands", above=0, below=1)
+    most_fall: float = option(2.0, "the same above", above=1)
+    batch: int = option(24, "draws of a batch, or two for each dimension", least=1)
+    most_batches: int = option(20, "batches at most", least=1)
+    hopeless_after: int = option(6, "batches with less than one effective draw each after which it ends", least=1)
+    first_share: float = option(0.5, "share of the first batch that comes from the prior", above=0, below=1)
+    share: float = option(0.2, "share of later ones: bounds the weights", above=0, below=1)
+    first_wider: float = option(1.5, "width of the first proposal over the normal's", above=0)
+    wider: float = option(1.3, "width of later ones over the draws'", above=0)
+    enough: float = option(100.0, "effective draws with which it ends", above=1)
+    least: float = option(30.0, "effective draws that may be relied on", above=1)
+    kernels: int = option(60, "kernels of the posterior", least=2)
+    narrower: float = option(0.5, "width of kernels over Silverman's rule, for the bounds' sake", above=0, below=1)
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws in S batches of all kinds.
+
+    Args:
+        points: (M, N).
+        values: (M,), the target there.
+        share: (S,), of each batch that of the prior.
+        mass: (S,), log of what lies of each batch's normal in the cube.
+        means: (S, N), of those normals.
+        covariances: (S, N, N).
+    """
+
+    points: FloatArray
+    values: FloatArray
+    share: FloatArray
+    mass: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+
+    @classmethod
+    def none(cls, size: int) -> Draws:
+        """Before the first batch, in ``size`` dimensions."""
+        return cls(*(np.empty((0, *shape)) for shape in ((size,), (), (), (), (size,), (size, size))))
+
+    @property
+    def batches(self) -> int:
+        """How many."""
+        return len(self.share)
+
 
 Target = Callable[[FloatArray], FloatArray]
 """Log densities (B,) of points (B, N)."""
 
 
-def cost(size: int) -> int:
-    """Points that ``normal`` looks at in ``size`` dimensions, at most."""
+def probe_size(size: int) -> int:
+    """Points that ``is_normal`` looks at in ``size`` dimensions, at most."""
     return 1 + 2 * size
 
 
-def normal(target: Target, theta: FloatArray, mean: FloatArray, cov: FloatArray) -> bool:
-    """Whether a log density is about that of N(mean, cov) around its optimum theta (N,); all in the cube."""
-    sd, precision = np.sqrt(np.diag(cov)), np.linalg.inv(cov)
-    steps = _SDS * np.concatenate([(cov / sd).T, -(cov / sd).T])  # a row for each parameter and side
-    room = np.where(steps > 0, 1 - theta, theta) / np.maximum(np.abs(steps), 1e-300)
+def is_normal(
+    target: Target, theta: FloatArray, mean: FloatArray, covariance: FloatArray, tuning: ImportanceTuning
+) -> bool:
+    """Whether a log density is about that of N(mean, covariance) around its optimum theta (N,); all in the cube."""
+    sd, precision = np.sqrt(np.diag(covariance)), np.linalg.inv(covariance)
+    along = (covariance / sd).T
+    steps = tuning.probe * np.concatenate([along, -along])  # a row for each parameter and side
+    room = np.where(steps > 0, 1 - theta, theta) / np.maximum(np.abs(steps), _TINY)
     points = np.clip(theta + np.minimum(1.0, room.min(1))[:, None] * steps, 0.0, 1.0)
     all_points = np.concatenate([theta[None], points])
     values = target(all_points)
     gaps = all_points - mean
     energies = 0.5 * np.einsum("bi,ij,bj->b", gaps, precision, gaps)
-    ratios = (values[0] - values[1:] + _SLACK) / (energies[1:] - energies[0] + _SLACK)
-    return bool((ratios > _RANGE[0]).all() and (ratios < _RANGE[1]).all())
+    ratios = (values[0] - values[1:] + tuning.slack) / (energies[1:] - energies[0] + tuning.slack)
+    return bool((ratios > tuning.least_fall).all() and (ratios < tuning.most_fall).all())
 
 
-def begin(size: int) -> State:
-    """A state without draws: points (S, N) and the target there (S,); of each batch its share of the prior, its normal's mean and covariance, and
-    the log of what lies of that in the cube."""
-    shapes = {"points": (0, size), "values": (0,), "share": (0,), "mass": (0,)}
-    shapes |= {"mean": (0, size), "covariance": (0, size, size)}
-    return {f"draws_{name}": np.empty(shape) for name, shape in shapes.items()}
-
-
-def batch(size: int) -> int:
+def batch_size(size: int, tuning: ImportanceTuning) -> int:
     """Draws of a batch in ``size`` dimensions."""
-    return max(_BATCH, 2 * size)
+    return max(tuning.batch, 2 * size)
 
 
-def draw(state: State, target: Target, found: GaussianMixture, prior: Posterior, seed: int) -> State:
-    """One more batch; found: Laplace's normal."""
-    done, size, share = len(state["draws_share"]), batch(len(found.space)), _SHARE
-    if done:
-        mean, covariance = _moments(state, found, prior)
+def draw(
+    draws: Draws, target: Target, normal: GaussianMixture, prior: Posterior, seed: int, tuning: ImportanceTuning
+) -> Draws:
+    """One more batch.
+
+    Args:
+        draws: those until now.
+        target: log densities.
+        normal: that of Laplace's method.
+        prior: over theta.
+        seed: of the draws.
+        tuning: of the batches.
+    """
+    batches, size = draws.batches, batch_size(len(normal.space), tuning)
+    if batches:
+        share, (mean, covariance) = tuning.share, _moments(draws, normal, prior, tuning)
     else:
-        mean, covariance, share = found.means.numpy()[0], _FIRST_WIDER**2 * found.covariances.numpy()[0], _FIRST_SHARE
-    proposal = GaussianMixture([0.0], mean[None], covariance[None], found.space)
-    rng = np.random.default_rng([seed, done])
+        share, mean = tuning.first_share, normal.means.numpy()[0]
+        covariance = tuning.first_wider**2 * normal.covariances.numpy()[0]
+    proposal = GaussianMixture([0.0], mean[None], covariance[None], normal.space)
+    rng = np.random.default_rng([seed, batches])
     generator, count = torch.Generator().manual_seed(int(rng.integers(2**31))), int(rng.binomial(size, share))
     drawn = [one.sample((n,), generator=generator) for one, n in ((proposal, size - count), (prior, count))]
     points = torch.cat(drawn).numpy()
-    new = {
-        "points": points,
-        "values": target(points),
-        "share": np.array([share]),
-        "mass": np.array([proposal.log_normaliser]),
-    }
-    new |= {"mean": mean[None], "covariance": covariance[None]}
-    return {**state, **{f"draws_{k}": np.concatenate([state[f"draws_{k}"], v]) for k, v in new.items()}}
+    mass = np.array([proposal.log_normaliser])
+    new = Draws(points, target(points), np.array([share]), mass, mean[None], covariance[None])
+    return Draws(*(np.concatenate([getattr(draws, f.name), getattr(new, f.name)]) for f in fields(Draws)))
 
 
-def weights(state: State, prior: Posterior) -> FloatArray:
-    """Of the draws (S,), which sum to one; all zero where no draw is worth anything."""
-    points, terms = state["draws_points"], []
+def weights(draws: Draws, prior: Posterior) -> FloatArray:
+    """Of the draws (M,), which sum to one; all zero where no draw is worth anything."""
+    points, terms = draws.points, []
     base = prior.log_prob(torch.from_numpy(points)).numpy()
-    batches = (state[f"draws_{name}"] for name in ("share", "mass", "mean", "covariance"))
-    for share, mass, mean, covariance in zip(*batches, strict=True):
+    batches = zip(draws.share, draws.mass, draws.means, draws.covariances, strict=True)
+    for share, mass, mean, covariance in batches:
         own = log_normal(points, mean, covariance) - mass
         terms.append(np.logaddexp(np.log1p(-share) + own, np.log(share) + base))
-    ratios = state["draws_values"] - np.logaddexp.reduce(terms, axis=0)
+    ratios = draws.values - np.logaddexp.reduce(terms, axis=0)
     if not np.isfinite(ratios.max()):
         return np.zeros(len(ratios))
     relative = np.exp(ratios - ratios.max())
@@ -112,16 +161,18 @@ def effective(weight: FloatArray) -> float:
     return float(1 / (weight**2).sum()) if weight.any() else 0.0
 
 
-def kernels(state: State, weight: FloatArray, space: ParameterSpace, seed: int) -> GaussianMixture:
-    """The posterior that weighted draws stand for."""
-    points, n = state["draws_points"], len(space)
+def kernels(
+    points: FloatArray, weight: FloatArray, space: ParameterSpace, seed: int, tuning: ImportanceTuning
+) -> GaussianMixture:
+    """The posterior that draws (M, N) with weights (M,) stand for."""
+    n = len(space)
     mean = weight @ points
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
     silverman = (4 / (effective(weight) * (n + 2))) ** (1 / (n + 4))  # of the sds
-    width = _NARROWER * silverman  # for the bounds' sake
+    width = tuning.narrower * silverman
     shrunk = mean + np.sqrt(1 - width**2) * (points - mean)
     order = np.argsort((points - mean) @ np.linalg.eigh(covariance)[1][:, -1], kind="stable")
-    comb = (np.arange(_KERNELS) + np.random.default_rng([seed, 0, 1]).random()) / _KERNELS
+    comb = (np.arange(tuning.kernels) + np.random.default_rng([seed, 0, 1]).random()) / tuning.kernels
     picked = order[np.minimum(np.searchsorted(np.cumsum(weight[order]), comb), len(weight) - 1)]
     which, counts = np.unique(picked, return_counts=True)
     spread = width**2 * covariance + _JITTER * np.diag(np.diag(covariance))
@@ -130,12 +181,14 @@ def kernels(state: State, weight: FloatArray, space: ParameterSpace, seed: int) 
     return GaussianMixture(np.log(counts) - masses, means, spreads, space)
 
 
-def _moments(state: State, found: GaussianMixture, prior: Posterior) -> tuple[FloatArray, FloatArray]:
+def _moments(
+    draws: Draws, normal: GaussianMixture, prior: Posterior, tuning: ImportanceTuning
+) -> tuple[FloatArray, FloatArray]:
     """Mean (N,) and covariance (N, N) of the next proposal."""
-    weight, points = weights(state, prior), state["draws_points"]
-    base, count = found.covariances.numpy()[0], effective(weight)
+    weight, points = weights(draws, prior), draws.points
+    base, count = normal.covariances.numpy()[0], effective(weight)
     if not count:
-        return found.means.numpy()[0], base
+        return normal.means.numpy()[0], base
     mean, trust = weight @ points, count / (count + 2 * points.shape[1])
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
-    return mean, _WIDER**2 * (trust * covariance + (1 - trust) * base)
+    return mean, tuning.wider**2 * (trust * covariance + (1 - trust) * base)

@@ -13,17 +13,25 @@ that ends before any step leaves is as wide as that step is long.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
-from sipe_bayes.inference.laplace.chain_state import diverged, evidence_of, onward, opening, recorded, screened
+from sipe_bayes.inference.laplace.chain_state import (
+    ChainState,
+    diverged,
+    evidence_of,
+    onward,
+    opening,
+    recorded,
+    screened,
+)
 from sipe_bayes.inference.laplace.growing_horizon import grown
-from sipe_bayes.inference.laplace.optima import Search
 from sipe_bayes.inference.laplace.posterior_linearisation import linearise
 from sipe_bayes.inference.laplace.smoother import Point, border, descend, first_noise, infer_noise, quietest, sound
+from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
@@ -39,21 +47,47 @@ _THETA_STEP = (1e-4, 0.1)  # of the cube: a difference is as long as the sd, but
 _STATE_STEP = (1e-6, 0.3)  # rad or m, and their rates; share of the coordinate's movement in a control step
 
 
-def start(search: Search, chain: Chain) -> State:
+@dataclass(frozen=True)
+class KnownStartSearch:
+    """The ``Strategy`` for a ``StateSpace`` whose first states are known.
+
+    Args:
+        problem: prior, starting points, options.
+        chain: the logs.
+    """
+
+    problem: SearchProblem
+    chain: Chain
+
+    @property
+    def step_rollouts(self) -> int:
+        """Rollouts that a step takes."""
+        return (2 * (self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
+
+    def start(self) -> ChainState:
+        """The first state of a fit."""
+        return ChainState(start(self.problem, self.chain))
+
+    def step(self, state: ChainState) -> ChainState:
+        """One linearisation and what follows from it."""
+        return ChainState(step(self.problem, self.chain, state.data))
+
+
+def start(search: SearchProblem, chain: Chain) -> State:
     """The first state of a fit."""
     chain.rollouts += chain.prepared
     points = grown(search, chain) if search.initial is None else search.initial
     return opening(chain, screened(search, chain) if points is None else points)
 
 
-def step(search: Search, chain: Chain, state: State) -> State:
+def step(search: SearchProblem, chain: Chain, state: State) -> State:
     """One linearisation and what follows from it: a step of the smoother, or a new noise and a step."""
     chain.part = float(state["part"])
     after = _followed(search, chain, state) if state["held"] else _smoothed(search, chain, state)
     return {**after, "part": chain.part}
 
 
-def _followed(search: Search, chain: Chain, state: State) -> State:
+def _followed(search: SearchProblem, chain: Chain, state: State) -> State:
     """The states that the commands lead to, and a first guess of the noise about them."""
     theta, states, prior = state["theta"], chain.predicted(state["theta"]), search.quadratic_prior
     states = state["states"] if states is None else states
@@ -72,7 +106,7 @@ def _followed(search: Search, chain: Chain, state: State) -> State:
     return {**state, **_steps(search, state, found, noise)}
 
 
-def _smoothed(search: Search, chain: Chain, state: State) -> State:
+def _smoothed(search: SearchProblem, chain: Chain, state: State) -> State:
     found = linearise(chain, state["theta"], state["states"], state["theta_step"], state["state_step"])
     if found is None:
         return diverged(chain, state)
@@ -94,7 +128,7 @@ def _smoothed(search: Search, chain: Chain, state: State) -> State:
 
 
 def _estimated(
-    search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
+    search: SearchProblem, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
 ) -> tuple[ChainNoise, State, bool]:
     """The noise estimated anew, the state with it and with what is worth recording, and whether the search ends."""
     theta, prior, movement = state["theta"], search.quadratic_prior, state["movement"]
@@ -114,7 +148,7 @@ def _estimated(
     return better, {**state, **now}, settled or state["round"] + 1 >= _ROUNDS
 
 
-def _steps(search: Search, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
+def _steps(search: SearchProblem, state: State, found: ChainLinearisation, noise: ChainNoise) -> State:
     """How long the next differences are, by theta (N,) and by the states (K, D)."""
     solved = eliminate_states(found, noise)
     spread = np.einsum("kdd->kd", solved.covariances()[0])

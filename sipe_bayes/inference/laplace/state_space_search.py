@@ -12,16 +12,23 @@ theta, with the states integrated out, is what ``laplace`` makes its truncated n
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.core.checkpoint import State
-from sipe_bayes.inference.laplace.chain_state import diverged, evidence_of, onward, opening, recorded, screened
+from sipe_bayes.inference.laplace.chain_state import (
+    ChainState,
+    diverged,
+    evidence_of,
+    onward,
+    opening,
+    recorded,
+    screened,
+)
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.laplace.loose_jumps import needed, outstanding
-from sipe_bayes.inference.laplace.optima import Search
 from sipe_bayes.inference.laplace.smoother import (
     Point,
     descend,
@@ -32,6 +39,7 @@ from sipe_bayes.inference.laplace.smoother import (
     regress,
     sound,
 )
+from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise
@@ -50,19 +58,45 @@ _UNSETTLED, _LET_GO = 4, 3  # estimates of the noise after which jumps that stan
 _SAME = 0.02  # distance of regressed thetas that is none
 
 
-def start(search: Search, chain: Chain) -> State:
+@dataclass(frozen=True)
+class StateSpaceSearch:
+    """The ``Strategy`` for a ``StateSpace``.
+
+    Args:
+        problem: prior, starting points, options.
+        chain: the logs.
+    """
+
+    problem: SearchProblem
+    chain: Chain
+
+    @property
+    def step_rollouts(self) -> int:
+        """Rollouts that a step takes."""
+        return ((self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
+
+    def start(self) -> ChainState:
+        """The first state of a fit."""
+        return ChainState(start(self.problem, self.chain))
+
+    def step(self, state: ChainState) -> ChainState:
+        """One linearisation and what follows from it."""
+        return ChainState(step(self.problem, self.chain, state.data))
+
+
+def start(search: SearchProblem, chain: Chain) -> State:
     """The first state of a fit."""
     chain.rollouts += chain.prepared
     return opening(chain, screened(search, chain) if search.initial is None else search.initial)
 
 
-def step(search: Search, chain: Chain, state: State) -> State:
+def step(search: SearchProblem, chain: Chain, state: State) -> State:
     """One linearisation and what follows from it: a step of the regression or the smoother, or a new noise."""
     chain.part = float(state["part"])
     return {**_stepped(search, chain, state), "part": chain.part}
 
 
-def _stepped(search: Search, chain: Chain, state: State) -> State:
+def _stepped(search: SearchProblem, chain: Chain, state: State) -> State:
     held = bool(state["held"])
     if held and not chain.placed.all():
         return _followed(search, chain, state)
@@ -105,7 +139,7 @@ def _at(point: Point) -> State:
     return {"theta": point.theta, "states": point.states, "damping": point.damping}
 
 
-def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisation) -> State:
+def _regressed(search: SearchProblem, chain: Chain, state: State, found: ChainLinearisation) -> State:
     theta = regress(found, search.quadratic_prior, state["theta"])
     still = np.abs(theta - state["theta"]).max() < _STILL or state["iteration"] + 1 >= _REGRESSIONS
     state = {**state, "theta": theta, "iteration": state["iteration"] + 1, "held": not still}
@@ -119,7 +153,7 @@ def _regressed(search: Search, chain: Chain, state: State, found: ChainLinearisa
     return {**state, "sd": noise.sd, "process": noise.process, "movement": movement, "regressed": regressed}
 
 
-def _followed(search: Search, chain: Chain, state: State) -> State:
+def _followed(search: SearchProblem, chain: Chain, state: State) -> State:
     """Where some coordinate is not measured: the filter's states, about those that the commands lead to."""
     theta, states = state["theta"], chain.predicted(state["theta"])
     states = state["states"] if states is None else states
@@ -158,7 +192,7 @@ def _refiltered(
 
 
 def _ended(
-    search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool
+    search: SearchProblem, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise, settled: bool
 ) -> State:
     """After an optimum: keep it if it is likelier than those before, and go on from it."""
     before = float(state["mode_evidence"][state["mode_point"] == state["point"]].max(initial=-np.inf))
@@ -191,7 +225,7 @@ def _candidates(state: State, found: ChainLinearisation, noise: ChainNoise) -> B
 
 
 def _closed(
-    search: Search, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
+    search: SearchProblem, chain: Chain, state: State, found: ChainLinearisation, noise: ChainNoise
 ) -> tuple[Point, float] | None:
     """Where the filter leads with no jump loose, and the evidence there; None where the budget ends or it diverges."""
     tight, prior = sound(found, replace(noise, outliers=np.zeros_like(state["loose"]))), search.quadratic_prior

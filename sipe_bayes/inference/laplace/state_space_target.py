@@ -8,13 +8,13 @@ optimum.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.inference.laplace.chain_state import ChainOptimum
 from sipe_bayes.inference.laplace.posterior_linearisation import linearise
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import (
@@ -28,17 +28,27 @@ from sipe_bayes.posterior import Posterior
 
 FloatArray = NDArray[np.float64]
 
-_NAMES = ("theta", "states", "slope", "sd", "tau", "process", "movement", "loose", "theta_step", "state_step")
 _STEPS = 2  # of the states, before a fresh linearisation is compared
 
 
-def at_optimum(chain: Chain, mode: State) -> State:
-    """What ``ChainTarget`` needs of a ``laplace`` optimum, with the Jacobians there, under names of a fit's state."""
-    found = _linearised(chain, mode["theta"], mode["states"], mode["theta_step"], mode["state_step"])
-    if found is None:
-        raise ValueError("mcmc: the simulation diverges at the laplace fit; narrow the bounds")
-    kept = {f"fit_{k}": mode[k] for k in _NAMES}
-    return kept | {f"fit_{f.name}": getattr(found, f.name) for f in fields(found)}
+@dataclass(frozen=True)
+class ChainFit:
+    """An optimum and the linearisation there: what ``ChainTarget`` is made of."""
+
+    optimum: ChainOptimum
+    linearisation: ChainLinearisation
+
+    @classmethod
+    def at(cls, chain: Chain, optimum: ChainOptimum) -> ChainFit:
+        """Linearise at an optimum.
+
+        Raises:
+            ValueError: where the simulation diverges there.
+        """
+        found = _linearised(chain, optimum.theta, optimum.states, optimum.theta_step, optimum.state_step)
+        if found is None:
+            raise ValueError("mcmc: the simulation diverges at the laplace fit; narrow the bounds")
+        return cls(optimum, found)
 
 
 def _linearised(
@@ -53,16 +63,15 @@ def _linearised(
 class ChainTarget:
     """log p(theta | y) of walkers (B, N), up to the prior's constant."""
 
-    def __init__(self, prior: Posterior, chain: Chain, state: State) -> None:
-        self.prior, self.chain, self.state = prior, chain, state
-        self.fit = ChainLinearisation(**{f.name: state[f"fit_{f.name}"] for f in fields(ChainLinearisation)})
-        self.sd = ChainNoise(state["fit_sd"], state["fit_process"], state["fit_movement"], state["fit_loose"])
+    def __init__(self, prior: Posterior, chain: Chain, fit: ChainFit) -> None:
+        self.prior, self.chain, self.optimum, self.fit = prior, chain, fit.optimum, fit.linearisation
+        self.sd = ChainNoise(fit.optimum.sd, fit.optimum.process, fit.optimum.movement, fit.optimum.loose)
         self.solved = eliminate_states(self.fit, self.sd)
 
     def states(self, theta: FloatArray) -> FloatArray:
         """States (B, K, S) that follow theta (B, N)."""
-        away = np.einsum("kdn,bn->bkd", self.state["fit_slope"], theta - self.state["fit_theta"])
-        return self.chain.moved(self.state["fit_states"], -away)
+        away = np.einsum("kdn,bn->bkd", self.optimum.slope, theta - self.optimum.theta)
+        return self.chain.moved(self.optimum.states, -away)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         out = np.full(len(points), -np.inf)
@@ -89,7 +98,7 @@ class ChainTarget:
     @property
     def check_cost(self) -> int:
         """Rollouts of a log to hold ``refreshed`` against the target."""
-        sides = 2 if self.state["fit_state_step"].any() else 1
+        sides = 2 if self.optimum.state_step.any() else 1
         return 1 + _STEPS * (1 + sides * (self.chain.num_theta + self.chain.num_start))
 
     def refreshed(self, point: FloatArray) -> float:
@@ -97,7 +106,7 @@ class ChainTarget:
         states = self.states(point[None])[0]
         value = -np.inf
         for _ in range(_STEPS):
-            found = _linearised(self.chain, point, states, self.state["fit_theta_step"], self.state["fit_state_step"])
+            found = _linearised(self.chain, point, states, self.optimum.theta_step, self.optimum.state_step)
             if found is None:
                 return -np.inf
             solved = eliminate_states(found, self.sd)

@@ -38,7 +38,7 @@ def present_noise(windows: Windows, residual: FloatArray) -> Noise:
     return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
 
 
-def louder(windows: Windows, noise: Noise, residuals: FloatArray) -> Noise:
+def noise_at_least(windows: Windows, noise: Noise, residuals: FloatArray) -> Noise:
     """The noise with sds no less than the root-mean-squares of residuals (B, W, L, C) of as good points, the given ones kept."""
     if not len(residuals):
         return noise

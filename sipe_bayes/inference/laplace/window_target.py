@@ -14,40 +14,44 @@ the optimum hardly depends on theta; exact for white noise of one channel whose 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.window_noise import beyond_rounding, free_noise
+from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, estimate_noise, marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
-FloatArray = NDArray[np.float64]
 
-_NAMES = ("theta", "starts", "slope", "sd", "tau")
+@dataclass(frozen=True)
+class WindowFit:
+    """An optimum and the starts' Jacobian (W, L, C, D) there: what ``WindowTarget`` is made of."""
 
+    optimum: WindowOptimum
+    jacobian: FloatArray
 
-def at_optimum(windows: Windows, mode: State) -> State:
-    """What ``WindowTarget`` needs of a ``laplace`` optimum, under names of a fit's state."""
-    shape = (*windows.observed.shape, windows.num_start)
-    jacobian = np.zeros(shape)
-    if windows.num_start:
-        found = windows.linearise(mode["theta"], mode["starts"], with_theta=False)
-        jacobian = np.ascontiguousarray(found.jacobian)
-    return {**{f"fit_{k}": mode[k] for k in _NAMES}, "fit_jacobian": jacobian}
+    @classmethod
+    def at(cls, windows: Windows, optimum: WindowOptimum) -> WindowFit:
+        """Take the Jacobian at an optimum; simulates where there are starts."""
+        jacobian = np.zeros((*windows.observed.shape, windows.num_start))
+        if windows.num_start:
+            lin = windows.linearise(optimum.theta, optimum.starts, with_theta=False)
+            jacobian = np.ascontiguousarray(lin.jacobian)
+        return cls(optimum, jacobian)
 
 
 class WindowTarget:
-    """log p(theta | y) of points (B, N), up to a constant; minus infinity outside the cube and where the simulation diverges."""
+    """log p(theta | y) of points (B, N), up to a constant; minus infinity outside the cube and where one diverges."""
 
-    def __init__(self, prior: Posterior, windows: Windows, state: State) -> None:
-        self.prior, self.windows = prior, windows
-        self.fit = {k[4:]: v for k, v in state.items() if k.startswith("fit_")}
-        self.noise = Noise(self.fit["sd"], self.fit["tau"])
+    def __init__(self, prior: Posterior, windows: Windows, fit: WindowFit) -> None:
+        self.prior, self.windows, self.fit = prior, windows, fit
+        self.noise = Noise(fit.optimum.sd, fit.optimum.tau)
         silent = beyond_rounding(windows, self.noise).sd
         self.silent = bool((silent > self.noise.sd).any())  # residuals of rounding are no evidence
         least = np.where(silent > self.noise.sd, silent, windows.rounding)
@@ -55,8 +59,9 @@ class WindowTarget:
 
     def starts(self, theta: FloatArray) -> FloatArray:
         """Starts (B, W, D) that follow theta (B, N)."""
-        moved = np.einsum("wdn,bn->bwd", self.fit["slope"], theta - self.fit["theta"])
-        return np.asarray(self.fit["starts"] - moved)
+        optimum = self.fit.optimum
+        moved = np.einsum("wdn,bn->bwd", optimum.slope, theta - optimum.theta)
+        return np.asarray(optimum.starts - moved)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         out = np.full(len(points), -np.inf)
@@ -69,7 +74,7 @@ class WindowTarget:
         good = np.flatnonzero(valid)
         prior = self.prior.log_prob(torch.from_numpy(theta)).numpy()
         for k in good:
-            out[inside[k]] = prior[k] + self._integrated(residuals[k], self.fit["jacobian"], starts[k])[0]
+            out[inside[k]] = prior[k] + self._integrated(residuals[k], self.fit.jacobian, starts[k])[0]
         return np.where(np.isnan(out), -np.inf, out)
 
     def _integrated(self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray) -> tuple[float, FloatArray]:

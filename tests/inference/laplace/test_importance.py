@@ -14,13 +14,16 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import default_prior
 from sipe_bayes.inference.laplace import importance
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.window_target import WindowTarget, at_optimum
+from sipe_bayes.inference.laplace.importance import Draws, ImportanceTuning
+from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.posterior import GaussianMixture
 from tests.problems.pendulums import log as pendulum_log
 from tests.problems.pendulums import pendulum
 
 SD = 0.5
+TUNING = ImportanceTuning()
 
 
 def skewed(rate: float = 3.0, size: int = 2) -> sipe.CallableSimulator:
@@ -42,7 +45,7 @@ def test_skewed_posteriors_are_those_of_a_grid(x: float) -> None:
     levels, estimator = [0.05, 0.5, 0.95], Laplace(skewed(), seed=1)
     found = estimator.fit(np.full(2, x)).quantile(levels).numpy()
     print(found.T, exact(3.0, x, levels), estimator.rollouts, estimator.diagnostics)
-    assert estimator.diagnostics["draws"]["effective"] >= importance.LEAST
+    assert estimator.diagnostics["draws"]["effective"] >= TUNING.least
     np.testing.assert_allclose(found, np.tile(exact(3.0, x, levels), (2, 1)).T, atol=0.06)
     assert not estimator.warnings
 
@@ -75,7 +78,7 @@ def test_the_probe_goes_two_sds_along_each_parameter() -> None:
         gaps = points - 0.5
         return np.asarray(10 * np.tanh(-0.05 * np.einsum("bi,ij,bj->b", gaps, np.linalg.inv(covariance), gaps)))
 
-    assert importance.normal(target, np.full(2, 0.5), np.full(2, 0.5), covariance)
+    assert importance.is_normal(target, np.full(2, 0.5), np.full(2, 0.5), covariance, TUNING)
     gaps = seen[0][1:] - 0.5
     np.testing.assert_allclose(np.einsum("bi,ij,bj->b", gaps, np.linalg.inv(covariance), gaps), 4.0)
 
@@ -84,12 +87,14 @@ def test_an_open_direction_beside_a_sharp_one() -> None:
     """Sds of 10 and 1e-5: the weighted variance of the sharp one is right to 3.5 standard errors (false alarm 1 in 2000), that of the open one the prior's."""
     space = sipe.ParameterSpace([sipe.Parameter("sharp", 0.0, 1.0), sipe.Parameter("open", 0.0, 1.0)])
     found = GaussianMixture([0.0], np.full((1, 2), 0.5), np.diag([1e-10, 100.0])[None], space)
-    state: dict[str, Any] = importance.begin(2)
+    draws, prior = Draws.none(2), default_prior(space)
+
+    def target(points: np.ndarray) -> np.ndarray:
+        return np.asarray(-0.5 * ((points[:, 0] - 0.5) / 1e-5) ** 2)
+
     for _ in range(40):
-        state = importance.draw(
-            state, lambda p: np.asarray(-0.5 * ((p[:, 0] - 0.5) / 1e-5) ** 2), found, default_prior(space), 2
-        )
-    weight, points = importance.weights(state, default_prior(space)), state["draws_points"]
+        draws = importance.draw(draws, target, found, prior, 2, TUNING)
+    weight, points = importance.weights(draws, prior), draws.points
     count = importance.effective(weight)
     assert count > 200
     variance = weight @ (points - weight @ points) ** 2 / np.array([1e-10, 1 / 12])
@@ -103,7 +108,7 @@ def test_kernels_at_a_bound_keep_the_draws_mean() -> None:
     space, ratios = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)]), []
     for seed in range(8):
         draws = np.abs(0.1 * np.random.default_rng(seed).standard_normal((400, 1)))
-        found = importance.kernels({"draws_points": draws}, np.full(400, 1 / 400), space, seed)
+        found = importance.kernels(draws, np.full(400, 1 / 400), space, seed, TUNING)
         quartiles = np.quantile(draws[:, 0], [0.25, 0.5, 0.75])
         ratios.append(
             [float(found.mean[0]) / draws.mean(), *(found.quantile([0.25, 0.5, 0.75])[:, 0].numpy() / quartiles)]
@@ -152,9 +157,10 @@ def test_unknown_noise_of_a_log_is_integrated_out() -> None:
     print(found.T, np.array(wanted), estimator.diagnostics, estimator.rollouts)
     np.testing.assert_allclose(found.T, wanted, atol=0.08)
     assert estimator.state is not None
-    mode = {k[5:]: v[0] for k, v in estimator.state.items() if k.startswith("mode_")}
+    (optimum, *_) = estimator.state.search.optima
+    assert isinstance(optimum, WindowOptimum)
     windows = bind(likelihood, simulator, Trajectories.stack([log]))
-    values = WindowTarget(estimator.prior, windows, at_optimum(windows, mode))(points)
+    values = WindowTarget(estimator.prior, windows, WindowFit.at(windows, optimum))(points)
     expected = -0.5 * len(log) * np.log(squares).sum(1)
     np.testing.assert_allclose(values - values.max(), expected - expected.max(), atol=5e-3)
 
@@ -190,17 +196,17 @@ def test_weights_of_known_proposals_give_the_posterior_back() -> None:
         )
 
     found = GaussianMixture([0.0], np.full((1, 3), 0.3), 0.02 * np.eye(3)[None], space)
-    state: dict[str, Any] = importance.begin(3)
+    draws = Draws.none(3)
     for _ in range(40):
-        state = importance.draw(state, target, found, prior, 5)
-    weight = importance.weights(state, prior)
+        draws = importance.draw(draws, target, found, prior, 5, TUNING)
+    weight = importance.weights(draws, prior)
     axis = (np.arange(60) + 0.5) / 60
     cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     density = np.exp(target(cells))
     density /= density.sum()
     mean = density @ cells
     sd = np.sqrt(density @ (cells - mean) ** 2)
-    points, count = state["draws_points"], importance.effective(weight)
+    points, count = draws.points, importance.effective(weight)
     assert count > 200
     error = np.abs(weight @ points - mean) / (sd / np.sqrt(count))
     print(error, count, len(points))

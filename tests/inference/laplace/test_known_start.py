@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import known_start_search
@@ -71,7 +72,7 @@ def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
 
 def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray | None, Laplace]:
     estimator = Laplace(bouncing(), likelihood=KNOWN, **settings)  # type: ignore[arg-type]
-    return grown(estimator, estimator.windows(Trajectories.stack(logs))), estimator
+    return grown(estimator.problem, estimator.windows(Trajectories.stack(logs))), estimator
 
 
 def test_many_logs_and_late_samples_grow_as_well() -> None:
@@ -101,9 +102,9 @@ def test_a_model_that_diverges_as_given_is_said_to() -> None:
         return result
 
     simulator.rollout = broken
-    points = grown(estimator, windows)
+    points = grown(estimator.problem, windows)
     assert points is not None
-    assert estimator.warnings == ["the model as given diverges on these logs; the search started elsewhere"]
+    assert [item.code for item in estimator.findings] == [Code.DIVERGES_AS_GIVEN]
 
 
 def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
@@ -124,7 +125,7 @@ def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
             estimator = Laplace(bouncing(), likelihood=KNOWN, initial=start, budget=budget)
             estimator.fit(log)
             assert estimator.state is not None
-            assert estimator.state["mode_evidence"].max() >= evidence - 1e-9
+            assert max(one.evidence for one in estimator.state.search.optima) >= evidence - 1e-9
 
 
 def test_mcmc_agrees_with_laplace() -> None:

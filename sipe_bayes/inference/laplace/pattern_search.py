@@ -1,0 +1,129 @@
+"""A look around an optimum, at points rather than by slopes.
+
+V. Torczon 1997, "On the convergence of pattern search algorithms", SIAM J. Optim. 7. Contact bends a simulation at
+every scale, and a linearisation sees neither a valley that is narrower than its step nor a plain that begins beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
+
+SHORTEST = 1e-6  # of the cube: the way over which an optimum's neighbours are as good in a smooth simulation
+_LENGTHS = 10.0 ** np.arange(-6, 0)  # of the cube, along the axes: SHORTEST and five powers of ten
+
+
+@dataclass(frozen=True)
+class PatternTuning(Options):
+    """What a pattern search looks at, and what it makes of it."""
+
+    sds: tuple[float, ...] = option((1.0, 3.0, 10.0), "distances along the principal directions", "sd")
+    between: float = option(
+        3.0, "further points where the simulation is rough, between powers of ten", above=1, below=10
+    )
+    open_sd: float = option(0.5, "sd from which a direction counts as open, and is cut", "of the cube", above=0)
+    better: float = option(0.5, "a difference that counts", "nats", above=0)
+    saddle: float = option(1.0, "how much worse points between two of one optimum may be", "nats", above=0)
+    luck: float = option(3.0, "how much worse the nearest neighbours may be in a smooth simulation", "nats", above=0)
+    growth: float = option(10.0, "how much worse still, at least, points ten times farther are there", above=1)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is around an optimum.
+
+    Args:
+        better: (N,), the best point, if better than the optimum.
+        covariance: (N, N), the optimum's, at least ``SHORTEST`` and wide enough for every point that fits better, or as
+            well with no worse ones in between, or as well in a simulation that is rough at every scale.
+        other: (N,), a point that fits as well, but apart.
+        rough: whether the simulation is rough at every scale.
+    """
+
+    better: FloatArray | None
+    covariance: FloatArray
+    other: FloatArray | None
+    rough: bool = False
+
+
+def pattern_size(size: int, tuning: PatternTuning) -> int:
+    """Points that ``pattern_search`` looks at in ``size`` dimensions, at most."""
+    return 1 + 2 * size * (1 + len(_LENGTHS) + len(tuning.sds) + len(_LENGTHS) - 2)
+
+
+def nearest_points(theta: FloatArray) -> FloatArray:
+    """Points (2N, N) of the cube that are as good as theta (N,) itself, unless the simulation is rough."""
+    step = SHORTEST * np.eye(len(theta))
+    return np.clip(theta + np.concatenate([step, -step]), 0, 1)
+
+
+def pattern_search(
+    energies: Callable[[FloatArray], FloatArray],
+    theta: FloatArray,
+    covariance: FloatArray,
+    tuning: PatternTuning,
+    level: float = -np.inf,
+) -> Surroundings:
+    """Look around an optimum in the unit cube.
+
+    Args:
+        energies: -log posterior (B,) of thetas (B, N), infinite where invalid.
+        theta: (N,), the optimum.
+        covariance: (N, N), of its normal.
+        tuning: distances and what differences mean.
+        level: the highest energy of ``nearest_points``. Far above the optimum's, and hardly lower than ten times
+            farther away, it says that the optimum is a stroke of luck in a simulation that is rough at every scale;
+            then whatever is no worse than its neighbours counts as fitting as well.
+    """
+    size = len(theta)
+    variance, principal = np.linalg.eigh(covariance)
+    along = np.sqrt(np.clip(variance, 0, tuning.open_sd**2))[:, None] * principal.T
+    ways = np.concatenate([k * np.eye(size) for k in _LENGTHS] + [k * along for k in tuning.sds])
+    trials = np.clip(theta + np.concatenate([np.zeros((1, size)), ways, -ways]), 0, 1)
+    values = energies(trials)
+    best, wide = int(values.argmin()), covariance + SHORTEST**2 * np.eye(size)
+    # is the optimum better than its neighbours by more than a smooth simulation allows?
+    luck, apart = level - values[0], values[_tenfold(size, len(tuning.sds))].max() - values[0]
+    rough = luck > max(tuning.luck, apart / tuning.growth)
+    luck = luck if rough else 0.0
+    if values[best] < values[0] - tuning.better - luck:
+        return Surroundings(trials[best], _holding(wide, trials[best] - theta), None)
+    level = values[0] + luck
+    if rough:
+        ways = np.concatenate([k * np.eye(size) for k in tuning.between * _LENGTHS[2:]])
+        more = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
+        trials, values = np.concatenate([trials, more]), np.concatenate([values, energies(more)])
+    # the ways to what fits as well, the farthest first
+    good = trials[values < level + tuning.better] - theta
+    distance = np.einsum("bn,bn->b", good, np.linalg.solve(wide, good.T).T)
+    good = good[np.argsort(-distance)][: int((distance > 1).sum())]
+    if rough:
+        for way in good:
+            wide = _holding(wide, way)
+        return Surroundings(None, wide, None, rough)
+    good = good[:size]
+    if not len(good):
+        return Surroundings(None, wide, None)
+    # half-way points say whether it is one optimum
+    one = energies(theta + 0.5 * good) < level + tuning.saddle
+    for way in good[one]:
+        wide = _holding(wide, way)
+    others = good[~one]
+    return Surroundings(None, wide, theta + others[0] if len(others) else None)
+
+
+def _tenfold(size: int, sds: int) -> list[int]:
+    """Where in a pattern the points are that lie ten times SHORTEST away."""
+    half = (len(_LENGTHS) + sds) * size
+    return [1 + size + k + side for side in (0, half) for k in range(size)]
+
+
+def _holding(covariance: FloatArray, way: FloatArray) -> FloatArray:
+    """The covariance (N, N) with the way (N,) within one sd."""
+    outside = way @ np.linalg.solve(covariance, way) > 1
+    return covariance + np.outer(way, way) if outside else covariance

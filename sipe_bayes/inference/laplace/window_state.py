@@ -1,0 +1,153 @@
+"""The state of a search over windows: which phase it is in, where it stands, and what it has recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum, auto
+from typing import Self
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Finding
+from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
+from sipe_bayes.inference.laplace.strategy import Optimum
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.windows import Windows
+
+_FIRST_SHARE = 0.1  # of a channel's spread: a first guess of its noise, which the first step replaces
+_LEAST_SD = 1e-9  # of a first guess, in the channel's unit
+
+
+class Phase(StrEnum):
+    """What the next step of a search does; ``WindowSearch`` has a function for each."""
+
+    SUBSET = auto()
+    """Theta alone, on every other window, the starts as the log tells them."""
+    WHOLE = auto()
+    """The first step after that on all windows, which may diverge where the others did not."""
+    ROUGH = auto()
+    """White noise of the size of the present residuals."""
+    DESCEND = auto()
+    """The noise as it was estimated last."""
+    NOISE = auto()
+    """The noise is estimated anew before the step."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is known at the present point and spares simulations.
+
+    Args:
+        residual: (W, L, C), of the simulation there; None where it was not made.
+        jacobian: (W, L, C, N + D), of the last linearisation; None where none is to be kept.
+        drift: nats by which what was foretold since the starts' columns were taken is wrong.
+        keep_starts: whether those columns foretold the last gain.
+        moved: whether theta or the starts have moved since the linearisation.
+    """
+
+    residual: FloatArray | None = None
+    jacobian: FloatArray | None = None
+    drift: float = 0.0
+    keep_starts: bool = False
+    moved: bool = True
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where the search from one starting point stands.
+
+    Args:
+        phase: what the next step does.
+        theta: (N,), within the cube.
+        starts: (W, D), of the windows.
+        noise: as last estimated.
+        damping: of the next step.
+        iteration: steps until now; a new optimum begins again at zero.
+        misfit: of the first residuals, in units of the channels' spread; zero before them.
+        theta_step: of the finite differences, at most.
+        kept: what spares simulations.
+        centred: whether the search has gone to the middle of a ridge.
+        long: whether differences are as long as the environment asks for.
+        patterns: pattern searches that have led on.
+    """
+
+    phase: Phase
+    theta: FloatArray
+    starts: FloatArray
+    noise: Noise
+    damping: float
+    theta_step: float
+    iteration: int = 0
+    misfit: float = 0.0
+    kept: Kept = field(default_factory=Kept)
+    centred: bool = False
+    long: bool = False
+    patterns: int = 0
+
+    @classmethod
+    def at(cls, windows: Windows, theta: FloatArray, rule: DampingRule, subset: bool) -> Self:
+        """At a starting point theta (N,), with a first guess of white noise.
+
+        Args:
+            windows: the logs.
+            theta: (N,).
+            rule: of the damping.
+            subset: whether every other window is to be tried first.
+        """
+        fixed = windows.fixed_sd
+        spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
+        sd = np.where(np.isnan(fixed), np.maximum(_FIRST_SHARE * spread, _LEAST_SD), fixed)
+        phase = Phase.SUBSET if subset else Phase.ROUGH
+        noise = Noise(sd, np.zeros(len(sd)))
+        return cls(phase, theta, windows.no_starts(), noise, rule.first, windows.theta_step)
+
+    def afresh(self, rule: DampingRule) -> Self:
+        """The same point without anything that was kept of earlier ones, and without a new noise."""
+        phase = Phase.ROUGH if self.phase is Phase.ROUGH else Phase.DESCEND
+        return replace(self, phase=phase, kept=Kept(), damping=rule.first)
+
+    @property
+    def revisits(self) -> bool:
+        """Whether the search goes on from an optimum of this very starting point."""
+        return self.patterns > 0 or self.long
+
+
+@dataclass(frozen=True)
+class WindowOptimum(Optimum):
+    """An optimum of windows.
+
+    Args:
+        starts: (W, D).
+        slope: (W, D, N): starts follow theta by minus this.
+        guessed: whether the normal's width is only a guess.
+        finding: why its intervals are not to be trusted; None where they may be.
+    """
+
+    starts: FloatArray
+    slope: FloatArray
+    guessed: bool
+    finding: Finding | None
+
+
+@dataclass(frozen=True)
+class WindowState:
+    """A search over windows.
+
+    Args:
+        points: (R, N), starting points.
+        point: which of them is followed.
+        here: where that stands.
+        optima: those recorded.
+        done: whether the last point has been followed to its end.
+    """
+
+    points: FloatArray
+    point: int
+    here: Position
+    optima: tuple[WindowOptimum, ...] = ()
+    done: bool = False
+
+    def describe(self) -> str:
+        """Starting point and step."""
+        return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
