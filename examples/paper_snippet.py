@@ -1,4 +1,6 @@
-"""The code of the SiPE paper's figure, as it runs here: a target, an environment to randomise, an estimator, its estimate.
+"""The code of the SiPE paper's figure, as it runs here.
+
+A target, an environment to randomise, an estimator, its estimate.
 
     python examples/paper_snippet.py
 

@@ -4,9 +4,9 @@
     python examples/stable_baselines3_randomized.py          # a minute
     python examples/stable_baselines3_randomized.py 20000    # control steps: long enough to swing up
 
-The posterior is of a pendulum whose parameters are hidden. Every episode of the training runs under a draw of it, with up to one control
-step of delay on the torque and a little noise on what is seen; the agent is then tested where the log came from. Other code that makes its
-own environments calls ``make_env(posterior)`` in place of ``gymnasium.make``.
+The posterior is of a pendulum whose parameters are hidden. Every episode of the training runs under a draw of it, with
+up to one control step of delay on the torque and a little noise on what is seen; the agent is then tested where the log
+came from. Other code that makes its own environments calls ``make_env(posterior)`` in place of ``gymnasium.make``.
 """
 
 import sys
@@ -43,7 +43,8 @@ def main(steps: int = 2_000) -> float:
 
     mean, sd = evaluate_policy(agent, Monitor(target), n_eval_episodes=5)
     print(
-        f"return in the target after {steps} control steps: {mean:.0f} (sd {sd:.0f}); {env.redrawn} draws were made anew"
+        f"return in the target after {steps} control steps: {mean:.0f} (sd {sd:.0f}); {env.redrawn} draws were made "
+        "anew"
     )
     return float(np.mean(mean))
 

@@ -10,7 +10,10 @@ from sipe_bayes.benchmark.frame import source
 
 
 def fits(path: Path) -> list[dict[str, Any]]:
-    """Those in a file; a line that an interruption cut off is removed. Raises SystemExit where other code than the present made some."""
+    """Those in a file; a line that an interruption cut off is removed.
+
+    Raises SystemExit where other code than the present made some.
+    """
     if not path.is_file():
         return []
     text = path.read_text(encoding="utf-8")

@@ -1,13 +1,16 @@
-"""Do the 90 % intervals of `npe` and `bayessim` hold the truth? Logs with 1 % observation noise, trained once for each task.
+"""Do the 90 % intervals of `npe` and `bayessim` hold the truth?
 
-    python examples/studies/amortised_coverage.py [--task HalfCheetahLinks] [--budget 2000] [--truths 400] [--methods npe bayessim]
+Logs have 1 % observation noise; each method is trained once for each task.
 
-One log of 100 control steps (FetchPush: 50) gives actions and starting state: of smooth random actions on the half-cheetah, of the
-expert on the hand and FetchPush. Each method is trained once, on ``budget`` simulations of the prior with noise of 1 % of each
-channel's spread, on the hand and FetchPush of a tenth of the largest channel's at least, and then conditions on ``truths`` new
-simulations of truths drawn from the prior, noise included. Coverage is pooled over the parameters and the truths, its standard
-error clustered by truth. contraction = 1 - sd / prior sd, mean. A parameter counts as determined by a log that leaves less
-than half of the prior's sd.
+    python examples/studies/amortised_coverage.py [--task HalfCheetahLinks] [--budget 2000] [--truths 400]
+                                                  [--methods npe bayessim]
+
+One log of 100 control steps (FetchPush: 50) gives actions and starting state: of smooth random actions on the
+half-cheetah, of the expert on the hand and FetchPush. Each method is trained once, on ``budget`` simulations of the
+prior with noise of 1 % of each channel's spread, on the hand and FetchPush of a tenth of the largest channel's at
+least, and then conditions on ``truths`` new simulations of truths drawn from the prior, noise included. Coverage is
+pooled over the parameters and the truths, its standard error clustered by truth. contraction = 1 - sd / prior sd, mean.
+A parameter counts as determined by a log that leaves less than half of the prior's sd.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ LEAST_SPREAD = 0.1  # of the largest
 
 
 def logs(simulator: sipe.Simulator, count: int) -> tuple[Trajectories, Trajectories, np.ndarray, tuple[float, ...]]:
-    """A recorded log and ``count`` held-out ones, the truths of those (count, N), and the noise's sd of each channel."""
+    """A recorded log and ``count`` others, the truths of those (count, N), and the noise's sd of each channel."""
     task = simulator.environment
     excited = task.name == TASKS[0]
     behaviour = acting.excitation(task, simulator.dt) if excited else behaviour_of(task, "expert")

@@ -3,17 +3,18 @@
     python examples/studies/arm.py                                   # four cells of 400 logs, some hours
     python examples/studies/arm.py --cells "2 s, white" --fits 20    # twenty of one cell
 
-The arm has five hinges, whose armatures are unknown; the model is the one that the installed mujoco.sysid tests itself with. As in the
-tutorial: armatures .5, .4, .3, .2, .1 kg m^2 sought in [.01, .6], sines as torques, positions at 500 Hz with noise of .6 rad, the first
-state known (at rest). Both searches start at .01, which is the model as given; mujoco.sysid warns that this is a bound. Intervals count
-as far as they lie within the bounds. The noise is white or first-order autoregressive with rho .99, of the same sd; logs take 2 or
-10 s. Ours is `laplace` with its default noise model, which estimates rho, over the whole log at once (`Segments(None, starts="recorded")`).
-Both methods run in turn on the same log, one thread each, with default settings; mujoco.sysid's divide each joint's residuals by their
-size, which weighs equal noise unequally. As there is one truth, an exact posterior need not cover it in 95 % of logs where a log says little
-beside the bounds; what it covers stands beside. Fits are kept one by one in runs/arm, so an interrupted
-study goes on; each run writes the summary of all fits there are to results/. Coverage is pooled over the armatures, its standard error clustered by log. The interval score of T. Gneiting, A. Raftery
-2007, "Strictly Proper Scoring Rules", https://doi.org/10.1198/016214506000001437, Section 6.2, in kg m^2, is smaller for intervals that are
-narrow and right.
+The arm has five hinges, whose armatures are unknown; the model is the one that the installed mujoco.sysid tests itself
+with. As in the tutorial: armatures .5, .4, .3, .2, .1 kg m^2 sought in [.01, .6], sines as torques, positions at 500 Hz
+with noise of .6 rad, the first state known (at rest). Both searches start at .01, which is the model as given;
+mujoco.sysid warns that this is a bound. Intervals count as far as they lie within the bounds. The noise is white or
+first-order autoregressive with rho .99, of the same sd; logs take 2 or 10 s. Ours is `laplace` with its default noise
+model, which estimates rho, over the whole log at once (`Segments(None, starts="recorded")`). Both methods run in turn
+on the same log, one thread each, with default settings; mujoco.sysid's divide each joint's residuals by their size,
+which weighs equal noise unequally. As there is one truth, an exact posterior need not cover it in 95 % of logs where a
+log says little beside the bounds; what it covers stands beside. Fits are kept one by one in runs/arm, so an interrupted
+study goes on; each run writes the summary of all fits there are to results/. Coverage is pooled over the armatures, its
+standard error clustered by log. The interval score of T. Gneiting, A. Raftery 2007, "Strictly Proper Scoring Rules",
+https://doi.org/10.1198/016214506000001437, Section 6.2, in kg m^2, is smaller for intervals that are narrow and right.
 """
 
 from __future__ import annotations
@@ -187,8 +188,11 @@ def summaries(simulator: sipe.Simulator, cell: str) -> dict[str, Any] | None:
 
 
 def exact(simulator: sipe.Simulator, cell: str) -> dict[str, float]:
-    """What an exact posterior comes to here: coverage of one truth, whose place within the bounds counts where the log says little, with
-    its standard error, and the median width. The model is linearised at the truth and the noise is known."""
+    """What an exact posterior comes to here.
+
+    Coverage of one truth, whose place within the bounds counts where the log says little, with its standard error, and
+    the median width. The model is linearised at the truth and the noise is known.
+    """
     seconds, rho = CELLS[cell]
     theta, step = (TRUTH - LOW) / (HIGH - LOW), 1e-4
     rows = theta + step * np.concatenate([np.eye(len(theta)), -np.eye(len(theta))])

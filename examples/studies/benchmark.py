@@ -1,6 +1,7 @@
 """The tables and SiPE plots of the committed benchmark, from its records.
 
-    sipe benchmark run --suite direct --out results            # the records, some hours on two cores; the same command goes on
+    # the records, some hours on two cores; the same command goes on
+    sipe benchmark run --suite direct --out results
     sipe benchmark run --suite learned_reward --out results
     sipe benchmark run --suite gradient_steps --out results
     python examples/studies/benchmark.py                       # results/README.md and its pictures
@@ -19,9 +20,12 @@ from sipe_bayes.core.files import write_text
 
 OFTEN = 10  # cells
 READING = (
-    "Means and standard errors over seeds. Logs are free of noise; every method has its default settings but for laplace's 100 starting "
-    "candidates and single steps. Bold is the best of a column where it differs from every other estimator by Welch's test at 5 % and is "
-    'better than the prior and its mean; nothing is on the default variant. "Better", "worse" and "not told apart" are t-tests over seeds at 5 %.'
+    "Means and standard errors over seeds. Logs are free of noise; every method has its default settings but for "
+    "laplace's 100 starting "
+    "candidates and single steps. Bold is the best of a column where it differs from every other estimator by Welch's "
+    "test at 5 % and is "
+    'better than the prior and its mean; nothing is on the default variant. "Better", "worse" and "not told apart" are '
+    "t-tests over seeds at 5 %."
 )
 RESULTS = Path(__file__).parents[2] / "results"
 SHOWN = (
@@ -71,7 +75,8 @@ def section(found: Section) -> Iterator[str]:
 
 
 def warned(found: Contents) -> Iterator[str]:
-    yield f"\n## Warnings\n\nWhat estimators said of their own fits, in at least {OFTEN} cells; # stands for a number.\n"
+    yield "\n## Warnings\n"
+    yield f"What estimators said of their own fits, in at least {OFTEN} cells; # stands for a number.\n"
     yield "| estimator | warning | cells |\n|---|---|---|"
     yield from (f"| `{name}` | {text} | {times} |" for name, text, times in found.warnings if times >= OFTEN)
 

@@ -1,14 +1,16 @@
-"""Learning curves of DDPG on the half-cheetah, ours and Stable-Baselines3's with the same settings on the same environment.
+"""Learning curves of DDPG on the half-cheetah, ours and Stable-Baselines3's.
+
+Both have the same settings, on the same environment.
 
     python examples/studies/ddpg_curves.py run      # every cell that is not there yet; goes on after an interruption
     python examples/studies/ddpg_curves.py run --select ours/0
     python examples/studies/ddpg_curves.py table    # results/ddpg_curves.csv, .json and .png of the cells there are
     python examples/studies/ddpg_curves.py          # both
 
-A cell is method/seed. Interrupted, ours goes on from its checkpoint and Stable-Baselines3's begins anew. Each point of a
-curve is the mean return of ten whole episodes without noise, from the same ten starting states for both. The final return
-is the mean of a curve's last five points; the area under the curve, in millions, is by trapezoids from its first point on.
-Beside them stands what equal settings mean alike in the two programs, and what they leave different.
+A cell is method/seed. Interrupted, ours goes on from its checkpoint and Stable-Baselines3's begins anew. Each point of
+a curve is the mean return of ten whole episodes without noise, from the same ten starting states for both. The final
+return is the mean of a curve's last five points; the area under the curve, in millions, is by trapezoids from its first
+point on. Beside them stands what equal settings mean alike in the two programs, and what they leave different.
 """
 
 from __future__ import annotations
@@ -48,9 +50,11 @@ ALIKE = (
 )
 DIFFERENCES = (
     "Stable-Baselines3 adds the exploration noise to the random actions of the start too; ours leaves them uniform.",
-    "Stable-Baselines3 updates for the first time one step later than ours, and evaluates before a step's update, not after.",
+    "Stable-Baselines3 updates for the first time one step later than ours, and evaluates before a step's update, not "
+    "after.",
     "Stable-Baselines3 stores observations in float64, ours in float32; the networks of both see float32.",
-    "Other random numbers: first weights (of one distribution, uniform within 1 / sqrt(inputs)), starts, actions, batches.",
+    "Other random numbers: first weights (of one distribution, uniform within 1 / sqrt(inputs)), starts, actions, "
+    "batches.",
 )
 
 
@@ -149,8 +153,10 @@ def table(steps: int, folder: Path, results: Path) -> None:
 
 
 def scores(cells: list[dict[str, Any]]) -> dict[str, Any]:
-    """Final return and area of each method's seeds; of all cells, how far the means are apart and whether ours
-    lies between Stable-Baselines3's extremes."""
+    """Final return and area of each method's seeds.
+
+    Of all cells, how far the means are apart and whether ours lies between Stable-Baselines3's extremes.
+    """
     found: dict[str, Any] = {}
     for name, of_curve in (("final_return", final_return), ("area_millions", area)):
         here = found[name] = {}
@@ -187,13 +193,15 @@ def statement(found: dict[str, Any]) -> str:
             if method in here:
                 row = here[method]
                 lines.append(
-                    f"{name}, {label}: {row['mean']:.4g} ({row['low']:.4g} to {row['high']:.4g} over {len(row['seeds'])} of {SEEDS} seeds)"
+                    f"{name}, {label}: {row['mean']:.4g} ({row['low']:.4g} to {row['high']:.4g} over "
+                    f"{len(row['seeds'])} of {SEEDS} seeds)"
                 )
         if "ours_within_spread" in here:
             within = "within" if here["ours_within_spread"] else "OUTSIDE"
             apart = abs(here["difference_in_standard_errors"])
             lines.append(
-                f"{name}: our mean is {within} the spread of Stable-Baselines3's seeds, {apart:.1f} standard errors from theirs"
+                f"{name}: our mean is {within} the spread of Stable-Baselines3's seeds, {apart:.1f} standard errors "
+                "from theirs"
             )
     missing = found["missing_cells"]
     return "\n".join(

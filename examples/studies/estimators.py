@@ -1,14 +1,14 @@
 """Every estimator on five tasks: accuracy, CRPS and skill at 1,000 rollouts, in-distribution variant, three seeds.
 
-    python examples/studies/estimators.py run              # every cell that is not there yet; goes on after an interruption
+    python examples/studies/estimators.py run     # every cell that is not there yet; goes on after an interruption
     python examples/studies/estimators.py run --select FetchPush/npe
-    python examples/studies/estimators.py table            # results/estimators.json and .md of the cells there are
+    python examples/studies/estimators.py table   # results/estimators.json and .md of the cells there are
 
-A cell is task/method/seed. The log is one excited trajectory of 100 control steps (Fetch: 50), noise-free, with recorded states;
-seed k gives log and estimator. A parameter counts as determined by a log where the Fisher information of its control steps at
-the truth, under noise of 0.1 % of each channel's spread, leaves less than half of the prior's sd; whatever the methods say.
-CRPS and skill are means over the determined parameters; skill is 1 - CRPS / CRPS of the prior's mean, and
-against the prior itself.
+A cell is task/method/seed. The log is one excited trajectory of 100 control steps (Fetch: 50), noise-free, with
+recorded states; seed k gives log and estimator. A parameter counts as determined by a log where the Fisher information
+of its control steps at the truth, under noise of 0.1 % of each channel's spread, leaves less than half of the prior's
+sd; whatever the methods say. CRPS and skill are means over the determined parameters; skill is 1 - CRPS / CRPS of the
+prior's mean, and against the prior itself.
 """
 
 from __future__ import annotations

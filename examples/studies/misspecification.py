@@ -3,12 +3,12 @@
     python examples/studies/misspecification.py                    # all cells, some ten minutes on one core
     python examples/studies/misspecification.py --cells delay --seeds 5
 
-Logs of a torque-driven pendulum (4 s, 100 Hz, angle with noise of sd 0.01 rad, white or AR(1) with rho 0.9), rod mass and damping
-unknown, fitted by `laplace`. Left out of the model, in three sizes: dry friction of 0.03, 0.06 and 0.12 N m, a delay of the command of
-10, 20 and 40 ms, friction of 5, 10 and 20 % of the torque applied; the torque is a sum of four sines of 0.6 N m. The null is
-the right model. Beside it a double pendulum with a motor, two unknowns and a channel at each joint, and the effect, of the middle size, at one
-of them in turn: there the cause that is named has to be the right one at the right joint.
-An alarm is p <= 0.05. Every fit is one line in runs/, so an interrupted study goes on.
+Logs of a torque-driven pendulum (4 s, 100 Hz, angle with noise of sd 0.01 rad, white or AR(1) with rho 0.9), rod mass
+and damping unknown, fitted by `laplace`. Left out of the model, in three sizes: dry friction of 0.03, 0.06 and 0.12 N
+m, a delay of the command of 10, 20 and 40 ms, friction of 5, 10 and 20 % of the torque applied; the torque is a sum of
+four sines of 0.6 N m. The null is the right model. Beside it a double pendulum with a motor, two unknowns and a channel
+at each joint, and the effect, of the middle size, at one of them in turn: there the cause that is named has to be the
+right one at the right joint. An alarm is p <= 0.05. Every fit is one line in runs/, so an interrupted study goes on.
 """
 
 from __future__ import annotations

@@ -1,17 +1,22 @@
-"""The net under a restructuring: one small fit of every kind with a fixed seed, before and after, which must not differ.
+"""The net under a restructuring.
 
-    python examples/studies/net.py --against examples/studies/results/net.json   # fit, and compare with what is kept; some minutes on one core
+One small fit of every kind with a fixed seed, before and after, which must not differ.
+
+    python examples/studies/net.py --against examples/studies/results/net.json
+        # fit, and compare with what is kept; some minutes on one core
     python examples/studies/net.py --against examples/studies/results/net.json --only npe arm-white
     python examples/studies/net.py --out examples/studies/results/net.json       # keep what there is now
 
-Nothing but the package's public names is used, so that the same file runs before and after. Budgets are small: the posteriors are as
-good as they need be to notice a change, not good. Fits are kept one by one, so an interrupted run goes on; those of another state of
-the package's code are made anew. One thread each, and each problem apart: any choice of them gives the same bits. Another processor, or other versions of NumPy, MuJoCo and PyTorch, rounds otherwise, and chains and networks magnify that:
-make both files on one machine where a line says that they differ in these.
+Nothing but the package's public names is used, so that the same file runs before and after. Budgets are small: the
+posteriors are as good as they need be to notice a change, not good. Fits are kept one by one, so an interrupted run
+goes on; those of another state of the package's code are made anew. One thread each, and each problem apart: any choice
+of them gives the same bits. Another processor, or other versions of NumPy, MuJoCo and PyTorch, rounds otherwise, and
+chains and networks magnify that: make both files on one machine where a line says that they differ in these.
 
-A line for each problem: the largest difference of a mean, in units of the earlier sd (of the range, for a point), the largest relative one of an
-sd, rollouts before and after, and whether all is the same to the last bit: both, rollouts, 1,000 draws, the number of warnings and the log
-itself. The exit status is 1 where a mean or an sd moved by more than 1e-6, or a problem failed.
+A line for each problem: the largest difference of a mean, in units of the earlier sd (of the range, for a point), the
+largest relative one of an sd, rollouts before and after, and whether all is the same to the last bit: both, rollouts,
+1,000 draws, the number of warnings and the log itself. The exit status is 1 where a mean or an sd moved by more than
+1e-6, or a problem failed.
 """
 
 from __future__ import annotations
@@ -73,7 +78,7 @@ def real(example: str, method: str, **settings: Any) -> Case:
 
 
 def arm(rho: float, likelihood: Any) -> Case:
-    """Two links that sines move for 2 s from rest; angles with noise of 0.02 rad, white or first-order autoregressive."""
+    """Two links that sines move for 2 s from rest; angles with noise of 0.02 rad, white or autoregressive."""
     parameters = [
         *(sipe.Parameter(f"{j}_damping", 0.02, 0.4, targets=(f"joint:{j}.damping",)) for j in ("shoulder", "elbow")),
         *(sipe.Parameter(f"{b}_mass", 0.5, 2.0, targets=(f"body:{b}.mass",)) for b in ("upper", "lower")),
@@ -107,7 +112,10 @@ def door(steps: int) -> Case:
 
 
 def push(known: bool, steps: int, **settings: Any) -> Case:
-    """`laplace` on an expert's push. known: all states, for windows of one control step; else the first, for StateSpace with 1 % noise."""
+    """`laplace` on an expert's push.
+
+    known: all states, for windows of one control step; else the first, for StateSpace with 1 % noise.
+    """
     simulator = sipe.Simulator(sipe.make_task("FetchPush"), num_threads=1)
     log = sipe.demonstrations(simulator, variant="in_distribution", count=1, steps=steps)[0]
     likelihood: Any = sipe.Segments(simulator.dt, noise="white", starts="recorded")
@@ -135,7 +143,7 @@ def recalibrated() -> Case:
 
 
 def line(values: FloatArray) -> FloatArray:
-    """x (B, 3) of slope and square (B, 2)."""
+    """``x`` (B, 3) of slope and square (B, 2)."""
     return np.stack([values[:, 0], values[:, 0] * values[:, 1], values[:, 1] ** 2], axis=1)
 
 

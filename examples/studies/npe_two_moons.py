@@ -1,22 +1,23 @@
 """Is `npe` as good as the sbi it is built on? Two moons, against exact posterior draws and sbi called directly.
 
-    python examples/studies/npe_two_moons.py                                    # all cells: about an hour and a half on one core
+    python examples/studies/npe_two_moons.py   # all cells: about an hour and a half on one core
     python examples/studies/npe_two_moons.py --observations 2 --seeds 1 --budget 1000 --draws 500 --rounds 1
 
-Two moons (J.-M. Lueckmann et al. 2021, "Benchmarking Simulation-Based Inference", https://arxiv.org/abs/2101.04653, task T.8):
+Two moons (J.-M. Lueckmann et al. 2021, "Benchmarking Simulation-Based Inference", https://arxiv.org/abs/2101.04653,
+task T.8):
 
     theta ~ U(-1, 1)^2,   x = (r cos a + 0.25, r sin a) + (-|theta_1 + theta_2|, theta_2 - theta_1) / sqrt(2),
     a ~ U(-pi/2, pi/2),   r ~ N(0.1, 0.01^2).
 
-Exact draws: with u = (theta_1 + theta_2) / sqrt(2) and t = (theta_2 - theta_1) / sqrt(2), the map from theta to the noise
-p = (x_1 + |u|, x_2 - t) keeps volumes, so theta given x is: p as simulated, |u| = p_1 - x_1 if that is positive, t = x_2 - p_2,
-either sign of u, and theta thrown away outside the prior's square.
+Exact draws: with u = (theta_1 + theta_2) / sqrt(2) and t = (theta_2 - theta_1) / sqrt(2), the map from theta to the
+noise p = (x_1 + |u|, x_2 - t) keeps volumes, so theta given x is: p as simulated, |u| = p_1 - x_1 if that is positive,
+t = x_2 - p_2, either sign of u, and theta thrown away outside the prior's square.
 
 Accuracy of a classifier that tells draws from exact ones (C2ST, sbi.utils.metrics.c2st), mean over the observations:
-0.5 is perfect. Each cell (method, seed) trains on its own simulations; ours and sbi's of one seed are the same ones. The
-"npe" and "sbi" cells condition one training on all observations; several rounds are a cell for each observation, whose
-standard error is over observations. Cells are kept one by one in runs/, so an interrupted study goes on; the summary goes
-to results/. Times are processor seconds of the training alone, of several rounds with their simulations.
+0.5 is perfect. Each cell (method, seed) trains on its own simulations; ours and sbi's of one seed are the same ones.
+The "npe" and "sbi" cells condition one training on all observations; several rounds are a cell for each observation,
+whose standard error is over observations. Cells are kept one by one in runs/, so an interrupted study goes on; the
+summary goes to results/. Times are processor seconds of the training alone, of several rounds with their simulations.
 """
 
 from __future__ import annotations
@@ -50,13 +51,13 @@ SEED = 20260  # of the observations
 
 
 def noise(count: int, rng: np.random.Generator) -> np.ndarray:
-    """p (count, 2): the crescent."""
+    """``p`` (count, 2): the crescent."""
     angle, radius = rng.uniform(-np.pi / 2, np.pi / 2, count), rng.normal(0.1, 0.01, count)
     return np.stack([radius * np.cos(angle) + 0.25, radius * np.sin(angle)], axis=1)
 
 
 def two_moons(theta: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """x (B, 2) of theta (B, 2)."""
+    """``x`` (B, 2) of theta (B, 2)."""
     shift = np.stack([-np.abs(theta.sum(1)), theta[:, 1] - theta[:, 0]], axis=1) / np.sqrt(2)
     return noise(len(theta), rng) + shift
 
@@ -79,7 +80,7 @@ def log_of(x: np.ndarray) -> sipe.Trajectory:
 
 
 def observations(count: int) -> np.ndarray:
-    """x (count, 2) of truths from the prior; the first ones are the same for every count."""
+    """``x`` (count, 2) of truths from the prior; the first ones are the same for every count."""
     draws = []
     for k in range(count):
         rng = np.random.default_rng([SEED, k])

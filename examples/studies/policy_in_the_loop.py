@@ -1,13 +1,16 @@
-"""Policy in the loop on HalfCheetahLinks: simopt, adr and maml estimate while an agent is trained where they believe, three seeds.
+"""Policy in the loop on HalfCheetahLinks.
 
-    python examples/studies/policy_in_the_loop.py run              # every cell that is not there yet; goes on after an interruption
+Simopt, adr and maml estimate while an agent is trained where they believe, three seeds.
+
+    python examples/studies/policy_in_the_loop.py run    # every cell not there yet; goes on after an interruption
     python examples/studies/policy_in_the_loop.py run --steps 300000 --select simopt/0
-    python examples/studies/policy_in_the_loop.py table            # results/policy_in_the_loop.json and .md of the cells there are
+    python examples/studies/policy_in_the_loop.py table # results/policy_in_the_loop.json and .md of the cells there are
 
-A cell is method/seed. The reference is the in-distribution variant; each of ten updates takes one trajectory of 100 control steps
-from it, and the estimator has 1,000 rollouts in all. The agent is that of the
-transfer study (``sipe_bayes.benchmark.transfer.study.settings``). The paper's rule: a seed counts only if its policy solves the environment, here simulators drawn from
-the last estimate (see ``sipe_bayes.rl.policy_in_the_loop``); the seeds that do are counted, and all are shown beside them.
+A cell is method/seed. The reference is the in-distribution variant; each of ten updates takes one trajectory of 100
+control steps from it, and the estimator has 1,000 rollouts in all. The agent is that of the transfer study
+(``sipe_bayes.benchmark.transfer.study.settings``). The paper's rule: a seed counts only if its policy solves the
+environment, here simulators drawn from the last estimate (see ``sipe_bayes.rl.policy_in_the_loop``); the seeds that do
+are counted, and all are shown beside them.
 """
 
 from __future__ import annotations
@@ -124,7 +127,8 @@ def table(steps: int, budget: int) -> None:
     ]
     lines = [
         f"{TASK}, {VARIANT}: {steps} control steps, {budget} rollouts of the estimator, {UPDATES} updates.\n",
-        "| method | converged | accuracy mean / min, converged | accuracy mean / min, all | CRPS, all | solves the reference "
+        "| method | converged | accuracy mean / min, converged | accuracy mean / min, all | CRPS, all | solves the "
+        "reference "
         "| return in simulation / reference | reference trajectories | CPU s |",
         "|---" * 9 + "|",
     ]
@@ -152,7 +156,8 @@ def line(method: str, cells: list[dict[str, Any]]) -> str:
     seconds = [c["cpu_seconds"] for c in cells if c["cpu_seconds"] is not None]
     return (
         f"| {method} | {len(converged)} of {len(cells)} | {accuracy(converged)} | {accuracy(cells)} | "
-        f"{np.mean([c['scores']['mean_crps'] for c in cells]):.3f} | {sum(c['solved_reference'] for c in cells)} of {len(cells)} | "
+        f"{np.mean([c['scores']['mean_crps'] for c in cells]):.3f} | {sum(c['solved_reference'] for c in cells)} of "
+        f"{len(cells)} | "
         f"{inside:.0f} / {outside:.0f} | {taken:.0f} | {f'{np.mean(seconds):.0f}' if seconds else ''} |"
     )
 

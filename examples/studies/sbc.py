@@ -1,14 +1,17 @@
-"""Simulation-based calibration of `npe`, `bayessim`, `mcmc` and `laplace` on Pendulum and HalfCheetahLinks, 1 % observation noise.
+"""Simulation-based calibration of `npe`, `bayessim`, `mcmc` and `laplace`.
 
-    python examples/studies/sbc.py run                                    # every cell, hours; goes on after an interruption
+On Pendulum and HalfCheetahLinks, with 1 % observation noise.
+
+    python examples/studies/sbc.py run      # every cell, hours; goes on after an interruption
     python examples/studies/sbc.py run --select Pendulum/laplace
-    python examples/studies/sbc.py table                                  # results/sbc.json and .md of the cells there are
+    python examples/studies/sbc.py table    # results/sbc.json and .md of the cells there are
 
-A cell is what `sipe check TASK ESTIMATOR` does: one demonstration's commands and start, truths from the prior, a log simulated at each
-of them with the noise, a posterior of each log. `npe` and `bayessim` are trained once, on 2,000 simulations, and then condition on 400
-logs; `laplace` and `mcmc`, on StateSpace, are fitted to 100. Ranks are uniform where the smallest p-value over a task's N parameters is at least
-.05 / N: the whole curve of each lies in its simultaneous band of 1 - .05 / N, all of them together in one of 95 %. Coverage is that of 90 %
-intervals, pooled over parameters, its standard error clustered by log.
+A cell is what `sipe check TASK ESTIMATOR` does: one demonstration's commands and start, truths from the prior, a log
+simulated at each of them with the noise, a posterior of each log. `npe` and `bayessim` are trained once, on 2,000
+simulations, and then condition on 400 logs; `laplace` and `mcmc`, on StateSpace, are fitted to 100. Ranks are uniform
+where the smallest p-value over a task's N parameters is at least .05 / N: the whole curve of each lies in its
+simultaneous band of 1 - .05 / N, all of them together in one of 95 %. Coverage is that of 90 % intervals, pooled over
+parameters, its standard error clustered by log.
 """
 
 from __future__ import annotations

@@ -1,18 +1,23 @@
-"""Accuracy, coverage and time of `laplace` on StateSpace: half-cheetah with 1 % and 5 % observation noise, the hand and FetchPush with 1 %.
+"""Accuracy, coverage and time of `laplace` on StateSpace.
+
+Half-cheetah with 1 % and 5 % observation noise, the hand and FetchPush with 1 %.
 
     python examples/studies/state_space.py                                             # every cell, some hours
     python examples/studies/state_space.py --task HalfCheetahJoints --level 0.01 --seeds 0 10   # ten fits of one cell
-    python examples/studies/state_space.py --slowest 5 --threads 2   # the half-cheetah's slowest fits anew, on a quiet machine
+    python examples/studies/state_space.py --slowest 5 --threads 2  # the half-cheetah's slowest fits anew
 
-Truths are uniform in [0.1, 0.9]^N on the half-cheetah, whose logs determine all parameters far better than that, and drawn from the prior
-on the others, where a truth that keeps from the bounds would be held too often. Every observed channel gets white noise of the given share of its own spread along the log, and the
-states are withheld. Noise, process noise, states and theta are all inferred. On the half-cheetah the excitation policy acts for 200 control
-steps and the start is unknown; velocities are observed. On Door and Relocate the expert acts for 100, on FetchPush for 50; the start is known, one
-starting point is followed, and no velocities are observed, nor what other channels say as well, nor the flag that says whether the door is open; a channel's
-spread counts as at least a tenth of the largest. Fits are kept one by one in runs/state_space, so an interrupted study goes on and several processes may share it; those of another state of
-the code are made anew. Each run writes the summary of all fits there are to results/. Coverage of the 90 % intervals is pooled over the parameters, its standard
-error clustered by fit; a parameter counts as determined in a fit that leaves less than half of the prior's sd. Seconds are the processor's over all
-threads: the wall time of a quiet machine with one.
+Truths are uniform in [0.1, 0.9]^N on the half-cheetah, whose logs determine all parameters far better than that, and
+drawn from the prior on the others, where a truth that keeps from the bounds would be held too often. Every observed
+channel gets white noise of the given share of its own spread along the log, and the states are withheld. Noise, process
+noise, states and theta are all inferred. On the half-cheetah the excitation policy acts for 200 control steps and the
+start is unknown; velocities are observed. On Door and Relocate the expert acts for 100, on FetchPush for 50; the start
+is known, one starting point is followed, and no velocities are observed, nor what other channels say as well, nor the
+flag that says whether the door is open; a channel's spread counts as at least a tenth of the largest. Fits are kept one
+by one in runs/state_space, so an interrupted study goes on and several processes may share it; those of another state
+of the code are made anew. Each run writes the summary of all fits there are to results/. Coverage of the 90 % intervals
+is pooled over the parameters, its standard error clustered by fit; a parameter counts as determined in a fit that
+leaves less than half of the prior's sd. Seconds are the processor's over all threads: the wall time of a quiet machine
+with one.
 """
 
 from __future__ import annotations
@@ -91,7 +96,10 @@ def one_fit(simulator: sipe.Simulator, task: str, level: float, seed: int, steps
 
 
 def _process_share(diagnostics: dict[str, Any], runs: bool) -> float:
-    """Median process noise over the coordinates by median measurement noise; how far a cheetah has run is not observed and left out."""
+    """Median process noise over the coordinates by median measurement noise.
+
+    How far a cheetah has run is not observed and left out.
+    """
     return float(np.median(diagnostics["process_noise"][runs:]) / np.median(diagnostics["noise_sd"]))
 
 

@@ -2,8 +2,8 @@
 
     python examples/studies/truth.py [--budget 10000] [--seeds 3]
 
-`npe` and `bayessim` on x = M theta + noise, `laplace` and `mcmc` on four carts in MuJoCo (tests/linear_gaussian.py). 2,000 draws
-each; 0.5 is perfect, the bar 0.60.
+`npe` and `bayessim` on x = M theta + noise, `laplace` and `mcmc` on four carts in MuJoCo (tests/linear_gaussian.py).
+2,000 draws each; 0.5 is perfect, the bar 0.60.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ METHODS: dict[str, dict[str, Any]] = {
 
 
 def independent(posterior: Posterior, diagnostics: dict[str, Any]) -> torch.Tensor:
-    """Up to 2,000 draws; of chains, whose repeats a classifier would tell at once, every n-th state, n the autocorrelation
-    time in steps."""
+    """Up to 2,000 draws.
+
+    Of chains, whose repeats a classifier would tell at once, every n-th state, n the autocorrelation time in steps.
+    """
     if not isinstance(posterior, Particles) or posterior.chains is None:
         return posterior.sample((2000,), generator=torch.Generator().manual_seed(0))
     every = math.ceil(diagnostics["mixing"]["autocorrelation_steps"])

@@ -1,14 +1,16 @@
-"""From a log to a policy: does it pay to train under the posterior? A pendulum whose rod is heavier and longer than its model says.
+"""From a log to a policy.
+
+Does it pay to train under the posterior? A pendulum whose rod is heavier and longer than its model says.
 
     python examples/transfer/transfer.py            # minutes on two cores; goes on after an interruption
     python examples/transfer/transfer.py --seeds 1  # a third of that
     python examples/transfer/transfer.py --seeds 1 --steps 1000 --out /tmp/look   # whether it runs
 
-1. The target, a simulated pendulum that stands for the machine and whose mass and length nobody knows, is moved to and fro for
-   5 s and recorded with 5 % noise.
+1. The target, a simulated pendulum that stands for the machine and whose mass and length nobody knows, is moved to
+   and fro for 5 s and recorded with 5 % noise.
 2. ``laplace`` gets the log and gives a posterior of mass, length and damping.
-3. DDPG agents are trained under five randomisations: the posterior, its most probable point, the uniform prior, the model as it is, and, as
-   what nobody has, the truth. All for as many steps, with the same settings and seeds.
+3. DDPG agents are trained under five randomisations: the posterior, its most probable point, the uniform prior, the
+   model as it is, and, as what nobody has, the truth. All for as many steps, with the same settings and seeds.
 4. Each is tested on the target as it is: 50 episodes. ``transfer.png`` and ``transfer.json`` lie beside this file.
 """
 

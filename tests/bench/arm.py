@@ -121,8 +121,10 @@ def ours(simulator: Simulator, log: ArmLog, likelihood: Segments, **settings: An
 
 
 def rival(log: ArmLog) -> Estimate:
-    """mujoco.sysid on the log, as its test calls it, with its default optimiser and its own intervals; timed is
-    ``optimize``."""
+    """mujoco.sysid on the log, as its test calls it, with its default optimiser and its own intervals.
+
+    Timed is ``optimize``.
+    """
     from mujoco import sysid
 
     spec = mujoco.MjSpec.from_string(arm_xml())

@@ -1,5 +1,7 @@
-"""`make bench`: tables of ratios. Whatever stands in one row was run in one process, the two sides in turn (first the one,
-then the other first), seven pairs or more; a row gives the medians and the median of the pairs' ratios.
+"""`make bench`: tables of ratios.
+
+Whatever stands in one row was run in one process, the two sides in turn (first the one, then the other first), seven
+pairs or more; a row gives the medians and the median of the pairs' ratios.
 
 Seconds depend on the machine and on what else it does; ratios should not.
 """
@@ -44,8 +46,8 @@ damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"
 TWO_LINKS_XML = """
 <mujoco><option timestep="0.002" integrator="implicitfast"><flag contact="disable"/></option><worldbody><body>
 <joint name="a" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
-<body pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02"
-mass="0.6"/></body></body></worldbody>
+<body pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping="0.1"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.6"/></body></body></worldbody>
 <actuator><motor name="a" joint="a"/><motor name="b" joint="b"/></actuator></mujoco>
 """
 Seconds = tuple[float, float, float]
@@ -58,8 +60,10 @@ def seconds(work: Callable[[], Any]) -> float:
 
 
 def side_by_side(ours: Callable[[int], float], other: Callable[[int], float], pairs: int) -> Seconds:
-    """Median seconds of each and the median of the pairs' ratios, after one warm-up of each. Both are given the number of
-    the pair and return seconds."""
+    """Median seconds of each and the median of the pairs' ratios, after one warm-up of each.
+
+    Both are given the number of the pair and return seconds.
+    """
     ours(0), other(0)
     times = []
     for k in range(pairs):
@@ -113,13 +117,16 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
 
 def rival(pairs: int) -> None:
     print(
-        "\nlaplace against mujoco.sysid: the arm of sysid's own test, five armatures from 0.01 kg m^2, bounds 0.001 and 1,"
+        "\nlaplace against mujoco.sysid: the arm of sysid's own test, five armatures from 0.01 kg m^2, bounds 0.001 "
+        "and 1,"
     )
     print(
-        "2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: optimize with"
+        "2 s at 500 Hz, ten channels with white noise of 1 % of their rms, another log for every pair. sysid: optimize "
+        "with"
     )
     print(
-        "its default 'mujoco', start state given, white noise. laplace: fit; start states and noise estimated with theta."
+        "its default 'mujoco', start state given, white noise. laplace: fit; start states and noise estimated with "
+        "theta."
     )
     simulator, single = arm.arm_simulator(), {"restarts": 1, "candidates": 0}
     white = Segments(window=None, noise="white")
@@ -213,8 +220,10 @@ def chain() -> None:
     elapsed = seconds(lambda: estimator.fit(problem.train))
     mixing = estimator.diagnostics["mixing"]
     print(
-        f"{estimator.rollouts} rollouts, {elapsed:.1f} s, {mixing['ess']:.0f} effective draws, R-hat {mixing['rhat']:.3f}: "
-        f"{estimator.rollouts / mixing['ess']:.0f} rollouts and {1e3 * elapsed / mixing['ess']:.0f} ms an effective draw"
+        f"{estimator.rollouts} rollouts, {elapsed:.1f} s, {mixing['ess']:.0f} effective draws, R-hat "
+        f"{mixing['rhat']:.3f}: "
+        f"{estimator.rollouts / mixing['ess']:.0f} rollouts and {1e3 * elapsed / mixing['ess']:.0f} ms an effective "
+        "draw"
     )
 
 
@@ -227,7 +236,8 @@ def main() -> None:
     versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in ("mujoco", "numpy", "scipy", "torch"))
     load = os.getloadavg()[0]
     print(
-        f"{os.cpu_count()} cores ({platform.machine()}), load {load:.1f}, Python {platform.python_version()}, {versions}"
+        f"{os.cpu_count()} cores ({platform.machine()}), load {load:.1f}, Python {platform.python_version()}, "
+        f"{versions}"
     )
     for name in given.tables or tables:
         if name == "rival" and not hasattr(__import__("mujoco.sysid").sysid, "optimize"):

@@ -136,7 +136,8 @@ def table(pairs: int, side_by_side: SideBySide) -> None:
     print("'rollout', 'stepping' (observations and rewards included): share of the bare speed; bars .90 and .75")
     print("'theta': share of a rollout that writing new parameters into every lane takes; bar 5 %")
     print(
-        "'async': times the published environment's AsyncVectorEnv of 64 processes, stepping alone, of what bare rollouts would be (bar)"
+        "'async': times the published environment's AsyncVectorEnv of 64 processes, stepping alone, of what bare "
+        "rollouts would be (bar)"
     )
     heading = ("bare", "rollout", "share", "stepping", "share", "theta")
     print(f"{'task':<20}" + "".join(f"{h:>10}" for h in heading) + f"{'async':>18}")
@@ -172,8 +173,10 @@ def _writing(lanes: Lanes) -> float:
 
 
 def _against_async(lanes: Lanes, pairs: int, side_by_side: SideBySide) -> float:
-    """How many times faster 64 lanes step than 64 processes of the published environment: the same actions from the
-    same kind of start, neither ending its episodes early, resets not counted."""
+    """How many times faster 64 lanes step than 64 processes of the published environment.
+
+    The same actions from the same kind of start, neither ending its episodes early, resets not counted.
+    """
     other = gymnasium.vector.AsyncVectorEnv([functools.partial(_published, str(lanes.id))] * LANES)
     steps = min(LANES, lanes.steps - 1)
     actions = lanes.actions.astype(np.float32)
@@ -248,7 +251,8 @@ def against_parsing(pairs: int, side_by_side: SideBySide) -> None:
     _, _, ratio = side_by_side(ours, theirs, pairs)
     other.close()
     print(
-        f"\nHalf-cheetah, {LANES} rollouts of {STEPS} steps with a new theta each: {1 / ratio:.1f} times as fast as XML parsed"
+        f"\nHalf-cheetah, {LANES} rollouts of {STEPS} steps with a new theta each: {1 / ratio:.1f} times as fast as "
+        "XML parsed"
     )
     print(f"anew for each theta and stepped in {LANES} sub-processes (bar 10)")
 

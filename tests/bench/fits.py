@@ -54,7 +54,7 @@ def _one_step(name: str, simulator: Simulator) -> dict[str, Any]:
 
 
 def _many_parameters() -> None:
-    """bayesopt where the Gaussian process is at its largest: 1,000 evaluations of 51 parameters."""
+    """``bayesopt`` where the Gaussian process is at its largest: 1,000 evaluations of 51 parameters."""
     space = sipe.ParameterSpace(sipe.Parameter(f"p{k}", low=0.0, high=1.0) for k in range(51))
     simulator = sipe.CallableSimulator(lambda values: values, space, name="identity")
     estimator = get_estimator(simulator, "bayesopt", budget=BUDGET, seed=0)

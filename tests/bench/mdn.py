@@ -15,7 +15,7 @@ ROWS, N, COMPONENTS, INPUTS, BATCH = 10_000, 18, (5, 10), 136, 100  # five compo
 
 
 def data(rows: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """theta uniform on the cube (rows, 18); inputs (rows, 136): noisy, slightly nonlinear mixtures of them."""
+    """``theta`` uniform on the cube (rows, 18); inputs (rows, 136): noisy, slightly nonlinear mixtures of them."""
     generator = torch.Generator().manual_seed(seed)
     theta = torch.rand(rows, N, generator=generator)
     mixing = torch.randn(N, INPUTS, generator=torch.Generator().manual_seed(99))
@@ -94,5 +94,6 @@ def _time_to_converge(components: int, inputs: torch.Tensor, theta: torch.Tensor
     converged = min(x for _, x in losses)
     near = next(t for t, x in losses if x <= converged + 0.05)
     print(
-        f"held-out loss within .05 nats of the converged {converged:.2f} after {near:.1f} s (bar 60), converged after {spent:.0f} s"
+        f"held-out loss within .05 nats of the converged {converged:.2f} after {near:.1f} s (bar 60), converged after "
+        f"{spent:.0f} s"
     )

@@ -25,12 +25,15 @@ SideBySide = Callable[[Callable[[int], float], Callable[[int], float], int], tup
 
 
 def table(pairs: int, side_by_side: SideBySide) -> None:
-    """Control steps/s under a posterior of each family and without one, on one thread: of the acting alone, where every lane begins an
-    episode, and of whole trainings."""
+    """Control steps/s under a posterior of each family and without one, on one thread.
+
+    Of the acting alone, where every lane begins an episode, and of whole trainings.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     print(
-        f"\nTraining under a randomisation against training without, one thread; medians of {pairs} alternating pairs (bar {BAR})"
+        f"\nTraining under a randomisation against training without, one thread; medians of {pairs} alternating pairs "
+        f"(bar {BAR})"
     )
     print(f"{'task':<20}{'':<18}{'drawn from':<18}{'steps/s':>10}{'without':>10}{'ratio':>8}")
     try:
@@ -52,7 +55,10 @@ def row(
 
 
 def trainer(task: str, given: Randomization | None, learning: bool) -> Trainer:
-    """One that acts by its actor and, if ``learning``, learns already; without demonstrations, which cost both sides alike."""
+    """One that acts by its actor and, if ``learning``, learns already.
+
+    Without demonstrations, which cost both sides alike.
+    """
     made = sipe.make_task(task)
     chosen = replace(settings(made, 4 * 300), demonstration_share=0.0)
     found = Trainer(made, chosen if learning else replace(chosen, updates_per_step=0.0), 0, given)

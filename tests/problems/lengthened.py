@@ -31,8 +31,10 @@ def compiled(spec: Any) -> Any:
 
 
 def edited(path: str, factors: dict[str, float]) -> Any:
-    """MjSpec of ``path`` with the geoms of ``factors`` longer, as sipe_bayes.envs.tasks.links says; masses and densities written
-    out, so that nothing is scaled to a total mass."""
+    """MjSpec of ``path`` with the geoms of ``factors`` longer, as sipe_bayes.envs.tasks.links says.
+
+    Masses and densities written out, so that nothing is scaled to a total mass.
+    """
     spec, model = read(path), compiled(read(path))
     plain = read(path)
     plain.compiler.settotalmass = spec.compiler.settotalmass = -1
@@ -110,7 +112,9 @@ def _stretch(body: Any, links: _Body) -> None:
 
 def differences(a: Any, b: Any) -> dict[str, float]:
     """For every field but ``stat`` and the bounding volumes the largest difference, in units of its largest entry or 1.
-    Principal axes are compared where the moments of inertia differ, and the inertia itself everywhere."""
+
+    Principal axes are compared where the moments of inertia differ, and the inertia itself everywhere.
+    """
     found = {}
     for name in dir(a):
         x, y = getattr(a, name), getattr(b, name)

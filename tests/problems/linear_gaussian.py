@@ -1,4 +1,7 @@
-"""Systems with exact posteriors for estimators of every kind: five parameters, two of them correlated; and a bimodal one."""
+"""Systems with exact posteriors for estimators of every kind: five parameters, two of them correlated.
+
+And a bimodal one.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ SD = 0.08  # of the function's noise
 
 
 def function_problem() -> tuple[CallableSimulator, Trajectory, GaussianMixture, Segments]:
-    """x = M theta + noise: simulator, log, exact posterior, likelihood. M mixes the first two parameters."""
+    """``x = M theta + noise``: simulator, log, exact posterior, likelihood. M mixes the first two parameters."""
     mixing = np.eye(5)
     mixing[0, 1] = mixing[1, 0] = 0.7
 
@@ -35,8 +38,11 @@ def function_problem() -> tuple[CallableSimulator, Trajectory, GaussianMixture, 
 
 
 def carts_problem() -> tuple[Simulator, Trajectory, GaussianMixture, Segments]:
-    """Four carts, positions measured from known starts: each has an unknown constant force, the first an encoder with
-    an unknown bias as well, which does nearly the same as the force."""
+    """Four carts, positions measured from known starts.
+
+    Each has an unknown constant force, the first an encoder with an unknown bias as well, which does nearly the same as
+    the force.
+    """
     bodies = "".join(
         f'<body name="c{k}"><joint name="j{k}" type="slide" axis="1 0 0"/><geom size="0.1" mass="2" contype="0" '
         'conaffinity="0"/></body>'
@@ -71,7 +77,7 @@ def carts_problem() -> tuple[Simulator, Trajectory, GaussianMixture, Segments]:
 
 
 def squared_function() -> tuple[CallableSimulator, Trajectory, Segments]:
-    """x = (2 theta - 1)^2 plus noise of sd 0.03: modes at 0.5 +- 0.3 for x = 0.36."""
+    """``x = (2 theta - 1)^2`` plus noise of sd 0.03: modes at 0.5 +- 0.3 for x = 0.36."""
 
     def function(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return (2 * values - 1) ** 2 + 0.03 * rng.standard_normal(values.shape)
@@ -85,7 +91,7 @@ def squared_function() -> tuple[CallableSimulator, Trajectory, Segments]:
 
 
 def squared_rod() -> tuple[Simulator, Trajectory, Segments]:
-    """A mass at an unknown place p along a balanced rod: its inertia is 0.05 + p^2, so theta = 0.5 +- 0.3 move alike."""
+    """A mass at an unknown place p along a balanced rod of inertia 0.05 + p^2: theta = 0.5 +- 0.3 move alike."""
     xml = """
     <mujoco><option timestep="0.02" gravity="0 0 0"/>
       <worldbody><body name="rod"><joint name="hinge" axis="0 0 1" damping="0.05"/>

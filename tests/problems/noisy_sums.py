@@ -18,7 +18,7 @@ SPACE = ParameterSpace([Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)])
 
 
 def linear() -> CallableSimulator:
-    """x = (a, (a + b) / 2) plus normal noise of sd 0.08."""
+    """``x = (a, (a + b) / 2)`` plus normal noise of sd 0.08."""
 
     def function(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return np.stack([values[:, 0], values.mean(1)], axis=1) + SD * rng.standard_normal(values.shape)

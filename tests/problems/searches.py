@@ -109,7 +109,10 @@ def check_divergence(name: str, budget: int, monkeypatch: pytest.MonkeyPatch, **
 
 
 def check_other_trajectories(name: str, **settings: Any) -> None:
-    """Each step may look at other trajectories: the pool starts anew, the search goes on; a budget of too little says so."""
+    """Each step may look at other trajectories: the pool starts anew, the search goes on.
+
+    A budget of too little says so.
+    """
     simulator, trajectory, _ = problem()
     another = log(simulator, VALUES, 9, steps=120)
     fit = get_estimator(simulator, name, seed=0, budget=2000, **settings)

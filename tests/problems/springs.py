@@ -43,7 +43,10 @@ def spring_step(stiffness: float) -> tuple[np.ndarray, np.ndarray]:
 def spring_logs(
     seed: int = 0, count: int = 2, steps: int = 60, process: np.ndarray = PROCESS, kick: float = 0.0
 ) -> list[Trajectory]:
-    """Logs of a stiffness of 12 N/m with process noise, of different lengths, one sample missing; kick: m/s, at the 21st control step."""
+    """Logs of a stiffness of 12 N/m with process noise, of different lengths, one sample missing; kick.
+
+    M/s, at the 21st control step.
+    """
     rng = np.random.default_rng(seed)
     transition, push = spring_step(12.0)
     logs = []
@@ -67,7 +70,7 @@ def kalman(
     noise: ChainNoise = MADE_WITH,
     start_sd: tuple[float, ...] = START_SD,
 ) -> float:
-    """log p(logs | stiffness) by a plain Kalman filter; firsts (R, 2): means of the first states, start_sd: their sds."""
+    """``log p(logs | stiffness)`` by a plain Kalman filter; firsts (R, 2), start_sd: of the first states."""
     transition, push = spring_step(stiffness)
     total = 0.0
     for log, first in zip(logs, firsts, strict=True):
