@@ -29,8 +29,9 @@ from _kept import fits, keep
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misspecification import LEVEL, SIMULATED, misfit
+from sipe_bayes.diagnostics.misspecification import SIMULATED, misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -116,7 +117,7 @@ def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int
     rows = fits(kept)
     rows += [keep(kept, one(engine, cell, size, NOISES[noise], seed)) for seed in range(len(rows), seeds)]
     rows = rows[:seeds]
-    found = [row for row in rows if row["p"] <= LEVEL]
+    found = [row for row in rows if row["p"] <= THRESHOLDS.misfit]
     causes = [row["cause"] for row in found]
     right = [row for row in found if row["cause"] == cause_of(cell, row["seed"] % joints)]
     channel = [row for row in found if row["channel"] == f"joint:hinge{1 + row['seed'] % joints}.position"]
@@ -153,7 +154,7 @@ def main() -> None:
     settings = {
         "command": "python examples/studies/misspecification.py",
         "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
-        "level": LEVEL,
+        "level": THRESHOLDS.misfit,
         "simulated": SIMULATED,
     }
     whole = given.seeds is None and given.cells == list(SIZES)

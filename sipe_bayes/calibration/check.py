@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing, write_bytes, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
@@ -33,7 +33,6 @@ from sipe_bayes.inference.recalibrated import Recalibrated
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
 
-FloatArray = NDArray[np.float64]
 Tell = Callable[[str, int, int], None]
 
 FITS, IDENTITY, RESULT = "fits", "check.json", "result.json"

@@ -6,21 +6,37 @@ import hashlib
 import importlib.metadata
 import json
 import platform
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+
+import numpy as np
+import torch
 
 from sipe_bayes.calibration.problem import RUN, Problem
 from sipe_bayes.core.files import OutputError, replacing, to_json, write_text
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.diagnostics.result import Calibration
+from sipe_bayes.envs.export import ExportError, write_identified
+from sipe_bayes.envs.randomization_code import write_randomization
+from sipe_bayes.report.page import write_report
 
 CHECKPOINT = "checkpoint.safetensors"
 RANDOMIZATION = "randomization"
 _RANDOMIZATION_DRAWS = 100  # in the generated code
+_COVARIANCE_DRAWS = 4000  # behind the written covariance
 _PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
 
 
-def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, Any]:
-    """Configuration, versions, seed and checksums of the inputs."""
+def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, object]:
+    """Configuration, versions, seed and checksums of the inputs, as JSON has them.
+
+    Args:
+        problem: the configuration read and bound.
+        estimator: its name.
+        seed: of the fit.
+        budget: rollouts of the fit, if limited.
+    """
     config = problem.config
     return {
         "config": str(config.path),
@@ -57,17 +73,25 @@ def release(folder: Path) -> None:
         folder.rmdir()
 
 
-def claim(folder: Path, run: dict[str, Any]) -> None:
-    """Make ``folder`` this run's own; the same run may come back to it. Raises OutputError when it holds another."""
+def claim(folder: Path, run: Mapping[str, object]) -> None:
+    """Make ``folder`` this run's own; the same run may come back to it.
+
+    Args:
+        folder: of the results.
+        run: as of ``describe_run``.
+
+    Raises:
+        OutputError: when it holds another run.
+    """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
     record = folder / RUN
     if record.is_file():
         try:
-            found = json.loads(record.read_text(encoding="utf-8"))
+            present = json.loads(record.read_text(encoding="utf-8"))
         except (OSError, json.JSONDecodeError) as error:
             raise OutputError(f"--out {folder}: its {RUN} cannot be read ({error}); choose another folder") from None
-        differing = [key for key in _IDENTITY if found.get(key) != run[key]]
+        differing = [key for key in _IDENTITY if present.get(key) != run[key]]
         if differing:
             what = ", ".join(key.removesuffix("_sha256") for key in differing)
             raise OutputError(
@@ -80,20 +104,27 @@ def claim(folder: Path, run: dict[str, Any]) -> None:
     write_text(record, to_json({**run, "status": "started"}, indent=2))
 
 
-def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
-    """Fill the folder of a finished run; its ``run.json`` comes last and says so."""
-    from sipe_bayes.envs.export import ExportError, write_identified
-    from sipe_bayes.envs.randomization_code import write_randomization
-    from sipe_bayes.report.page import write_report
+def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calibration:
+    """Fill the folder of a finished run; its ``run.json`` comes last and says so.
 
+    Args:
+        calibration: the result.
+        problem: that it is of.
+        folder: claimed by this run.
+
+    Returns:
+        The result with what was noticed on the way.
+    """
     calibration.posterior.save(folder / "posterior")
     with replacing(folder / "posterior.nc") as temporary:
         calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
     values = problem.environment.space.values(calibration.posterior.mode.numpy())
     try:
-        calibration.warnings += write_identified(problem.environment, values, folder / "identified.xml")
+        remarks = write_identified(problem.environment, values, folder / "identified.xml")
     except ExportError as error:
-        calibration.warnings.append(str(error))
+        remarks = [str(error)]
+    noticed = [finding(Code.EXPORT, text=remark) for remark in remarks]
+    calibration = replace(calibration, findings=(*calibration.findings, *noticed))
     draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=_generator())
     write_randomization(problem.environment, draws, folder / RANDOMIZATION)
     randomization = domain_randomization(calibration, problem)
@@ -101,17 +132,24 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> None:
     write_report(calibration, folder)
     write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
     write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
+    return calibration
 
 
-def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, Any]:
+def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, object]:
     """What a policy trainer samples from: each parameter's normal in its unit, its bounds, and the covariance.
 
-    ``targets`` says what the value is multiplied by for each target that it is written to, ``posterior`` which saved posterior beside the
-    file the normal stands for (``sipe_bayes.rl.randomization.load_randomization`` reads it)."""
-    import numpy as np
+    ``sipe_bayes.rl.randomization.load_randomization`` reads it.
 
+    Args:
+        calibration: the result.
+        problem: that it is of.
+
+    Returns:
+        As JSON has it. ``targets`` says what the value is multiplied by for each target that it is written to,
+        ``posterior`` which saved posterior beside the file the normal stands for.
+    """
     space = problem.environment.space
-    draws = calibration.posterior.values(4000, generator=_generator())
+    draws = calibration.posterior.values(_COVARIANCE_DRAWS, generator=_generator())
     rows = [
         {
             "name": p.name,
@@ -131,7 +169,5 @@ def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str
     return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "posterior": "posterior"}
 
 
-def _generator() -> Any:
-    import torch
-
+def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)

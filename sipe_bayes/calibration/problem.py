@@ -10,11 +10,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sipe_bayes.calibration.config import Config, ConfigError, LogEntry, check_dimensions, load_config, overlap
-from sipe_bayes.calibration.logs import LogReport, load_log
+from sipe_bayes.calibration.config import Config, check_dimensions, load_config
+from sipe_bayes.calibration.config_fields import ConfigError
+from sipe_bayes.calibration.config_tables import LogEntry, overlap
+from sipe_bayes.calibration.logs import load_log
+from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.units import find_unit, to_si
+from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
@@ -32,7 +36,19 @@ _SCORED = 0.5  # s, windows over which logs are scored and drawn where the likel
 
 @dataclass(frozen=True)
 class Problem:
-    """A configuration read and bound: what an Estimator needs, and the logs behind it."""
+    """A configuration read and bound: what an Estimator needs, and the logs behind it.
+
+    Args:
+        config: the file's content.
+        environment: the model with its unknowns.
+        simulator: of the environment.
+        likelihood: of the fit.
+        prior: of the parameters.
+        train: logs to fit.
+        holdout: logs to predict.
+        reports: what was done to each log.
+        findings: what is to be said of the prior.
+    """
 
     config: Config
     environment: MjcfEnvironment
@@ -42,12 +58,20 @@ class Problem:
     train: Trajectories
     holdout: Trajectories | None
     reports: tuple[LogReport, ...]
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def warnings(self) -> list[str]:
+        """The texts of what was found."""
+        return Findings(self.findings).warnings
 
     @property
     def segments(self) -> Segments:
-        """The windows by which logs are scored, drawn and checked: the likelihood's own, or, beside a ``StateSpace``, of half a second
-        or what a held-out log's ``window`` says; a shorter log is one window."""
+        """The windows by which logs are scored, drawn and checked: the likelihood's own.
+
+        Beside a ``StateSpace`` they are of half a second, or what a held-out log's ``window`` says; a shorter log is one
+        window.
+        """
         if isinstance(self.likelihood, Segments):
             return self.likelihood
         own = {log.name: self.config.window_of(log) for log in self.config.logs if log.window is not None}
@@ -58,7 +82,18 @@ class Problem:
 
 
 def prepare(config: Config | str | Path, num_threads: int | None = None) -> Problem:
-    """Read the model and the logs of a configuration; raises ConfigError, LogError, ModelError or TargetError."""
+    """Read the model and the logs of a configuration.
+
+    Args:
+        config: or its file.
+        num_threads: native ones of the simulator; default all cores.
+
+    Raises:
+        ConfigError: for a configuration that cannot be used.
+        LogError: for a log that cannot be used.
+        ModelError: for a model that cannot be read.
+        TargetError: for a parameter that the model does not have.
+    """
     config = config if isinstance(config, Config) else load_config(config)
     train_logs, held_logs = config.logs_for("train"), config.logs_for("holdout")
     environment = _environment(config, train_logs)
@@ -73,7 +108,8 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
         for log, report in zip(train_logs, reports[: len(train_logs)], strict=True):
             if copy.sha256 == report.sha256 and overlap(held_log.span, log.span):
                 raise ConfigError(
-                    f"{config.path}: log {held_log.name!r} is held out, but {held_log.file} is a copy of {log.file}, which trains; hold out another log"
+                    f"{config.path}: log {held_log.name!r} is held out, but {held_log.file} is a copy of {log.file}, "
+                    "which trains; hold out another log"
                 )
     prior, remarks = _prior(config, environment.space, reports[: len(train_logs)])
     return Problem(
@@ -147,9 +183,8 @@ def _likelihood(config: Config) -> Segments | StateSpace:
     )
 
 
-def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) -> tuple[Posterior, tuple[str, ...]]:
-    """The parameters' own priors, or the normal of an earlier posterior for the parameters that it knows, matched by name;
-    and warnings."""
+def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) -> tuple[Posterior, tuple[Finding, ...]]:
+    """The parameters' own priors, or the normal of an earlier posterior for those that it knows, matched by name."""
     own = default_prior(space)
     if config.prior is None:
         return own, ()
@@ -157,8 +192,8 @@ def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) ->
     shared = [n for n in space.names if n in earlier.space.names]
     if not shared:
         raise ConfigError(
-            f"{config.path}: key `prior.from`: the posterior knows {list(earlier.space.names)}, none of them is asked for "
-            f"here ({list(space.names)}); rename the parameters or drop the key"
+            f"{config.path}: key `prior.from`: the posterior knows {list(earlier.space.names)}, none of them is asked "
+            f"for here ({list(space.names)}); rename the parameters or drop the key"
         )
     mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
     covariance[np.isinf(covariance)] = _FLAT_SD**2
@@ -167,36 +202,32 @@ def _prior(config: Config, space: ParameterSpace, train: Sequence[LogReport]) ->
     slope, shift = np.empty(len(shared)), np.empty(len(shared))
     for k, (i, j) in enumerate(zip(new, old, strict=True)):
         for what in ("scale", "unit"):
-            there, here = getattr(earlier.space[j], what), getattr(space[i], what)
-            if there != here:
+            before, now = getattr(earlier.space[j], what), getattr(space[i], what)
+            if before != now:
                 raise ConfigError(
-                    f"{config.path}: key `prior.from`: {space[i].name!r} had the {what} {there!r} there and has {here!r} here; "
-                    "use the same"
+                    f"{config.path}: key `prior.from`: {space[i].name!r} had the {what} {before!r} there and has "
+                    f"{now!r} here; use the same"
                 )
         ends = space[i].normalise(earlier.space[j].value(np.array([0.0, 1.0])))
         slope[k], shift[k] = ends[1] - ends[0], ends[0]
     mean[new] = shift + slope * old_mean[old]
     covariance[np.ix_(new, new)] = slope[:, None] * old_covariance[np.ix_(old, old)] * slope
-    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space), _remarks(config, earlier, train)
+    noticed = _of_earlier(config.prior.source, earlier, train)
+    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space), noticed
 
 
-def _remarks(config: Config, earlier: Posterior, train: Sequence[LogReport]) -> tuple[str, ...]:
+def _of_earlier(source: Path, earlier: Posterior, train: Sequence[LogReport]) -> tuple[Finding, ...]:
     """What is to be said of an earlier posterior as the prior."""
-    assert config.prior is not None
-    remarks = []
+    noticed = []
     if isinstance(earlier, GaussianMixture) and len(earlier.means) > 1:
-        remarks.append(
-            f"the earlier posterior is a mixture of {len(earlier.means)} normals; one with its mean and covariance stands for it"
-        )
-    record = Path(config.prior.source).parent / RUN
+        noticed.append(finding(Code.PRIOR_OF_MIXTURE, components=len(earlier.means)))
+    record = source.parent / RUN
     if record.is_file():
         before = set(json.loads(record.read_text(encoding="utf-8")).get("logs_sha256", {}).values())
         again = [report.name for report in train if report.sha256 in before]
         if again:
-            remarks.append(
-                f"the earlier posterior has seen {', '.join(again)} already: counted twice, the intervals come out too narrow"
-            )
-    return tuple(remarks)
+            noticed.append(finding(Code.PRIOR_COUNTED_TWICE, logs=", ".join(again)))
+    return tuple(noticed)
 
 
 def method_of(
@@ -207,7 +238,19 @@ def method_of(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> Estimator:
-    """The configuration's estimator; what is given overrides it."""
+    """The configuration's estimator.
+
+    Args:
+        problem: the configuration read and bound.
+        estimator: default the configuration's.
+        seed: default the configuration's.
+        budget: rollouts; default the configuration's, then the estimator's.
+        checkpoint: file that an interrupted fit goes on from.
+        progress: called along the way.
+
+    Raises:
+        ConfigError: for keys that the estimator does not take.
+    """
     config = problem.config
     name = estimator or config.estimator
     takes = estimator_class(name).searches

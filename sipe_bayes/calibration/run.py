@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from sipe_bayes.calibration.config import Config
+from sipe_bayes.calibration.gathered import Marginals, not_better, of_logs, uneven_targets
 from sipe_bayes.calibration.output import CHECKPOINT, claim, describe_run, release, write_all
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
-from sipe_bayes.core.findings import Code
-from sipe_bayes.diagnostics.agreement import Disagreement, compare_logs
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.agreement import compare_logs
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
     channel_scores,
@@ -28,22 +28,16 @@ from sipe_bayes.diagnostics.evaluate import (
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.misspecification import Misfit, misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
-from sipe_bayes.diagnostics.records import ChannelScore, Residual, Ridge
-from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
+from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import observation_noise
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
-
-FloatArray = NDArray[np.float64]
-
-_DRAWS = 4000  # of the posterior, for summaries
-_NOT_DETERMINED = 0.5  # contraction below which a parameter is not determined
-_AT_BOUND = 0.02  # of the prior's range: how near to a bound the mode counts as at it
 
 
 def calibrate(
@@ -54,216 +48,164 @@ def calibrate(
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Fit, check and summarise. Estimator, seed and budget override the configuration's."""
+    """Fit, check and summarise.
+
+    Args:
+        problem: a configuration read and bound.
+        estimator: default the configuration's.
+        seed: default the configuration's.
+        budget: rollouts of the fit; default the configuration's, then the estimator's.
+        checkpoint: file that an interrupted fit goes on from.
+        progress: called along the way.
+    """
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
-    if not method.uncertain:
-        method.doubt(
-            f"the spread of {method.name} is that of its search, not an uncertainty: use laplace or mcmc, or in Python sipe.Recalibrated"
-        )
 
     def tell(what: str) -> None:
         if progress is not None:
             progress(what, method.rollouts, method.budget)
 
+    # what the parameters do and whether the logs agree about them
     tell("checking what each parameter changes")
-    theta = posterior.mode.numpy()
-    scored = {"train": problem.train, "holdout": problem.holdout}
-    bound = {
-        use: Windows(replace(problem.segments, fit=None), problem.simulator, logs)
-        for use, logs in scored.items()
-        if logs is not None
-    }
+    theta, space = posterior.mode.numpy(), problem.environment.space
     fitted = bind(problem.segments, problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
     conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed, tell)
-    for name in skipped:
-        method.warn(f"log {name} could not be fitted by itself; whether it agrees is unknown")
+    unknown = [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
+    # what the model lacks
     noise = _noise_of(method, fitted, theta)
     tell("checking what the model lacks")
-    lacking, residuals = _residuals(problem, method, fitted, theta, noise, posterior.stddev.numpy())
-    outside = _outside(problem, method, fitted)
+    lacks, residuals = _residuals(problem, method, fitted, theta, noise, posterior.stddev.numpy(), unknown)
+    outside = _outside(problem, method, fitted, unknown)
+    # how well it predicts
     tell("simulating the posterior's band")
-    draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(method.seed))
-    summaries = _summaries(problem, posterior, draws, dead, conflict, lacking)
-    found = ridges(problem.environment.space, draws, [p.contraction for p in summaries])
-    scores = {use: channel_scores(w, theta) for use, w in bound.items()}
-    held = scores.get("holdout", [])
-    comparison = compare_errors(bound["holdout"], theta) if "holdout" in bound else None
-    telling = held if comparison is None or comparison.starts is None else []  # errors that are not the starts'
+    marginals = Marginals.of(posterior, problem.prior, space, method.seed)
+    combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
+    predictions = _Predictions.of(problem, theta)
+    noticed = (
+        *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
+        *problem.findings,
+        *_own(method),
+        *unknown,
+        *uneven_targets(problem.environment),
+        *([] if conflict is None else [conflict.finding]),
+        *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
+        *marginals.findings(dead, combinations),
+        *predictions.findings(),
+        *of_logs(problem.reports),
+        *_left_out(problem, method),
+    )
     return Calibration(
-        name=_run_name(problem.config),
+        name=run_name(problem.config),
         estimator=method.name,
         posterior=posterior,
         prior=problem.prior,
-        parameters=summaries,
-        train=scores["train"],
-        holdout=held,
-        warnings=_alarms(lacking, outside) + _warnings(problem, method, summaries, dead, found, conflict, telling),
-        doubts=[*method.doubts, *(look.text for look in outside if look.alarm)],
-        signals=[s for use, w in reversed(bound.items()) for s in signals(w, use, theta, posterior, method.seed)],
+        parameters=marginals.summaries(),
+        train=predictions.train,
+        holdout=predictions.holdout,
+        findings=noticed,
+        signals=predictions.signals(posterior, method.seed),
         residuals=residuals,
-        ridges=found,
-        comparison=comparison,
-        misfit=lacking,
+        ridges=combinations,
+        comparison=predictions.comparison,
+        misfit=lacks,
         outside=outside,
-        left_out=_left_out(problem, method),
-        noise=_noise(fitted, noise),
-        mixing=method.diagnostics.get("mixing"),
-        logs=[r.to_dict() for r in problem.reports],
+        noise=_by_channel(fitted, noise),
+        mixing=_mixing(method),
+        logs=list(problem.reports),
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
     )
 
 
+@dataclass(frozen=True)
+class _Predictions:
+    """Of the logs at theta (N,), by use: windows from measured starts, the errors there, the held-out ones compared."""
+
+    theta: FloatArray
+    windows: dict[str, Windows]
+    train: list[ChannelScore]
+    holdout: list[ChannelScore]
+    comparison: Comparison | None
+
+    @classmethod
+    def of(cls, problem: Problem, theta: FloatArray) -> _Predictions:
+        windows = {"train": _every_channel(problem, problem.train)}
+        if problem.holdout is None:
+            return cls(theta, windows, channel_scores(windows["train"], theta), [], None)
+        windows["holdout"] = held_out = _every_channel(problem, problem.holdout)
+        train, holdout = (channel_scores(one, theta) for one in windows.values())
+        return cls(theta, windows, train, holdout, compare_errors(held_out, theta))
+
+    def findings(self) -> list[Finding]:
+        """Held-out errors that did not become smaller, unless they are mostly those of the measured starts."""
+        of_starts = self.comparison is not None and self.comparison.starts is not None
+        return [] if of_starts else not_better(self.holdout)
+
+    def signals(self, posterior: Posterior, seed: int) -> list[Signal]:
+        """What the report draws, held-out logs first."""
+        uses = reversed(self.windows.items())
+        return [s for use, windows in uses for s in signals(windows, use, self.theta, posterior, seed)]
+
+
+def _every_channel(problem: Problem, logs: Trajectories) -> Windows:
+    """Windows of logs by which they are scored and drawn, in all channels."""
+    return Windows(replace(problem.segments, fit=None), problem.simulator, logs)
+
+
+def _own(method: Estimator) -> list[Finding]:
+    """What the estimator noticed itself; bounds are told by parameter, with their values."""
+    spread = [] if method.uncertain else [finding(Code.SEARCH_SPREAD, method=method.name)]
+    return [item for item in method.findings if item.code is not Code.AT_BOUND] + spread
+
+
 def _residuals(
-    problem: Problem, method: Estimator, fitted: Windows, theta: FloatArray, noise: Noise, sd: FloatArray
+    problem: Problem,
+    method: Estimator,
+    fitted: Windows,
+    theta: FloatArray,
+    noise: Noise,
+    sd: FloatArray,
+    unknown: list[Finding],
 ) -> tuple[Misfit | None, list[Residual]]:
-    """What the residuals look like, and the residuals; nothing with a ``StateSpace``, whose process noise takes what the model
-    lacks. sd (N,): of the posterior in theta."""
+    """What the residuals look like, and the residuals.
+
+    Nothing with a ``StateSpace``, whose process noise takes what the model lacks. sd (N,): of the posterior in theta;
+    unknown: gets a finding where they cannot be looked at.
+    """
     if isinstance(problem.likelihood, StateSpace):
         return None, []
     starts = best_starts(fitted, theta, noise)
     try:
         prior = QuadraticPrior.of(problem.prior)
-        found = misfit(fitted, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed)
+        lacks = misfit(fitted, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed)
     except ValueError as error:  # LinAlgError is one
-        method.warn(f"whether the residuals are noise is unknown: {error}")
-        found = None
-    return found, fitted_residuals(fitted, theta, noise, starts)
+        unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
+        lacks = None
+    return lacks, fitted_residuals(fitted, theta, noise, starts)
 
 
-def _outside(problem: Problem, method: Estimator, fitted: Windows) -> list[OutsidePrior]:
+def _outside(problem: Problem, method: Estimator, fitted: Windows, unknown: list[Finding]) -> list[OutsidePrior]:
     noise = observation_noise(method.diagnostics, problem.train, problem.likelihood)
     try:
         return outside_prior(fitted, problem.prior, noise, seed=method.seed)
     except ValueError as error:
-        method.warn(f"whether the logs lie within the prior is unknown: {error}")
+        unknown.append(finding(Code.OUTSIDE_PRIOR_UNKNOWN, reason=error))
         return []
 
 
-def _alarms(lacking: Misfit | None, outside: Sequence[OutsidePrior]) -> list[str]:
-    return [look.text for look in (*outside, lacking) if look is not None and look.alarm]
-
-
-def _left_out(problem: Problem, method: Estimator) -> list[str]:
+def _left_out(problem: Problem, method: Estimator) -> list[Finding]:
     """What the report does not look at with a ``StateSpace``, and what its process noise says instead."""
-    if isinstance(problem.likelihood, Segments):
+    if not isinstance(problem.likelihood, StateSpace):
         return []
-    said = (
-        "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, and process "
-        "noise, which is inferred, takes what the model lacks. Errors and signals are over windows from measured starts."
-    )
+    noticed = [finding(Code.RESIDUALS_LEFT_OUT)]
     known = ("process_noise", "movement", "loose")
-    if not set(known) <= method.diagnostics.keys():
-        return [said]
-    chain: Any = method.windows(problem.train)
-    return [said, chain.lacking(*(np.array(method.diagnostics[key]) for key in known))]
-
-
-def _run_name(config: Config) -> str:
-    stem = config.path.stem
-    return config.path.resolve().parent.name if stem in ("calibrate", "config") else stem
-
-
-def _summaries(
-    problem: Problem,
-    posterior: Posterior,
-    draws: FloatArray,
-    dead: dict[str, list[tuple[float, float]]],
-    conflict: Disagreement | None,
-    lacking: Misfit | None,
-) -> list[ParameterSummary]:
-    space = problem.environment.space
-    theta = posterior.mode.numpy()
-    mode = space.values(theta)
-    prior_sd, sd = problem.prior.stddev.numpy(), posterior.stddev.numpy()
-    contraction = 1 - sd / np.maximum(prior_sd, 1e-300)
-    quantiles = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
-    rows = []
-    for j, p in enumerate(space):
-        flags = []
-        if any(low <= 0 and high >= 1 for low, high in dead.get(p.name, [])):
-            flags.append("no_effect")
-        elif p.name in dead:
-            flags.append("dead_range")
-        if contraction[j] < _NOT_DETERMINED:
-            flags.append("not_determined")
-        elif min(theta[j], 1 - theta[j]) < _AT_BOUND * min(1.0, 10 * sd[j]):
-            flags.append("at_bound")
-        if conflict is not None and conflict.parameter == p.name:
-            flags.append("disagrees")
-        if lacking is not None and lacking.matters and (p.name in lacking.moved or not lacking.moved):
-            flags.append("misfit")
-        if p.log is not None:
-            flags.append("nuisance")
-        rows.append(
-            ParameterSummary(
-                name=p.name,
-                unit=p.unit,
-                targets=p.targets,
-                mean=float(draws[:, j].mean()),
-                sd=float(draws[:, j].std()),
-                q05=float(quantiles[0, j]),
-                q50=float(quantiles[1, j]),
-                q95=float(quantiles[2, j]),
-                mode=float(mode[j]),
-                default=p.default,
-                contraction=float(contraction[j]),
-                flags=tuple(flags),
-            )
-        )
-    return rows
-
-
-def _warnings(
-    problem: Problem,
-    method: Estimator,
-    summaries: Sequence[ParameterSummary],
-    dead: dict[str, list[tuple[float, float]]],
-    found: Sequence[Ridge],
-    conflict: Disagreement | None,
-    holdout: Sequence[ChannelScore],
-) -> list[str]:
-    own = [f.text for f in method.findings if f.code is not Code.AT_BOUND]  # said below, with the value
-    words = [*problem.warnings, *own] + [
-        f"{p.name}: its targets have different values in the model, so 'the model as given' stands for all at {p.default:.4g} {p.unit}"
-        for p in problem.environment.space
-        if problem.environment.uneven(p)
-    ]
-    if conflict is not None:
-        unit = problem.environment.space[problem.environment.space.index(conflict.parameter)].unit
-        words.append(conflict.text(unit))
-    words += [f"{ridge.text}: fix one of them at a measured value" for ridge in found]
-    in_ridge = {name for ridge in found for name in ridge.parameters}
-    for p in summaries:
-        space = problem.environment.space[problem.environment.space.index(p.name)]
-        if "no_effect" in p.flags:
-            words.append(f"{p.name} changes nothing in these logs; its posterior is its prior")
-        elif "dead_range" in p.flags:
-            ranges = ", ".join(f"{space.value(a):.4g} to {space.value(b):.4g}" for a, b in dead[p.name])
-            words.append(f"{p.name} changes nothing between {ranges} {p.unit}")
-        if "not_determined" in p.flags and "no_effect" not in p.flags and p.name not in in_ridge:
-            words.append(f"{p.name} is not determined by these logs (contraction {p.contraction:.2f})")
-        if "at_bound" in p.flags:
-            bound = space.low if p.mode - space.low < space.high - p.mode else space.high
-            words.append(f"{p.name} is at its bound {bound:.4g} {p.unit}: widen it, unless the bound is physical")
-    words += [text for s in holdout if (text := _heldout_warning(s))]
-    for r in problem.reports:
-        if r.gaps or r.resampled or any(r.missing.values()) or any(r.clipped.values()):
-            words += [f"log {r.name}: {note}" for note in r.notes]
-    return words
-
-
-def _heldout_warning(s: ChannelScore) -> str:
-    """Empty where the calibrated model predicts better than the model as given."""
-    where = f"held-out {s.log}, {s.channel}"
-    if not np.isfinite(s.rmse):
-        return f"{where}: the calibrated model diverges there"
-    if not np.isfinite(s.rmse_default) or s.rmse < s.rmse_default:
-        return ""
-    return f"{where}: {s.rmse:.3g} {s.unit} is not better than the model as given ({s.rmse_default:.3g})"
+    if set(known) <= method.diagnostics.keys():
+        chain: Any = method.windows(problem.train)
+        text = chain.lacking(*(np.array(method.diagnostics[key]) for key in known))
+        noticed.append(finding(Code.PROCESS_NOISE, text=text))
+    return noticed
 
 
 def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
@@ -273,14 +215,22 @@ def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
     return white_noise(windows, theta)
 
 
-def _noise(windows: Windows, noise: Noise) -> dict[str, dict[str, Any]]:
-    units = dict(zip(windows.simulator.environment.channels, _units(windows), strict=True))
+def _by_channel(windows: Windows, noise: Noise) -> dict[str, ChannelNoise]:
+    environment = windows.simulator.environment
+    units = dict(zip(environment.channels, getattr(environment, "channel_units", ()), strict=False))
     rows = zip(windows.fitted, noise.sd.tolist(), noise.tau.tolist(), strict=True)
-    return {name: {"sd": sd, "tau": tau, "unit": units[name]} for name, sd, tau in rows}
+    return {name: ChannelNoise(sd, tau, units.get(name, "")) for name, sd, tau in rows}
 
 
-def _units(windows: Windows) -> tuple[str, ...]:
-    return tuple(getattr(windows.simulator.environment, "channel_units", ("",) * len(windows.channels)))
+def _mixing(method: Estimator) -> Mixing | None:
+    measured = method.diagnostics.get("mixing")
+    return Mixing.of(measured, method.space.names) if measured else None
+
+
+def run_name(config: Config) -> str:
+    """What a run is called: as the configuration's file, or its folder where the file's name says nothing."""
+    stem = config.path.stem
+    return config.path.resolve().parent.name if stem in ("calibrate", "config") else stem
 
 
 def run(
@@ -294,25 +244,37 @@ def run(
 ) -> Calibration:
     """What the command does: read, claim the output folder, fit with a checkpoint, write everything.
 
-    Every input is checked before the folder is touched. The same call after an interruption resumes."""
+    Every input is checked before the folder is touched. The same call after an interruption resumes.
+
+    Args:
+        config: the TOML file.
+        estimator: default the configuration's.
+        seed: default the configuration's.
+        budget: rollouts of the fit; default the configuration's, then the estimator's.
+        out: folder of the results; default runs/NAME-ESTIMATOR.
+        num_threads: native ones; default all cores.
+        progress: called along the way.
+
+    Raises:
+        ValueError: for input that cannot be used; the message is one line with the remedy.
+    """
     problem = prepare(config, num_threads)
     name = estimator or problem.config.estimator
     method_of(problem, name, seed, budget)
     bind(problem.likelihood, problem.simulator, problem.train)
     if problem.holdout is not None:
-        Windows(replace(problem.segments, fit=None), problem.simulator, problem.holdout)
+        _every_channel(problem, problem.holdout)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
-    folder = Path("runs") / f"{_run_name(problem.config)}-{name}" if out is None else out
+    folder = Path("runs") / f"{run_name(problem.config)}-{name}" if out is None else out
     record = describe_run(problem, name, chosen_seed, chosen_budget)
     claim(folder, record)
     try:
-        found = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
+        calibration = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
     except ValueError:
         release(folder)
         raise
-    found.run, found.out = record, str(folder)
+    calibration = replace(calibration, run=record, out=str(folder))
     if progress is not None:
-        progress("writing the report", found.rollouts, found.rollouts)
-    write_all(found, problem, folder)
-    return found
+        progress("writing the report", calibration.rollouts, calibration.rollouts)
+    return write_all(calibration, problem, folder)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.calibration.config import nearest_file
+from sipe_bayes.calibration.config_fields import nearest_file
 
 Columns = dict[str, NDArray[Any]]
 

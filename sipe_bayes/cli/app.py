@@ -178,19 +178,21 @@ def print_calibration(found: Calibration) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from sipe_bayes.report.page import parameter_verdict, significant, verdicts
+    from sipe_bayes.core.findings import Findings
+    from sipe_bayes.report.verdicts import parameter_verdict, verdicts
+    from sipe_bayes.report.words import significant
 
     console = _console()
     console.print(Text(f"{found.name}: posterior by {found.estimator}"))
     for verdict in verdicts(found):
         console.print(Text(verdict.text, style=_TONES[verdict.tone]))
-    table = Table()
+    findings, table = Findings(found.findings), Table()
     for heading in ("parameter", "value", "90 % interval", "unit", "verdict"):
         table.add_column(heading, justify="right" if heading in ("value", "90 % interval") else "left")
     for p in found.parameters:
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
-        verdict = parameter_verdict(p, found.ridges, found.doubts)
+        verdict = parameter_verdict(p, findings)
         # brackets of a name are not markup
         table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     console.print(table)

@@ -124,7 +124,8 @@ TEXTS: dict[Code, Text] = {
     ),
     Code.NOT_MIXED: Text(
         _BLOCKING,
-        "the {what} have not mixed (R-hat {rhat:.3f}, {ess:.0f} effective{unit}): {remedy} before you trust the intervals",
+        "the {what} have not mixed (R-hat {rhat:.3f}, {ess:.0f} effective{unit}): {remedy} before you trust the "
+        "intervals",
     ),
     Code.SEARCH_SPREAD: Text(
         _BLOCKING,

@@ -103,7 +103,11 @@ class Findings:
         """Those of these codes."""
         return [item for item in self._items if item.code in codes]
 
-    def __contains__(self, code: Code) -> bool:
+    def about(self, name: str) -> list[Finding]:
+        """Those about one parameter, or about all."""
+        return [item for item in self._items if name in item.parameters or not item.parameters]
+
+    def __contains__(self, code: object) -> bool:
         return any(item.code == code for item in self._items)
 
     def __iter__(self) -> Iterator[Finding]:

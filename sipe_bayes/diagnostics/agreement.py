@@ -1,12 +1,14 @@
 """Do the logs agree? Each is fitted by itself; estimates that differ by more than their uncertainty are an alarm.
 
-With m_k the optimum of log k and L_k its information (starts and its own nuisance parameters marginalised, directions of which it says less
-than a uniform prior left out), Q is the least of sum_k (m_k - mu)' L_k (m_k - mu) over a common mu: chi-square, when the logs agree,
-with as many degrees of freedom as the logs determine directions, each by itself, less those that they determine together (Cochran's
-test). Along directions that even together they leave open mu keeps within the cube, which makes Q smaller than that at most. The
-parameter named is the one whose freedom to differ between logs lowers Q most: the most economical explanation, not merely the largest
-shift. Where even that leaves the logs in disagreement, the text says that no single parameter explains it. And each log is left out in
-turn: where the others agree without one, that one is named.
+With m_k the optimum of log k and L_k its information (starts and its own nuisance parameters marginalised, directions of
+which it says less than a uniform prior left out), Q is the least of sum_k (m_k - mu)' L_k (m_k - mu) over a common mu.
+When the logs agree it is chi-square, with as many degrees of freedom as the logs determine directions, each by itself,
+less those that they determine together (Cochran's test). Along directions that even together they leave open mu keeps
+within the cube, which makes Q smaller than that at most.
+
+The parameter named is the one whose freedom to differ between logs lowers Q most: the most economical explanation, not
+merely the largest shift. Where even that leaves the logs in disagreement, the text says that no single parameter
+explains it. And each log is left out in turn: where the others agree without one, that one is named.
 """
 
 from __future__ import annotations
@@ -17,25 +19,29 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 import scipy.stats
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
-
-LEVEL = 0.01  # false alarms where logs agree
 _BUDGET = 5000  # rollouts for each log
-_DETERMINED = 12.0  # information of a uniform prior: directions with less are not tested
-_KNOWN = 0.5 / np.sqrt(12)  # sd in theta: half of the prior's
+_UNIFORM = 12.0  # information of a uniform prior: directions with less are not tested
 
 
 @dataclass(frozen=True)
 class LogEstimate:
-    """One log by itself: mean (N,) and information (N, N) in theta."""
+    """One log by itself.
+
+    Args:
+        name: of the log.
+        mean: (N,) in theta.
+        information: (N, N) in theta.
+    """
 
     name: str
     mean: FloatArray
@@ -44,30 +50,43 @@ class LogEstimate:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """p: of Cochran's Q under agreement; parameter: its most economical explanation; p_left: the same with that parameter free in every
-    log; per_log: (log, value, sd) in the parameter's unit, of logs that determine it; odd: the log without which the others agree best, and
-    p_without: how well, where they do at the same level."""
+    """How logs disagree.
+
+    Args:
+        p: of Cochran's Q under agreement.
+        parameter: its most economical explanation.
+        p_left: the same with that parameter free in every log.
+        per_log: (log, value, sd) in the parameter's unit, of logs that determine it.
+        unit: of the parameter.
+        odd: the log without which the others agree best, where they do at the same level.
+        p_without: how well they agree without it.
+    """
 
     p: float
     parameter: str
     p_left: float
     per_log: tuple[tuple[str, float, float], ...]
+    unit: str = ""
     odd: str | None = None
     p_without: float = 0.0
 
-    def text(self, unit: str) -> str:
-        """In words."""
-        parts = ", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log)
-        without = "" if self.odd is None else f"; without {self.odd} the others agree (p = {self.p_without:.1g})"
-        if self.p_left < LEVEL:
-            return (
-                f"the logs disagree (p = {self.p:.1g}) and no single parameter explains it: the model lacks something that "
-                f"differs between them; {self.parameter} explains most ({parts} {unit}){without}"
-            )
-        return (
-            f"the logs disagree about {self.parameter} (p = {self.p:.1g}): {parts} {unit}; "
-            f"give it per_log = true, model what changed, or leave a log out{without}"
+    @property
+    def finding(self) -> Finding:
+        """It as a finding about the parameter."""
+        unexplained = self.p_left < THRESHOLDS.logs_disagree
+        return finding(
+            Code.LOGS_DISAGREE_UNEXPLAINED if unexplained else Code.LOGS_DISAGREE,
+            parameters=[self.parameter],
+            p=self.p,
+            estimates=", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log),
+            unit=self.unit,
+            without="" if self.odd is None else f"; without {self.odd} the others agree (p = {self.p_without:.1g})",
         )
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return self.finding.text
 
 
 def compare_logs(
@@ -78,8 +97,19 @@ def compare_logs(
     seed: int = 0,
     tell: Callable[[str], object] = lambda _: None,
 ) -> tuple[Disagreement | None, list[str]]:
-    """Fit each log by itself, from theta (N,), and compare; and the names of logs that could not be fitted alone. tell: told
-    what is being done."""
+    """Fit each log by itself, and compare.
+
+    Args:
+        simulator: of the model.
+        likelihood: of the fits.
+        trajectories: the logs; one alone agrees with itself.
+        theta: (N,) where each fit starts.
+        seed: of the fits.
+        tell: called with what is being done.
+
+    Returns:
+        The disagreement, or None, and the names of logs that could not be fitted alone.
+    """
     estimates, skipped = [], []
     for trajectory in trajectories if len(trajectories) > 1 else ():
         tell(f"checking log {trajectory.name} by itself")
@@ -94,27 +124,32 @@ def compare_logs(
 
 
 def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
-    """The disagreement of two or more logs, or None. Only parameters shared by all logs are compared."""
+    """The disagreement of two or more logs, or None; only parameters shared by all logs are compared.
+
+    Args:
+        space: of the N parameters.
+        logs: each by itself.
+    """
     shared = [j for j, p in enumerate(space) if p.log is None]
     if len(logs) < 2 or not shared:
         return None
     roots = [_root(_marginal(log.information, shared)) for log in logs]
     sought = [root @ log.mean[shared] for root, log in zip(roots, logs, strict=True)]
     together = _scatter(roots, sought)
-    if together.freedom < 1 or together.p > LEVEL:
+    if together.freedom < 1 or together.p > THRESHOLDS.logs_disagree:
         return None
     apart = [_scatter(roots, sought, own=j) for j in range(len(shared))]
-    worst = int(np.argmin([found.q for found in apart]))
+    worst = int(np.argmin([scatter.q for scatter in apart]))
     parameter, per_log = space[shared[worst]], []
     for log, theta, sd in zip(logs, *apart[worst].own, strict=True):
-        if sd < _KNOWN:
+        if sd < (1 - THRESHOLDS.not_determined) / np.sqrt(12):  # of the uniform prior's
             slope = float(parameter.value(theta + 1e-6) - parameter.value(theta - 1e-6)) / 2e-6
             per_log.append((log.name, float(parameter.value(theta)), float(sd) * slope))
     left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
-    agree = left_out[best].freedom > 0 and left_out[best].p > LEVEL
+    agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree
     odd = (logs[best].name, left_out[best].p) if agree else (None, 0.0)
-    return Disagreement(together.p, parameter.name, apart[worst].p, tuple(per_log), *odd)
+    return Disagreement(together.p, parameter.name, apart[worst].p, tuple(per_log), parameter.unit, *odd)
 
 
 def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
@@ -131,8 +166,8 @@ def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
 def _root(information: FloatArray) -> FloatArray:
     """Rows r (R, N) with r' r the information in the R directions of which it says more than a uniform prior."""
     eigenvalues, axes = np.linalg.eigh(information)
-    told = eigenvalues > _DETERMINED
-    return np.asarray(np.sqrt(eigenvalues[told])[:, None] * axes[:, told].T)
+    determined = eigenvalues > _UNIFORM
+    return np.asarray(np.sqrt(eigenvalues[determined])[:, None] * axes[:, determined].T)
 
 
 @dataclass(frozen=True)
@@ -163,10 +198,10 @@ def _scatter(roots: list[FloatArray], sought: list[FloatArray], own: int | None 
         at += len(root)
     target = np.concatenate(sought)
     eigenvalues, axes = np.linalg.eigh(rows.T @ rows)
-    weak = eigenvalues <= _DETERMINED
+    weak = eigenvalues <= _UNIFORM
     low = np.where(weak, np.minimum(axes, 0).sum(0), -np.inf)
     high = np.where(weak, np.maximum(axes, 0).sum(0), np.inf)
     solution = axes @ scipy.optimize.lsq_linear(rows @ axes, target, (low, high), tol=1e-12).x
-    sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + _DETERMINED * np.eye(rows.shape[1]))))
+    sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + _UNIFORM * np.eye(rows.shape[1]))))
     q = float(((rows @ solution - target) ** 2).sum())
     return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], sd[len(common) :]))

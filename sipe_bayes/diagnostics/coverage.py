@@ -34,11 +34,10 @@ from typing import Any, Literal
 import numpy as np
 import scipy.stats
 import torch
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.posterior import Posterior
 
-FloatArray = NDArray[np.float64]
 Verdict = Literal["calibrated", "too narrow", "too wide", "shifted"]
 
 LEVELS = np.arange(1, 100) / 100

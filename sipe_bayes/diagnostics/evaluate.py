@@ -14,15 +14,13 @@ import mujoco
 import numpy as np
 import scipy.stats
 import torch
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
-
-FloatArray = NDArray[np.float64]
 
 _BAND_DRAWS = 64
 _MOSTLY = 0.95  # of an error

@@ -10,25 +10,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Ridge
 from sipe_bayes.likelihood.windows import Windows
 
-FloatArray = NDArray[np.float64]
-
 GRID = (0.0, 0.25, 0.5, 0.75, 1.0)
-_NO_EFFECT = 1e-7  # of the signal's own spread
-_NARROW = 0.03  # eigenvalue of the correlation matrix below which a combination is far better known than its members
-_MEMBER = 0.25  # of the largest loading, from which a parameter belongs to a ridge
-_DETERMINED = 0.8  # contraction from which a member is well known by itself
 
 
 def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
-    """Parameter -> pieces [a, b] of [0, 1] over which it changes no fitted channel, the others at theta (N,).
+    """Where parameters change nothing; costs five rollouts a parameter and log.
 
-    Costs five rollouts a parameter and log; a piece whose simulation diverges is not called dead."""
+    Args:
+        windows: the logs.
+        theta: (N,) where the other parameters stand.
+
+    Returns:
+        Parameter -> pieces [a, b] of [0, 1] over which it changes no fitted channel. A piece whose simulation diverges
+        is not called dead.
+    """
     space = windows.simulator.space
     points = np.tile(theta, (len(space) * len(GRID), 1))
     for j in range(len(space)):
@@ -41,7 +43,7 @@ def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[flo
         for k in range(len(GRID) - 1):
             if valid[k] and valid[k + 1]:
                 change = np.abs(predicted[k + 1] - predicted[k]) / scale
-                if np.where(windows.observed, change, 0.0).max() < _NO_EFFECT:
+                if np.where(windows.observed, change, 0.0).max() < THRESHOLDS.no_effect:
                     dead.setdefault(name, []).append((GRID[k], GRID[k + 1]))
     return {name: _joined(pieces) for name, pieces in dead.items()}
 
@@ -57,22 +59,28 @@ def _joined(pieces: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float]) -> list[Ridge]:
-    """Combinations that are determined while their members are not, from posterior draws (n, N) in units."""
+    """Combinations that are determined while their members are not.
+
+    Args:
+        space: of the N parameters.
+        draws: (n, N) of the posterior, in units.
+        contraction: (N,) 1 - sd / prior sd of each.
+    """
     spread = draws.std(0)
     moving = np.flatnonzero(spread > 1e-12 * np.maximum(np.abs(draws.mean(0)), 1e-300))
     if len(moving) < 2:
         return []
     steady = np.abs(np.sign(draws).sum(0)) == len(draws)
     logarithms = np.where(steady, np.log(np.maximum(np.abs(draws), 1e-300)), draws)
-    found: list[Ridge] = []
+    seen: list[Ridge] = []
     used: list[set[str]] = []
     for view in (logarithms[:, moving], draws[:, moving]):
         eigenvalues, vectors = np.linalg.eigh(np.corrcoef(view.T))
         for value, vector in zip(eigenvalues, vectors.T, strict=True):
             members = [int(moving[i]) for i in _members(vector)]
-            if value > 3 * _NARROW or len(members) < 2:
+            if value > 3 * THRESHOLDS.ridge or len(members) < 2:
                 continue
-            if all(contraction[j] > _DETERMINED for j in members):
+            if all(contraction[j] > THRESHOLDS.well_determined for j in members):
                 continue
             ridge = _describe(space, draws, members, contraction)
             named = set().union(*used)
@@ -80,29 +88,31 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
             if 0 < len(fresh) < len(members) and (ridge is None or set(ridge.parameters) <= named):
                 one = next(j for j in members if j not in fresh)  # of those that go together, the others follow
                 ridge = _describe(space, draws, sorted([one, *fresh]), contraction)
-            if ridge is not None and not any(set(ridge.parameters) <= seen for seen in used):
+            if ridge is not None and not any(set(ridge.parameters) <= other for other in used):
                 used.append(set(ridge.parameters))
-                found.append(ridge)
-    return found
+                seen.append(ridge)
+    return seen
 
 
-def _members(loadings: FloatArray) -> NDArray[np.int64]:
+def _members(loadings: FloatArray) -> IntArray:
     size = np.abs(loadings)
-    return np.flatnonzero(size > _MEMBER * size.max())
+    return np.flatnonzero(size > THRESHOLDS.ridge_member * size.max())
 
 
 def _describe(
     space: ParameterSpace, draws: FloatArray, members: list[int], contraction: Sequence[float]
 ) -> Ridge | None:
-    """The best determined combination of the members, in words; None when it is not far better known than they, or each of them
-    is well known by itself."""
+    """The best determined combination of the members.
+
+    None when it is not far better known than they, or each of them is well known by itself.
+    """
     chosen = draws[:, members]
     spaces = [("sum", chosen)]
     if (np.abs(np.sign(chosen).sum(0)) == len(chosen)).all():  # nobody changes sign: products have logarithms
         spaces.insert(0, ("product", np.log(np.abs(chosen))))
-    best = min(((*_narrowest(x), kind, x) for kind, x in spaces), key=lambda found: found[0])
+    best = min(((*_narrowest(x), kind, x) for kind, x in spaces), key=lambda one: one[0])
     eigenvalue, weights, loadings, kind, x = best[0], np.array(best[1]), np.array(best[2]), best[3], best[4]
-    if eigenvalue > _NARROW:
+    if eigenvalue > THRESHOLDS.ridge:
         return None
     kept = _members(loadings)
     names, units = ([getattr(space[members[k]], what) for k in kept] for what in ("name", "unit"))
@@ -115,12 +125,12 @@ def _describe(
     else:
         unit = units[int(np.argmax(loadings[kept]))]
         value, width, text = float(combined.mean()), float(combined.std()), _sum(names, weights[kept], units, unit)
-    unit = f" {unit}" if unit not in ("", "1") else ""
-    unknown = [name for name, k in zip(names, kept, strict=True) if contraction[members[k]] <= _DETERMINED]
+    unknown = [
+        name for name, k in zip(names, kept, strict=True) if contraction[members[k]] <= THRESHOLDS.well_determined
+    ]
     if not unknown:
         return None
-    alone = f"{', '.join(unknown[:-1])} and {unknown[-1]} alone are" if len(unknown) > 1 else f"{unknown[0]} alone is"
-    return Ridge(f"{text} = {value:.4g} ± {width:.1g}{unit} is determined; {alone} not", tuple(names))
+    return Ridge(tuple(names), text, float(value), float(width), unit, tuple(unknown))
 
 
 def _narrowest(x: FloatArray) -> tuple[float, tuple[float, ...], tuple[float, ...]]:

@@ -1,25 +1,30 @@
 """Can the model explain the log? Residuals that are not noise.
 
-At the estimate, with parameters and windows' starts free to follow (linearised, but for parameters that the log presses against a
-bound) and autoregressive noise, two kinds of statistics are looked at. *Probes*: a force that the model may lack, as a change u + b phi(t) of an actuator's command with
-phi = dry friction tanh(v / v0), friction under load |u| tanh(v / v0), drag v |v|, delay u(t - 1) - u(t), a spring q, a stiffening
-spring q^3, an offset 1 and a gain that is not constant u |u|; v and q are the velocity and position of the joint that it drives. The
-score statistic of b, all else projected out, is chi-square with one degree of freedom (C. R. Rao 1948,
-https://doi.org/10.1017/S0305004100023987): the simulation answers what such a force would have done to every sample. *Whiteness*, of
-each channel's whitened residuals: the sum of squared autocorrelations over lags 1, 2, 3, 5, 8, ... (G. Box, D. Pierce 1970,
-https://doi.org/10.1080/01621459.1970.10481180), and the largest mean square of ten pieces of time.
+At the estimate, with parameters and windows' starts free to follow (linearised, but for parameters that the log presses
+against a bound) and autoregressive noise, two kinds of statistics are looked at.
+
+- *Probes* (``diagnostics.probes``): a force that the model may lack, as a change of an actuator's command by b phi(t).
+  The score statistic of b, all else projected out, is chi-square with one degree of freedom (C. R. Rao 1948,
+  https://doi.org/10.1017/S0305004100023987): the simulation answers what such a force would have done to every sample.
+- *Whiteness* of each channel's whitened residuals: the sum of squared autocorrelations over lags 1, 2, 3, 5, 8, ...
+  (G. Box, D. Pierce 1970, https://doi.org/10.1080/01621459.1970.10481180), and the largest mean square of ten pieces of
+  time.
 
 The null is simulated: noise as estimated, drawn anew, estimated anew, projected alike. Each statistic's cube root is
 standardised by its mean and sd over these; the largest is compared with the largest of each. So the p-value holds for
 white and first-order autoregressive sensor noise, whatever the number of probes, up to the linearisation.
 
-A small p says that something is there, not that it is large: with it come the share of each channel's residual that the named
-cause explains and, of a probe, how far the estimate would move if the model had it.
+A small p says that something is there, not that it is large: with it come the share of each channel's residual that the
+named cause explains and, of a probe, how far the estimate would move if the model had it.
 
-Deviations: the log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
-estimates. A probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow
-misfit passes as slow noise. Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is
-named even if whiteness is odder, since it says more. A cause that is named is the one that fits best, not one that is proven.
+Deviations:
+
+- The log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
+  estimates.
+- A probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow misfit
+  passes as slow noise.
+- Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is named even if
+  whiteness is odder, since it says more. A cause that is named is the one that fits best, not one that is proven.
 """
 
 from __future__ import annotations
@@ -27,12 +32,13 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import best_starts
+from sipe_bayes.diagnostics.probes import probe_effects
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
@@ -40,33 +46,32 @@ from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
-SIMULATED = 199
-LEVEL = 0.05
-SMALL = 0.1
-"""Share of a channel's residual below which what the model lacks counts as small."""
-FAR = 1.0
-"""Posterior sds: a parameter that would move further if the model had what it lacks is not to be trusted."""
-_STEP = 1e-3  # of a command's size: how far a probe is pushed
-_SOFT = 0.05  # of a velocity's size, where friction turns round
-_PIECES = 10
-_LAGS = (1, 2, 3, 5, 8, 13, 21, 34)
-_FLAT_PRECISION = 1e-6
-_AT_BOUND = 1e-6  # of the range
+SIMULATED = 199  # draws of the null: p resolves half a percent
+_PIECES = 10  # of a log, among which the largest mean square is looked for
+_LAGS = (1, 2, 3, 5, 8, 13, 21, 34)  # samples: each channel's memory at every scale
+_FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
+_PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 _AT_ONCE = 16  # draws of the null whose products are formed together
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """p: of residuals as odd as these under a right model with autoregressive noise. cause: what fits them best, in words; remedy:
-    what to do about it; log, channel, start, stop (s): where it shows most.
+    """What the residuals look like.
 
-    share: for each channel the share of the residual's variance that the cause explains; where samples follow one another, of the
-    whitened residual's that those before foretell; where noise is larger for a while, of its squares what that tenth of the time
-    has too many. shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
-    where that cannot be told."""
+    Args:
+        p: of residuals as odd as these under a right model with autoregressive noise.
+        cause: what fits them best, in words.
+        remedy: what to do about it.
+        log: where it shows most.
+        channel: where it shows most.
+        start: s, from where it shows most.
+        stop: s, to where.
+        share: for each channel the share of the residual's variance that the cause explains. Where samples follow one
+            another, of the whitened residual's that those before foretell; where noise is larger for a while, of its
+            squares what that tenth of the time has too many.
+        shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
+            where that cannot be told.
+    """
 
     p: float
     cause: str
@@ -80,37 +85,42 @@ class Misfit:
 
     @property
     def alarm(self) -> bool:
-        """Whether p is at most ``LEVEL``."""
-        return self.p <= LEVEL
+        """Whether the residuals are not noise."""
+        return self.p <= THRESHOLDS.misfit
 
     @property
     def moved(self) -> list[str]:
-        """The parameters that would move by more than ``FAR``."""
-        return [name for name, sds in self.shift.items() if abs(sds) > FAR]
+        """The parameters that would move far."""
+        return [name for name, sds in self.shift.items() if abs(sds) > THRESHOLDS.far_shift]
 
     @property
     def matters(self) -> bool:
         """Whether there is an alarm and its cause is not small."""
-        return self.alarm and (max(self.share.values()) >= SMALL or bool(self.moved))
+        return self.alarm and (max(self.share.values()) >= THRESHOLDS.small_misfit or bool(self.moved))
+
+    @property
+    def finding(self) -> Finding:
+        """It as a finding: about the parameters that move, or about all where that cannot be told."""
+        code = Code.MISFIT_SHIFTS if self.moved else Code.MISFIT if self.matters else Code.SMALL_MISFIT
+        return finding(
+            code if self.alarm else Code.NO_MISFIT,
+            parameters=self.moved if self.matters else (),
+            log=self.log,
+            p=self.p,
+            cause=self.cause,
+            percent=100 * self.share[self.channel],
+            channel=self.channel,
+            start=self.start,
+            stop=self.stop,
+            moved=", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved),
+            remedy=self.remedy,
+            far=THRESHOLDS.far_shift,
+        )
 
     @property
     def text(self) -> str:
         """In a sentence."""
-        there = (
-            f"{self.cause} ({100 * self.share[self.channel]:.2g} % of the residual of {self.channel}), most in {self.log} between "
-            f"{self.start:.3g} and {self.stop:.3g} s"
-        )
-        if not self.alarm:
-            return f"the residuals pass for noise (p = {self.p:.2g}); what they resemble most is {there}"
-        found = f"the residuals are not noise (p = {self.p:.2g}): they look like {there}"
-        if self.moved:
-            moved = ", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved)
-            return f"{found}; with it in the model the estimate would move, {moved}: {self.remedy}"
-        if self.matters:
-            return f"{found}; do not trust the intervals' width: {self.remedy}"
-        return (
-            f"{found}; a small effect that moves no parameter by more than {FAR:g} sd: {self.remedy} if you need more"
-        )
+        return self.finding.text
 
 
 def misfit(
@@ -124,10 +134,24 @@ def misfit(
     seed: int = 0,
     simulated: int = SIMULATED,
 ) -> Misfit:
-    """How odd the residuals of fitted ``windows`` are at theta (N,) with the ``noise`` (C) found there.
+    """How odd the residuals of fitted windows are; costs a linearisation and a rollout for each probe.
 
-    starts (W, D): of the windows, default the best. sd (N,): of the posterior in theta, default that of the linearisation. prior: of the
-    fit, default flat. Costs a linearisation and a rollout for each probe. Raises ValueError where the simulation diverges at theta."""
+    Args:
+        windows: the logs, W windows of C channels.
+        theta: (N,) the estimate.
+        noise: (C,) found there.
+        starts: (W, D) of the windows; default the best.
+        sd: (N,) of the posterior in theta; default that of the linearisation.
+        prior: of the fit; default flat.
+        seed: of the null.
+        simulated: draws of the null.
+
+    Returns:
+        What they look like most, and how odd that is.
+
+    Raises:
+        ValueError: where the simulation diverges at theta.
+    """
     starts = best_starts(windows, theta, noise) if starts is None else starts
     prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
     return _Residuals(windows, theta, noise, starts, prior).misfit(np.random.default_rng(seed), simulated, sd)
@@ -135,8 +159,18 @@ def misfit(
 
 @dataclass(frozen=True)
 class _Solved:
-    """A residual solved for theta and starts, without the K probes: statistics (K + 2 C,), what is left (W, L, C), step (N + K,),
-    score (K,) of each probe and its information, theta's answer (N, K) to the probes and its variance (N,)."""
+    """A residual solved for theta and starts, without the K probes.
+
+    Args:
+        statistics: (K + 2 C,) cube roots: probes, sums of squared autocorrelations, largest mean squares of a piece.
+        left: (W, L, C) of the residual.
+        step: (N + K,) of theta; zero of the probes.
+        score: (K,) of each probe.
+        information: (K,) of each probe, all else projected out.
+        answer: (N, K) of theta to the probes.
+        variance: (N,) of theta.
+        arrow: the windows' starts eliminated.
+    """
 
     statistics: FloatArray
     left: FloatArray
@@ -155,22 +189,23 @@ class _Residuals:
         self, windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray, prior: QuadraticPrior
     ) -> None:
         self.windows, self.theta, self.noise = windows, theta, noise
-        found = windows.linearise(theta, starts)
-        if not found.valid:
+        linearisation = windows.linearise(theta, starts)
+        if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        self.probes, effects = _probes(windows, theta, starts)
+        self.probes, effects = probe_effects(windows, theta, starts)
         n = windows.num_theta
-        parts = (found.jacobian[..., :n], effects, found.jacobian[..., n:])
-        self.residual, self.jacobian = found.residual, np.concatenate(parts, axis=-1)
+        parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
+        self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
         self.count = n + len(self.probes)
         self.coloured = bool((noise.tau > 0).any())
         self.inner = prior.precision + _FLAT_PRECISION * np.eye(n)
         self.free, self.pull = np.ones(n, bool), prior.pull(theta)
         arrow = self._arrow(self.moments(self.residual[..., None])[0][1], noise)
         total = arrow.gradient[:n] + self.pull
-        self.free = ~(((theta <= _AT_BOUND) & (total < 0)) | ((theta >= 1 - _AT_BOUND) & (total > 0)))
+        self.free = ~(((theta <= _PRESSED) & (total < 0)) | ((theta >= 1 - _PRESSED) & (total > 0)))
 
     def misfit(self, rng: np.random.Generator, simulated: int, sd: FloatArray | None) -> Misfit:
+        """The oddest statistic against ``simulated`` draws of the null; sd (N,) of the posterior."""
         seen = self.solved(self.residual, self.moments(self.residual[..., None])[0][1], self.noise, self.pull)
         null = self.null(rng, simulated)
         middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
@@ -183,7 +218,7 @@ class _Residuals:
         if k:
             best = int(odd[:k].argmax())
             named = self._probe_named(p(worst), best, seen, sd)
-            if best == worst or (p(best) <= LEVEL and max(named.share.values()) >= SMALL):
+            if best == worst or (p(best) <= THRESHOLDS.misfit and max(named.share.values()) >= THRESHOLDS.small_misfit):
                 return named
         return self._colour_named(p(worst), worst - k, seen)
 
@@ -240,19 +275,28 @@ class _Residuals:
         )
 
     def solved(self, residual: FloatArray, moments: Moments, noise: Noise, pull: FloatArray | None = None) -> _Solved:
-        """Cube roots of K score statistics, C sums of squared autocorrelations and C largest mean squares of a piece, with what
-        they are made of; residual (W, L, C), its products with the probes, and the prior's pull (N,), default none."""
+        """Statistics of a residual, with what they are made of.
+
+        Args:
+            residual: (W, L, C).
+            moments: its products with theta, probes and starts.
+            noise: (C,) of the channels.
+            pull: (N,) of the prior; default none.
+        """
         n = self.windows.num_theta
+        # information of theta and probes with the starts eliminated; inverted among the parameters that are free
         arrow = self._arrow(moments, noise)
         inner, inverse = arrow.precision + _FLAT_PRECISION * np.eye(self.count), np.zeros((n, n))
         inner[:n, :n] = arrow.precision[:n, :n] + self.inner
         among = np.ix_(self.free, self.free)
         inverse[among] = np.linalg.inv(inner[:n, :n][among])
         base, cross = inverse @ (arrow.gradient[:n] + (0.0 if pull is None else pull)), inverse @ inner[:n, n:]
+        # score and information of each probe with theta projected out; one that theta can imitate is not usable
         gradient = arrow.gradient[n:] - inner[n:, :n] @ base
         information = np.diag(inner)[n:] - np.einsum("ik,ik->k", inner[:n, n:], cross)
         usable = information > 1e-6 * np.diag(inner)[n:] + 2 * _FLAT_PRECISION
         information = np.where(usable, information, np.inf)
+        # what theta and starts leave, whitened by channel
         base = np.concatenate([base, np.zeros(self.count - n)])
         left = self._left(residual, base, arrow.blocks(base))
         white = [self._white(left, c, noise) for c in range(len(noise.sd))]
@@ -284,8 +328,8 @@ class _Residuals:
         share = np.clip(1 - after / np.maximum(before, 1e-300), 0, 1)
         sd = np.sqrt(seen.variance) if sd is None else sd
         shift = (np.clip(self.theta + step[:n] - seen.step[:n], 0, 1) - self.theta) / np.maximum(sd, 1e-12)
-        name, remedy = self.probes[probe]
-        return self._placed(p, name, remedy, gains, share, dict(zip(names, shift.tolist(), strict=True)))
+        named = self.probes[probe]
+        return self._placed(p, named.name, named.remedy, gains, share, dict(zip(names, shift.tolist(), strict=True)))
 
     def _colour_named(self, p: float, statistic: int, seen: _Solved) -> Misfit:
         """statistic: of 2 C, autocorrelations first."""
@@ -357,86 +401,3 @@ def _autocorrelation(z: FloatArray) -> float:
     square = max(float(z @ z), 1e-300)
     lags = [lag for lag in _LAGS if lag < len(z) // 4]
     return float(len(z) * sum((z[lag:] @ z[:-lag] / square) ** 2 for lag in lags))
-
-
-def _probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[tuple[str, str]], FloatArray]:
-    """(name, remedy) of K probes and their effects (W, L, C, K) on the predictions; those of an actuator in one batch."""
-    states = windows.states(starts)
-
-    def simulated(actions: FloatArray) -> Trajectories:
-        """Of actions (B W, T, A)."""
-        many = len(actions) // windows.num_windows
-        goals = None if windows.goals is None else np.tile(windows.goals, (many, 1))
-        first, dt, names = np.tile(states, (many, 1)), np.tile(windows.dt, many), windows.names * many
-        return windows.simulator.rollout(theta[None], actions, first, dt, names, goals=goals)
-
-    motion = simulated(windows.actions)
-    assert motion.states is not None
-    plain = motion.observations[..., windows.channels]
-    inside = np.arange(windows.actions.shape[1]) < windows.steps[:, None]
-    found, effects = [], []
-    for column in range(windows.actions.shape[-1]):
-        changes = _changes(windows, motion.states[:, :-1], inside, column)
-        if not changes:
-            continue
-        moved = np.tile(windows.actions, (len(changes), 1, 1))
-        moved[..., column] += np.concatenate([change for *_, change in changes])
-        answer = simulated(moved).observations[..., windows.channels].reshape(len(changes), *plain.shape)
-        for (name, remedy, _), seen in zip(changes, answer, strict=True):
-            effect = np.where(windows.observed, (seen - plain) / _STEP, 0.0)
-            if np.isfinite(effect).all() and np.abs(effect).max() > 0:
-                found.append((name, remedy))
-                effects.append(effect)
-    return found, np.stack(effects, axis=-1) if effects else np.zeros((*plain.shape, 0))
-
-
-def _changes(
-    windows: Windows, states: FloatArray, inside: NDArray[np.bool_], column: int
-) -> list[tuple[str, str, FloatArray]]:
-    """(what it stands for, what to do about it, change (W, T)) of one command, small against its size; states (W, T, S)."""
-    simulator = windows.simulator
-    own = getattr(simulator.environment, "actuators", None)
-    label = own[column] if own is not None else f"actuator {column}"
-    command = windows.actions[..., column]
-    size = float(np.sqrt((command[inside] ** 2).mean())) or 1.0
-    before = np.concatenate([command[:, :1], command[:, :-1]], axis=1)
-    model = "put it into the model"
-    shapes = {
-        f"a delay of {label}": (_unknown(f"actuator:{label}.delay"), before - command),
-        f"an offset of {label}": (_unknown(f"actuator:{label}.offset"), np.ones_like(command)),
-        f"a gain of {label} that is not constant": (model, command * np.abs(command)),
-    }
-    joint = _joint(simulator.model, label) if own is not None else None
-    if joint is not None:
-        name, position, velocity = joint
-        q, v = states[..., position], states[..., velocity]
-        turn = np.tanh(v / (_SOFT * max(float(np.sqrt((v[inside] ** 2).mean())), 1e-9)))
-        shapes |= {
-            f"dry friction at {name}": (_unknown(f"joint:{name}.frictionloss"), turn),
-            f"friction under load at {name}": (model, np.abs(command) * turn),
-            f"drag at {name}": (model, v * np.abs(v)),
-            f"a spring at {name}": (_unknown(f"joint:{name}.stiffness"), q),
-            f"a stiffening spring at {name}": (model, q**3),
-        }
-    found = []
-    for what, (remedy, shape) in shapes.items():
-        scale = float(np.sqrt((shape[inside] ** 2).mean()))
-        if np.isfinite(scale) and scale > 0:
-            found.append((what, remedy, _STEP * size * shape / scale))
-    return found
-
-
-def _unknown(target: str) -> str:
-    return f"make {target} a parameter, or widen its bounds"
-
-
-def _joint(model: mujoco.MjModel, actuator: str) -> tuple[str, int, int] | None:
-    """Name, column of the position and of the velocity in the physics state, of the hinge or slide joint that an actuator drives."""
-    index = model.actuator(actuator).id
-    if int(model.actuator_trntype[index]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-        return None
-    joint = int(model.actuator_trnid[index, 0])
-    if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-        return None
-    name = model.joint(joint).name or f"joint {joint}"
-    return name, 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])

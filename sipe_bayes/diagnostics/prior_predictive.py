@@ -1,9 +1,9 @@
 """Would any parameters within the bounds give such a log? Its place among logs simulated from the prior, with noise.
 
-The log's local outlier factor among them (M. Breunig et al. 2000, https://doi.org/10.1145/342009.335388), channel by channel. The
-p-value compares the log's largest with the largest of each simulation over all logs and channels, each started as far off as noise
-leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall, S. Young 1993, "Resampling-based
-multiple testing").
+The log's local outlier factor among them (M. Breunig et al. 2000, https://doi.org/10.1145/342009.335388), channel by
+channel. The p-value compares the log's largest with the largest of each simulation over all logs and channels, each
+started as far off as noise leaves the estimate of a start, so that any alarm at all is as rare as it says (P. Westfall,
+S. Young 1993, "Resampling-based multiple testing").
 """
 
 from __future__ import annotations
@@ -12,23 +12,32 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from sipe_bayes.diagnostics.misspecification import LEVEL
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
-FloatArray = NDArray[np.float64]
-
-_SAMPLES, _NEIGHBOURS, _PREDICTIVE, _PER_BATCH = 50, 20, 59, 10
+_SIMULATIONS = 59  # one more makes the largest of them a p-value of 1/60
+_PER_BATCH = 10  # of them in memory at a time
+_SAMPLES = 50  # of a log: more are correlated, and distances in many dimensions alike
+_NEIGHBOURS = 20  # of the local outlier factor, as its authors advise
 
 
 @dataclass(frozen=True)
 class OutsidePrior:
-    """p: of a log as far from the prior's simulations as this one; channel, time (s): where it is farthest."""
+    """Where a log lies among simulations of the prior.
+
+    Args:
+        p: of a log as far from the prior's simulations as this one.
+        log: its name.
+        channel: where it is farthest.
+        time: s, where it is farthest.
+    """
 
     p: float
     log: str
@@ -37,56 +46,68 @@ class OutsidePrior:
 
     @property
     def alarm(self) -> bool:
-        """Whether p is at most ``LEVEL``."""
-        return self.p <= LEVEL
+        """Whether the log is outside."""
+        return self.p <= THRESHOLDS.misfit
+
+    @property
+    def finding(self) -> Finding:
+        """It as a finding."""
+        code = Code.OUTSIDE_PRIOR if self.alarm else Code.WITHIN_PRIOR
+        return finding(code, log=self.log, p=self.p, channel=self.channel, time=self.time)
 
     @property
     def text(self) -> str:
         """In a sentence."""
-        if not self.alarm:
-            return f"log {self.log} is like simulations of the prior (p = {self.p:.2g})"
-        return (
-            f"log {self.log} is unlike simulations of the prior (p = {self.p:.2g}), most in {self.channel} at {self.time:.3g} s: "
-            "widen the bounds, or correct the model, units or signs"
-        )
+        return self.finding.text
 
 
 def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
-    """For each log its place among 59 simulations of the prior with ``noise`` (O channels); those that diverge are left out.
-    Raises ValueError where fewer than half are left."""
+    """For each log its place among simulations of the prior; those that diverge are left out.
+
+    Args:
+        windows: the logs, bound to the simulator.
+        prior: of the parameters.
+        noise: (O,) of all channels.
+        seed: of the simulations.
+
+    Returns:
+        One for each log.
+
+    Raises:
+        ValueError: where more than half of the simulations diverge.
+    """
     logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
-    if len(made) < _PREDICTIVE // 2:
+    if len(made) < _SIMULATIONS // 2:
         raise ValueError(
-            f"prior: {len(made)} of {_PREDICTIVE} simulations did not diverge, half are needed; narrow the bounds"
+            f"prior: {len(made)} of {_SIMULATIONS} simulations did not diverge, half are needed; narrow the bounds"
         )
     far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
     farthest = np.zeros((len(logs), len(windows.channels)))
     for k, log in enumerate(logs):
         for i, c in enumerate(windows.channels):
-            there = np.flatnonzero(np.isfinite(log.observations[:, c]))
-            if not len(there):
+            known = np.flatnonzero(np.isfinite(log.observations[:, c]))
+            if not len(known):
                 continue
-            kept = there[np.linspace(0, len(there) - 1, min(_SAMPLES, len(there))).round().astype(int)]
+            kept = known[np.linspace(0, len(known) - 1, min(_SAMPLES, len(known))).round().astype(int)]
             simulated = np.stack([one[k, kept, c] for one in made])
             far[k, i] = _outlier_factors(simulated, log.observations[kept, c])
             gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(simulated.std(0), 1e-12)
             farthest[k, i] = kept[gap.argmax()] * log.dt
     largest = far[..., 1:].max((0, 1))
-    found = []
+    outcome = []
     for k, name in enumerate(logs.names):
         i = int(far[k, :, 0].argmax())
         p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
-        found.append(
-            OutsidePrior(p, name, windows.simulator.environment.channels[windows.channels[i]], float(farthest[k, i]))
-        )
-    return found
+        channel = windows.simulator.environment.channels[windows.channels[i]]
+        outcome.append(OutsidePrior(p, name, channel, float(farthest[k, i])))
+    return outcome
 
 
 def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
     """Observations (R, T+1, O) of the logs at draws of the prior."""
     replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
-    thetas = prior.sample((_PREDICTIVE,), generator=torch.Generator().manual_seed(seed)).numpy()
-    batches = np.array_split(thetas, max(1, _PREDICTIVE // _PER_BATCH))
+    thetas = prior.sample((_SIMULATIONS,), generator=torch.Generator().manual_seed(seed)).numpy()
+    batches = np.array_split(thetas, max(1, _SIMULATIONS // _PER_BATCH))
     return [
         one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
     ]

@@ -1,20 +1,31 @@
-"""What single checks of a calibration found, as plain data: errors, signals, residuals, ridges."""
+"""What single checks of a calibration say, as plain data: errors, signals, residuals, ridges, noise, mixing, logs."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from numbers import Real
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.thresholds import THRESHOLDS
 
 
 @dataclass(frozen=True)
 class ChannelScore:
-    """Root-mean-square error of one channel of one log over open-loop windows from measured starts, at the posterior
-    mode and with the model as given."""
+    """Root-mean-square errors of one channel of one log.
+
+    They are over open-loop windows from measured starts, in the channel's unit.
+
+    Args:
+        log: its name.
+        channel: its name.
+        unit: of the errors.
+        rmse: at the posterior mode.
+        rmse_default: with the model as given.
+    """
 
     log: str
     channel: str
@@ -25,10 +36,17 @@ class ChannelScore:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Whether the held-out errors are smaller than those of the model as given. ratio: how many times, as the geometric mean over
-    logs and channels; low, high: its 95 % interval; p: of a ratio as far from 1 where the models predict alike; both from a paired
-    t-test over ``pieces`` of the logs. starts: the share of the calibrated model's error that the measured starts of windows made, where that is
-    nearly all and each model's own best starts took their place."""
+    """Whether the held-out errors are smaller than those of the model as given.
+
+    Args:
+        ratio: how many times, as the geometric mean over logs and channels.
+        low: lower end of its 95 % interval.
+        high: upper end.
+        p: of a ratio as far from 1 where the models predict alike; as the interval from a paired t-test.
+        pieces: of the logs, over which the test goes.
+        starts: share of the calibrated model's error that the measured starts of windows made, where that is nearly
+            all and each model's own best starts took their place.
+    """
 
     ratio: float
     low: float
@@ -39,19 +57,30 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """``better``, ``not better`` or ``worse``, at the 5 % level."""
-        return "not better" if self.p > 0.05 else "better" if self.ratio > 1 else "worse"
+        """``better``, ``not better`` or ``worse``."""
+        return "not better" if self.p > THRESHOLDS.comparison else "better" if self.ratio > 1 else "worse"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
+        """As JSON has it."""
         return {"verdict": self.verdict, **asdict(self)}
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One channel of one log for drawing. All arrays (T+1,); NaN where there is nothing.
+    """One channel of one log for drawing; all arrays (T+1,), NaN where there is nothing.
 
-    mode: prediction at the posterior mode; low, high: 5 % and 95 % of the predictions over posterior draws, without
-    measurement noise; default: the model as given. Every window of the log starts anew at ``window_starts`` (s).
+    Args:
+        log: its name.
+        use: ``train`` or ``holdout``.
+        channel: its name.
+        unit: of all but time.
+        time: s.
+        measured: what the log holds.
+        mode: prediction at the posterior mode.
+        low: 5 % quantile of the predictions over posterior draws, without measurement noise.
+        high: 95 % quantile.
+        default: prediction of the model as given.
+        window_starts: (W,) s, where every window of the log starts anew.
     """
 
     log: str
@@ -69,8 +98,16 @@ class Signal:
 
 @dataclass(frozen=True)
 class Residual:
-    """Residual (T+1,) of one fitted channel of one training log with the windows' starts at their estimates, in the
-    channel's unit; whitened: the same after the noise model, which should be white with sd 1."""
+    """What the model leaves of one fitted channel of one training log, with the windows' starts at their estimates.
+
+    Args:
+        log: its name.
+        channel: its name.
+        unit: of the residual.
+        time: (T+1,) s.
+        residual: (T+1,).
+        whitened: (T+1,), the residual after the noise model, which should be white with sd 1.
+    """
 
     log: str
     channel: str
@@ -82,7 +119,150 @@ class Residual:
 
 @dataclass(frozen=True)
 class Ridge:
-    """A direction that the data leave open, in words, and the members of it by name."""
+    """A combination of parameters that the data determine while they leave its members open.
 
-    text: str
+    Args:
+        parameters: the members.
+        combination: a sum or product of them, as a formula.
+        value: of the combination.
+        width: its sd.
+        unit: its unit.
+        unknown: the members that are not determined alone.
+    """
+
     parameters: tuple[str, ...]
+    combination: str
+    value: float
+    width: float
+    unit: str
+    unknown: tuple[str, ...]
+
+    def finding(self, code: Code = Code.RIDGE) -> Finding:
+        """It as a finding.
+
+        Args:
+            code: ``RIDGE``, ``RIDGE_TO_RESOLVE`` with the remedy, or ``RIDGE_EXPECTED`` of a planned experiment.
+        """
+        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
+        *others, last = self.unknown
+        alone = f"{', '.join(others)} and {last} alone are" if others else f"{last} alone is"
+        return finding(
+            code,
+            parameters=self.parameters,
+            combination=self.combination,
+            value=self.value,
+            width=self.width,
+            unit=unit,
+            alone=alone,
+            ridge=self.text if code is Code.RIDGE_TO_RESOLVE else "",
+        )
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return self.finding().text
+
+
+@dataclass(frozen=True)
+class ChannelNoise:
+    """Sensor noise of one channel: its sd in ``unit``, its correlation time ``tau`` in s (0: white)."""
+
+    sd: float
+    tau: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """How well Markov chains have mixed.
+
+    Args:
+        overall: numbers of the whole chain by name: ``rhat``, ``ess``, ``acceptance``, ``steps``, ...
+        by_parameter: for each measure that is told by parameter, the number of each.
+    """
+
+    overall: Mapping[str, float] = field(default_factory=dict)
+    by_parameter: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, measured: Mapping[str, object], names: Sequence[str]) -> Mixing:
+        """Read what an estimator's diagnostics hold.
+
+        Args:
+            measured: numbers, or by parameter mappings or sequences in the order of ``names``; all else is left out.
+            names: of the parameters.
+        """
+        overall: dict[str, float] = {}
+        each: dict[str, dict[str, float]] = {}
+        for key, value in measured.items():
+            if isinstance(value, Real):
+                overall[key] = value if isinstance(value, int) else float(value)
+            elif isinstance(value, Mapping):
+                each[key] = {str(name): float(number) for name, number in value.items()}
+            elif isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and len(value) == len(names):
+                each[key] = dict(zip(names, map(float, value), strict=True))
+        return cls(overall, each)
+
+    @property
+    def worst(self) -> tuple[float, str] | None:
+        """Largest R-hat and the parameter that it is of, empty where that is not told; None without any."""
+        told = self.by_parameter.get("rhat")
+        if told:
+            name = max(told, key=lambda n: told[n])
+            return told[name], name
+        return (self.overall["rhat"], "") if "rhat" in self.overall else None
+
+    def to_dict(self) -> dict[str, object]:
+        """As JSON has it; what is not finite is None."""
+        return {
+            **{k: v if np.isfinite(v) else None for k, v in self.overall.items()},
+            **{k: dict(v) for k, v in self.by_parameter.items()},
+        }
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """What a log held and what was done to it.
+
+    Args:
+        name: of the log.
+        file: its path.
+        sha256: of the file.
+        rate_hz: of the control grid.
+        duration_s: of the trajectory.
+        samples: T+1.
+        jitter_s: largest distance of a sample period from the median one, or, over dropped rows, from a multiple of it.
+        resampled: whether samples were interpolated.
+        gaps: (start, stop) in s from the trajectory's first sample, without a measurement for longer than ``max_gap``.
+        missing: masked samples of each channel.
+        clipped: samples of each channel and command (``actuator:NAME``) in runs at its extreme value.
+        findings: the same in words, with what the user should know.
+    """
+
+    name: str
+    file: str
+    sha256: str
+    rate_hz: float
+    duration_s: float
+    samples: int
+    jitter_s: float
+    resampled: bool
+    gaps: tuple[tuple[float, float], ...] = ()
+    missing: Mapping[str, int] = field(default_factory=dict)
+    clipped: Mapping[str, int] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The texts of the findings."""
+        return tuple(item.text for item in self.findings)
+
+    @property
+    def suspect(self) -> bool:
+        """Whether the log is not simply as it was recorded, so that the user should read the notes."""
+        return bool(self.gaps or self.resampled or any(self.missing.values()) or any(self.clipped.values()))
+
+    def to_dict(self) -> dict[str, object]:
+        """As JSON has it."""
+        plain = {k: v for k, v in asdict(self).items() if k != "findings"}
+        return {**plain, "gaps": [list(gap) for gap in self.gaps], "notes": list(self.notes)}

@@ -2,21 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
-import numpy as np
-
+from sipe_bayes.core.findings import Code, Finding, Findings
 from sipe_bayes.diagnostics.misspecification import Misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
-from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Ridge, Signal
+from sipe_bayes.diagnostics.records import (
+    ChannelNoise,
+    ChannelScore,
+    Comparison,
+    LogReport,
+    Mixing,
+    Residual,
+    Ridge,
+    Signal,
+)
 from sipe_bayes.posterior import Posterior
+
+FLAGS: Mapping[Code, str] = {
+    Code.NO_EFFECT: "no_effect",
+    Code.DEAD_RANGE: "dead_range",
+    Code.NOT_DETERMINED: "not_determined",
+    Code.MODE_AT_BOUND: "at_bound",
+    Code.LOGS_DISAGREE: "disagrees",
+    Code.LOGS_DISAGREE_UNEXPLAINED: "disagrees",
+    Code.MISFIT: "misfit",
+    Code.MISFIT_SHIFTS: "misfit",
+}
+"""Findings about single parameters, and the flag that result.json has for them."""
+NUISANCE = "nuisance"
+_LEFT_OUT = (Code.RESIDUALS_LEFT_OUT, Code.PROCESS_NOISE)
 
 
 @dataclass(frozen=True)
 class ParameterSummary:
-    """One parameter's marginal in its unit. contraction = 1 - sd / prior sd; flags are single words: ``at_bound``,
-    ``no_effect``, ``dead_range``, ``not_determined``, ``disagrees``, ``misfit`` (what the model lacks moves it), ``nuisance``."""
+    """One parameter's marginal in its unit.
+
+    Args:
+        name: of the parameter.
+        unit: of all numbers but the contraction.
+        targets: what it writes to.
+        mean: of the posterior.
+        sd: its standard deviation.
+        q05: its 5 % quantile.
+        q50: its median.
+        q95: its 95 % quantile.
+        mode: the best point's value.
+        default: of the model as given, if it has one.
+        contraction: 1 - sd / prior sd.
+        nuisance: whether it holds for one log alone.
+    """
 
     name: str
     unit: str
@@ -29,23 +65,39 @@ class ParameterSummary:
     mode: float
     default: float | None
     contraction: float
-    flags: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "targets": list(self.targets), "flags": list(self.flags)}
+    nuisance: bool = False
 
 
-def _finite(value: Any) -> Any:
-    """JSON knows neither infinity nor NaN."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-@dataclass
+@dataclass(frozen=True)
 class Calibration:
-    """The outcome of ``sipe calibrate``. doubts: the warnings for which no interval is to be trusted; comparison: of the held-out errors, None without any; misfit: None where the residuals could
-    not be looked at; outside: one for each training log; noise: channel -> {"sd", "tau" (s), "unit"}; mixing: {"rhat", "ess", ...}
-    of mcmc or None; logs: what was read and what was done to it; left_out: sentences about parts that do not apply; run:
-    configuration, versions, seed, checksums."""
+    """The outcome of ``sipe calibrate``.
+
+    ``findings`` is the one list of what the estimator, the checks and the readers noticed; ``warnings``, ``doubts``,
+    ``left_out`` and ``flags`` are views of it.
+
+    Args:
+        name: of the run.
+        estimator: of the method.
+        posterior: of the parameters.
+        prior: that it started from.
+        parameters: a summary of each.
+        train: errors on the training logs.
+        holdout: errors on the held-out logs.
+        findings: what was noticed, in the order in which it is told.
+        signals: what to draw of each log and channel.
+        residuals: of each training log and fitted channel.
+        ridges: combinations that are better known than their members.
+        comparison: of the held-out errors with the model as given; None without any.
+        misfit: what the residuals look like; None where they could not be looked at.
+        outside: of each training log, whether the prior gives such a one.
+        noise: of each fitted channel.
+        mixing: of Markov chains; None of other methods.
+        logs: what was read and what was done to it.
+        run: configuration, versions, seed and checksums, as JSON has them.
+        rollouts: spent.
+        seconds: taken.
+        out: folder that holds the results.
+    """
 
     name: str
     estimator: str
@@ -54,39 +106,71 @@ class Calibration:
     parameters: list[ParameterSummary]
     train: list[ChannelScore]
     holdout: list[ChannelScore]
-    warnings: list[str]
-    doubts: list[str] = field(default_factory=list)
+    findings: tuple[Finding, ...] = ()
     signals: list[Signal] = field(default_factory=list)
     residuals: list[Residual] = field(default_factory=list)
     ridges: list[Ridge] = field(default_factory=list)
     comparison: Comparison | None = None
     misfit: Misfit | None = None
     outside: list[OutsidePrior] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    noise: dict[str, dict[str, Any]] = field(default_factory=dict)
-    mixing: dict[str, Any] | None = None
-    logs: list[dict[str, Any]] = field(default_factory=list)
-    run: dict[str, Any] = field(default_factory=dict)
+    noise: dict[str, ChannelNoise] = field(default_factory=dict)
+    mixing: Mixing | None = None
+    logs: list[LogReport] = field(default_factory=list)
+    run: dict[str, object] = field(default_factory=dict)
     rollouts: int = 0
     seconds: float = 0.0
     out: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """The object that ``--json`` prints."""
+    @property
+    def warnings(self) -> list[str]:
+        """The texts of all findings but notes."""
+        return Findings(self.findings).warnings
+
+    @property
+    def doubts(self) -> list[str]:
+        """The texts of the findings for which no interval is to be trusted."""
+        return Findings(self.findings).doubts
+
+    @property
+    def left_out(self) -> list[str]:
+        """Sentences about parts of the report that do not apply, and what there is in their place."""
+        return [item.text for item in Findings(self.findings).of(*_LEFT_OUT)]
+
+    def flags(self, name: str) -> tuple[str, ...]:
+        """What was noticed about one parameter, in single words.
+
+        Args:
+            name: of the parameter.
+
+        Returns:
+            Of ``no_effect``, ``dead_range``, ``not_determined``, ``at_bound``, ``disagrees``, ``misfit`` (what the
+            model lacks moves it) and ``nuisance`` (it holds for one log alone) those that apply.
+        """
+        codes = {item.code for item in Findings(self.findings).about(name)}
+        nuisance = any(p.nuisance for p in self.parameters if p.name == name)
+        return (*dict.fromkeys(flag for code, flag in FLAGS.items() if code in codes), *[NUISANCE] * nuisance)
+
+    def to_dict(self) -> dict[str, object]:
+        """The object that ``--json`` prints and result.json holds."""
+        rows = []
+        for p in self.parameters:
+            row = {k: v for k, v in asdict(p).items() if k != NUISANCE}
+            rows.append({**row, "targets": list(p.targets), "flags": list(self.flags(p.name))})
         return {
-            "parameters": [p.to_dict() for p in self.parameters],
+            "parameters": rows,
             "holdout": [asdict(s) for s in self.holdout],
             "train": [asdict(s) for s in self.train],
             "comparison": None if self.comparison is None else self.comparison.to_dict(),
             "misfit": None if self.misfit is None else {**asdict(self.misfit), "matters": self.misfit.matters},
             "outside_prior": [asdict(o) for o in self.outside],
-            "ridges": [asdict(r) for r in self.ridges],
-            "warnings": list(self.warnings),
-            "doubts": list(self.doubts),
-            "left_out": list(self.left_out),
-            "noise": self.noise,
-            "logs": self.logs,
-            "mixing": None if self.mixing is None else {k: _finite(v) for k, v in self.mixing.items()},
+            "ridges": [{"text": r.text, **asdict(r)} for r in self.ridges],
+            "findings": [item.to_dict() for item in self.findings],
+            "warnings": self.warnings,
+            "doubts": self.doubts,
+            "left_out": self.left_out,
+            "noise": {channel: asdict(noise) for channel, noise in self.noise.items()},
+            "logs": [log.to_dict() for log in self.logs],
+            "mixing": None if self.mixing is None else self.mixing.to_dict(),
             "rollouts": self.rollouts,
             "seconds": round(self.seconds, 3),
             "out": self.out,

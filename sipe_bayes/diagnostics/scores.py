@@ -25,15 +25,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.models.sbi_tools import import_sbi
 from sipe_bayes.posterior import Dirac, Particles, Posterior, SurrogatePosterior
 from sipe_bayes.posterior import prior as default_prior
-
-FloatArray = NDArray[np.float64]
 
 LEVELS = (0.5, 0.9, 0.95)  # of the central intervals
 _QUANTILES = 400

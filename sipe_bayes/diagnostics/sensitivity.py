@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
-
-FloatArray = NDArray[np.float64]
 
 LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta
 DEAD = 1e-3  # of the spread: below it a change moves nothing
@@ -59,7 +57,7 @@ def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
     starts, goals = task.initial_states(rng, _EPISODES)
     actions = rng.uniform(task.action_low, task.action_high, (_EPISODES, steps, task.num_actions))
 
-    def observe(theta: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def observe(theta: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Observations (L, episodes, steps, O) of theta (L, N) and where they are valid."""
         lanes = np.repeat(theta, _EPISODES, axis=0)
         tile = len(theta)

@@ -22,15 +22,13 @@ from typing import Any
 import numpy as np
 import scipy.signal
 import torch
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
-
-FloatArray = NDArray[np.float64]
 
 KINDS = ("chirp up", "chirp down", "noise", "sines")
 _SIZES = (1.0, 0.5, 0.25)  # of the limits

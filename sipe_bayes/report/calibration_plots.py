@@ -7,7 +7,7 @@ into a file's bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -78,7 +78,7 @@ def autocorrelation(series: FloatArray, lags: int) -> FloatArray:
 
 def ordered(parameters: Iterable[ParameterSummary]) -> list[ParameterSummary]:
     """The parameters with the nuisance ones, which hold for one log alone, at the end."""
-    return sorted(parameters, key=lambda p: "nuisance" in p.flags)
+    return sorted(parameters, key=lambda p: p.nuisance)
 
 
 def pair_names(calibration: Calibration, theta: FloatArray) -> list[str]:
@@ -327,17 +327,6 @@ def _autocorrelation(ax: Axes, row: Residual) -> None:
 # Chains
 
 
-def scores_by_name(mixing: dict[str, Any] | None, key: str, names: Sequence[str]) -> dict[str, float]:
-    """What ``mixing`` holds under ``key`` as numbers by parameter, from a mapping or a list in the order of
-    ``names``; empty when it is neither, such as a single number for all."""
-    found: Any = (mixing or {}).get(key)
-    if isinstance(found, dict):
-        return {str(name): float(value) for name, value in found.items()}
-    if np.ndim(found) == 1 and len(np.asarray(found)) == len(names):
-        return dict(zip(names, np.asarray(found, dtype=float).tolist(), strict=True))
-    return {}
-
-
 @_styled
 def chains(calibration: Calibration) -> list[Figure]:
     """Traces of the Markov chains, one row per parameter; none when the posterior did not come as several
@@ -351,7 +340,8 @@ def chains(calibration: Calibration) -> list[Figure]:
     step = -(-traces.shape[1] // 400)
     values = space.values(traces[:, ::step])
     names = [p.name for p in ordered(calibration.parameters)]
-    scores = [scores_by_name(calibration.mixing, key, space.names) for key in ("rhat", "ess")]
+    each = calibration.mixing.by_parameter if calibration.mixing else {}
+    scores = [each.get(key, {}) for key in ("rhat", "ess")]
     return [_chain_figure(part, values, step, calibration, scores) for part in _parts(names, _TRACES)]
 
 
@@ -360,7 +350,7 @@ def _chain_figure(
     values: FloatArray,
     step: int,
     calibration: Calibration,
-    scores: list[dict[str, float]],
+    scores: Sequence[Mapping[str, float]],
 ) -> Figure:
     figure = _figure(1.1 * len(names) + 0.5)
     axes: Any = figure.subplots(len(names), 1, squeeze=False, sharex=True)

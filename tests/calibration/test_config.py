@@ -11,14 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sipe_bayes.calibration.config import (
-    Config,
-    ConfigError,
-    MeasurementTarget,
-    check_dimensions,
-    load_config,
-    parse_measurement_target,
-)
+from sipe_bayes.calibration.config import Config, check_dimensions, load_config
+from sipe_bayes.calibration.config_fields import ConfigError, MeasurementTarget, parse_measurement_target
 from sipe_bayes.core.units import UNITS, convert, find_unit, to_si
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -12,10 +12,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sipe_bayes.calibration.config import Config, ConfigError, load_config
-from sipe_bayes.calibration.logs import LogReport, count_clipped, load_log
+from sipe_bayes.calibration.config import Config, load_config
+from sipe_bayes.calibration.config_fields import ConfigError
+from sipe_bayes.calibration.log_report import count_clipped
+from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.tables import LogError, read_table
 from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.diagnostics.records import LogReport
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

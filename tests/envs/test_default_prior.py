@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.calibration.config import ConfigError
+from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.run import run
 from sipe_bayes.report import page as report
 

@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 
 import sipe_bayes
-from sipe_bayes.calibration.config import (
+from sipe_bayes.calibration.config import Config
+from sipe_bayes.calibration.config_fields import Table
+from sipe_bayes.calibration.config_tables import (
     Columns,
     Command,
-    Config,
     LogEntry,
     Measurement,
     Noise,
@@ -26,7 +27,6 @@ from sipe_bayes.calibration.config import (
     PriorSource,
     Resample,
     Search,
-    Table,
     TimeColumn,
 )
 from sipe_bayes.core.units import UNITS

@@ -15,14 +15,26 @@ import pytest
 import torch
 
 from sipe_bayes.core import files
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.misspecification import Misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
-from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Ridge, Signal
+from sipe_bayes.diagnostics.records import (
+    ChannelNoise,
+    ChannelScore,
+    Comparison,
+    LogReport,
+    Mixing,
+    Residual,
+    Ridge,
+    Signal,
+)
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Dirac, GaussianMixture, Particles, Posterior, prior
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report import page as report
+from sipe_bayes.report import verdicts as judged
+from sipe_bayes.report.words import significant
 
 BETTER = Comparison(3.1, 2.6, 3.7, 1e-6, 10)
 LACKS = Misfit(
@@ -41,7 +53,15 @@ def make_posterior(space: ParameterSpace) -> GaussianMixture:
     return GaussianMixture(torch.zeros(1), torch.tensor(mean)[None], torch.tensor(covariance)[None], space)
 
 
-def summaries(posterior: Posterior, flags: dict[str, tuple[str, ...]]) -> list[ParameterSummary]:
+def noticed(code: Code, *names: str, severity: Severity = Severity.CAUTION, text: str = "") -> Finding:
+    return Finding(code, severity, text or f"{code}: {', '.join(names)}", names)
+
+
+def ridge(*names: str, combination: str = "a b") -> Ridge:
+    return Ridge(names, combination, 2.0, 0.1, "kg", names)
+
+
+def summaries(posterior: Posterior) -> list[ParameterSummary]:
     values = posterior.values(4000, torch.Generator().manual_seed(0))
     before = prior(posterior.space).values(4000, torch.Generator().manual_seed(0)).std(0)
     mode = posterior.space.values(posterior.mode.numpy())
@@ -58,7 +78,6 @@ def summaries(posterior: Posterior, flags: dict[str, tuple[str, ...]]) -> list[P
             mode=float(m),
             default=p.default,
             contraction=float(1 - v.std() / b),
-            flags=flags.get(p.name, ()),
         )
         for p, v, m, b in zip(posterior.space, values.T, mode, before, strict=True)
     ]
@@ -95,16 +114,16 @@ def make_calibration(size: int = 3, logs: int = 1, channels: int = 1, names: tup
         estimator="laplace",
         posterior=posterior,
         prior=prior(space),
-        parameters=summaries(posterior, {names[0]: ("at_bound",)}),
+        parameters=summaries(posterior),
         train=scores["train"],
         holdout=scores["holdout"],
-        warnings=[f"{names[0]} lies at its lower bound"],
+        findings=(noticed(Code.MODE_AT_BOUND, names[0]),),
         signals=signals,
         residuals=residuals,
         comparison=BETTER,
-        ridges=[Ridge("the last two trade against each other", names[-2:])],
-        noise={"angle_0": {"sd": 0.0123, "tau": 0.0, "unit": "rad"}},
-        logs=[{"name": log, "use": use, "rate_hz": 100.0, "samples": 201, "gaps": [[0.4, 0.6]]} for log, use in keys],
+        ridges=[ridge(*names[-2:], combination="the last two")],
+        noise={"angle_0": ChannelNoise(0.0123, 0.0, "rad")},
+        logs=[LogReport(log, "", "", 100.0, 2.0, 201, 0.0, False, ((0.4, 0.6),)) for log, _ in keys],
         run={"config": {"model": "pendulum.xml"}, "seed": 0},
         rollouts=1234,
         seconds=5.6,
@@ -227,7 +246,7 @@ def test_autocorrelation_matches_the_plain_sum() -> None:
     ],
 )
 def test_significant_digits_follow_the_uncertainty(value: float, sd: float, text: str) -> None:
-    assert report.significant(value, sd) == text
+    assert significant(value, sd) == text
 
 
 # Figures
@@ -235,7 +254,7 @@ def test_significant_digits_follow_the_uncertainty(value: float, sd: float, text
 
 def test_marginals_have_one_panel_per_parameter_nuisance_last(monkeypatch: pytest.MonkeyPatch) -> None:
     found = make_calibration(7)
-    found.parameters[0] = dataclasses.replace(found.parameters[0], flags=("nuisance",))
+    found.parameters[0] = dataclasses.replace(found.parameters[0], nuisance=True)
     (figure,) = plots.marginals(found)
     assert [ax.get_title() for ax in figure.axes] == [f"p{i}" for i in (1, 2, 3, 4, 5, 6, 0)]
     monkeypatch.setattr(plots, "_PANELS", 3)
@@ -257,7 +276,7 @@ def test_a_wide_log_scale_is_drawn_as_one() -> None:
     space = ParameterSpace([Parameter("friction", 1e-6, 1e-2, 1e-4, "N", scale="log"), Parameter("mass", 0, 1, 0.5)])
     posterior = GaussianMixture(torch.zeros(1), torch.full((1, 2), 0.5), 0.04 * torch.eye(2)[None], space)
     found = dataclasses.replace(
-        make_calibration(2), posterior=posterior, prior=prior(space), parameters=summaries(posterior, {})
+        make_calibration(2), posterior=posterior, prior=prior(space), parameters=summaries(posterior)
     )
     (figure,) = plots.marginals(found)
     assert [ax.get_xscale() for ax in figure.axes] == ["log", "linear"]
@@ -280,7 +299,7 @@ def test_pairs_choose_the_ridge_among_many() -> None:
     theta = plots.draws(found.posterior)
     assert {"p10", "p11"} < set(plots.pair_names(found, theta))
     assert len(plots.pair_names(found, theta)) == plots.MAX_PAIRS
-    found.ridges.append(Ridge("p3", ("p3",)))
+    found.ridges.append(ridge("p3"))
     assert "p3" in plots.pair_names(found, theta)
 
 
@@ -351,7 +370,7 @@ def with_chains(calibration: Calibration, rhat: float) -> Calibration:
     theta = calibration.posterior.sample((400,), torch.Generator().manual_seed(0))
     posterior = Particles(theta, calibration.posterior.space, chains=4)
     names = posterior.space.names
-    mixing = {"rhat": dict.fromkeys(names, rhat), "ess": [321.0] * len(names), "acceptance": 0.31}
+    mixing = Mixing.of({"rhat": dict.fromkeys(names, rhat), "ess": [321.0] * len(names), "acceptance": 0.31}, names)
     return dataclasses.replace(calibration, posterior=posterior, mixing=mixing)
 
 
@@ -371,40 +390,50 @@ def test_figures_are_the_same_bytes_each_time(calibration: Calibration) -> None:
 # Words
 
 
-def parameter(contraction: float = 0.9, *flags: str) -> ParameterSummary:
-    return ParameterSummary("mass", "kg", (), 1, 0.1, 0.9, 1, 1.1, 1, 1, contraction, flags)
+def parameter(contraction: float = 0.9, nuisance: bool = False) -> ParameterSummary:
+    return ParameterSummary("mass", "kg", (), 1, 0.1, 0.9, 1, 1.1, 1, 1, contraction, nuisance)
+
+
+def of_mass(*codes: Code) -> Findings:
+    return Findings(noticed(code, "mass") for code in codes)
 
 
 @pytest.mark.parametrize(
-    ("summary", "tone", "words"),
+    ("summary", "codes", "tone", "words"),
     [
-        (parameter(0.9), "good", "determined"),
-        (parameter(0.5), "fair", "weakly determined"),
-        (parameter(0.05, "not_determined"), "bad", "not determined"),
-        (parameter(0.99, "at_bound"), "bad", "at a bound"),
-        (parameter(0.0, "no_effect", "not_determined"), "bad", "changes nothing, not determined"),
-        (parameter(0.99, "disagrees"), "bad", "disagrees between logs"),
-        (parameter(0.99, "misfit"), "bad", "model lacks something"),
-        (parameter(0.99, "at_bound", "misfit"), "bad", "at a bound, model lacks something"),
-        (parameter(0.99, "dead_range"), "fair", "part of its range changes nothing"),
-        (dataclasses.replace(parameter(1.0), sd=0.0), "fair", "a point without uncertainty"),
+        (parameter(0.9), (), "good", "determined"),
+        (parameter(0.5), (), "fair", "weakly determined"),
+        (parameter(0.05), (Code.NOT_DETERMINED,), "bad", "not determined"),
+        (parameter(0.99), (Code.MODE_AT_BOUND,), "bad", "at a bound"),
+        (parameter(0.0), (Code.NO_EFFECT, Code.NOT_DETERMINED), "bad", "changes nothing, not determined"),
+        (parameter(0.99), (Code.LOGS_DISAGREE,), "bad", "disagrees between logs"),
+        (parameter(0.99), (Code.LOGS_DISAGREE_UNEXPLAINED,), "bad", "disagrees between logs"),
+        (parameter(0.99), (Code.MISFIT_SHIFTS,), "bad", "model lacks something"),
+        (parameter(0.99), (Code.MODE_AT_BOUND, Code.MISFIT), "bad", "at a bound, model lacks something"),
+        (parameter(0.99), (Code.DEAD_RANGE,), "fair", "part of its range changes nothing"),
+        (dataclasses.replace(parameter(1.0), sd=0.0), (), "fair", "a point without uncertainty"),
     ],
 )
-def test_verdict_on_a_parameter(summary: ParameterSummary, tone: str, words: str) -> None:
-    found = report.parameter_verdict(summary)
+def test_verdict_on_a_parameter(summary: ParameterSummary, codes: tuple[Code, ...], tone: str, words: str) -> None:
+    found = judged.parameter_verdict(summary, of_mass(*codes))
     assert found.tone == tone
     assert words in found.text
+    other = judged.parameter_verdict(dataclasses.replace(summary, name="other"), of_mass(*codes))
+    assert other == judged.parameter_verdict(summary, Findings())
 
 
 def test_a_member_of_a_ridge_is_determined_only_with_the_others() -> None:
-    ridge = [Ridge("mass / length = 2 is determined", ("mass", "length"))]
-    for flags in ((), ("not_determined",)):
-        found = report.parameter_verdict(parameter(0.3, *flags), ridge)
+    def seen(contraction: float, *codes: Code, members: tuple[str, ...] = ("mass", "length")) -> judged.Verdict:
+        findings = [noticed(Code.RIDGE_TO_RESOLVE, *members), *of_mass(*codes)]
+        return judged.parameter_verdict(parameter(contraction), Findings(findings))
+
+    for codes in ((), (Code.NOT_DETERMINED,)):
+        found = seen(0.3, *codes)
         assert (found.tone, found.text) == ("fair", "only with length")
-    assert report.parameter_verdict(parameter(0.9), ridge).text == "determined"
-    assert report.parameter_verdict(parameter(0.3, "at_bound"), ridge).text == "at a bound"
-    assert report.parameter_verdict(parameter(0.0, "no_effect", "not_determined"), ridge).tone == "bad"
-    assert report.parameter_verdict(parameter(0.3, "not_determined"), [Ridge("", ("a", "b"))]).tone == "bad"
+    assert seen(0.9).text == "determined"
+    assert seen(0.3, Code.MODE_AT_BOUND).text == "at a bound"
+    assert seen(0.0, Code.NO_EFFECT, Code.NOT_DETERMINED).tone == "bad"
+    assert seen(0.3, Code.NOT_DETERMINED, members=("a", "b")).tone == "bad"
 
 
 def scores(*pairs: tuple[float, float]) -> list[ChannelScore]:
@@ -446,7 +475,7 @@ ALIKE = Comparison(1.1, 0.8, 1.5, 0.6, 10)
 def test_verdict_on_the_prediction(
     rows: list[ChannelScore], comparison: Comparison | None, tone: str, words: str
 ) -> None:
-    found = report.prediction(rows, comparison)
+    found = judged.prediction(rows, comparison)
     assert found.tone == tone
     assert words in found.text
     assert (comparison is None) == ("t-test" not in found.text)
@@ -455,51 +484,61 @@ def test_verdict_on_the_prediction(
 def test_a_calibration_that_does_not_help_says_so_first(calibration: Calibration) -> None:
     for comparison, first in ((WORSE, "WORSE"), (ALIKE, "NOT shown"), (BETTER, "may be trusted")):
         found = dataclasses.replace(calibration, comparison=comparison)
-        assert first in report.verdicts(found)[0].text
+        assert first in judged.verdicts(found)[0].text
         page = Page(report.render(found, [])).text
         assert page.index(first) < page.index("90 % interval")
 
 
 def test_what_the_model_lacks_is_among_the_first_sentences(calibration: Calibration) -> None:
-    assert report.lack(calibration) is None
-    found = report.lack(dataclasses.replace(calibration, misfit=LACKS))
+    assert judged.lack(calibration) is None
+    found = judged.lack(dataclasses.replace(calibration, misfit=LACKS))
     assert found is not None
     assert found.tone == "bad"
     assert "drag at hinge (40 % of the residual of angle_0, p = 0.005)" in found.text
-    small = report.lack(
+    small = judged.lack(
         dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, share={"angle_0": 0.04}, shift={}))
     )
     assert small is not None
     assert small.tone == "fair"
     assert "something small" in small.text
-    assert report.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, p=0.2))) is None
+    assert judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, p=0.2))) is None
     strange = dataclasses.replace(calibration, outside=[OutsidePrior(0.01, "train_0", "angle_0", 1.0)], misfit=LACKS)
     assert strange.to_dict()["outside_prior"][0]["log"] == "train_0"
     assert strange.to_dict()["misfit"]["matters"]
 
 
 def test_headline_counts_without_nuisance_parameters() -> None:
-    good, weak, nuisance = parameter(0.9), parameter(0.5), parameter(0.9, "nuisance")
-    found = report.headline([good, weak, nuisance]).text
-    assert found == "1 of 2 values may be trusted within their intervals: mass; the table says why not the others."
-    assert report.headline([good, good]).text == "All 2 values may be trusted within their intervals."
-    assert report.headline([good]).tone == "good"
-    assert report.headline([weak, weak]).tone == "bad"
-    assert report.headline([nuisance]).tone == "fair"
+    good, weak, nuisance = parameter(0.9), parameter(0.5), parameter(0.9, nuisance=True)
+
+    def seen(*values: ParameterSummary) -> judged.Verdict:
+        return judged.headline(values, Findings())
+
+    words = "1 of 2 values may be trusted within their intervals: mass; the table says why not the others."
+    assert seen(good, weak, nuisance).text == words
+    assert seen(good, good).text == "All 2 values may be trusted within their intervals."
+    assert seen(good).tone == "good"
+    assert seen(weak, weak).tone == "bad"
+    assert seen(nuisance).tone == "fair"
+    doubts = Findings(doubt(text) for text in ("the chains have not mixed", "another", "a third"))
     for values in ([good, weak], [weak]):
-        doubted = report.headline(values, doubts=["the chains have not mixed", "another", "a third"])
         words = "the chains have not mixed; another; and 1 more, among the warnings"
-        assert doubted == report.Verdict("bad", f"No value may be trusted within its interval yet: {words}.")
-    assert report.parameter_verdict(good).tone == "good"
-    assert report.parameter_verdict(good, doubts=["another"]).tone == "fair"
+        expected = judged.Verdict("bad", f"No value may be trusted within its interval yet: {words}.")
+        assert judged.headline(values, doubts) == expected
+    assert judged.parameter_verdict(good, Findings()).tone == "good"
+    assert judged.parameter_verdict(good, doubts).tone == "fair"
+
+
+def doubt(text: str, code: Code = Code.REMARK) -> Finding:
+    return noticed(code, severity=Severity.BLOCKING, text=text)
 
 
 def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> None:
-    found = dataclasses.replace(with_chains(calibration, 1.4), comparison=BETTER, doubts=["the chains have not mixed"])
-    texts = [v.text for v in report.verdicts(found)]
+    unmixed = doubt("the chains have not mixed", Code.NOT_MIXED)
+    found = dataclasses.replace(with_chains(calibration, 1.4), comparison=BETTER, findings=(unmixed,))
+    texts = [v.text for v in judged.verdicts(found)]
     assert texts[0].endswith("yet: the chains have not mixed.")
     assert not any("NOT mixed" in text for text in texts)
-    texts = [v.text for v in report.verdicts(dataclasses.replace(found, doubts=["another"]))]
+    texts = [v.text for v in judged.verdicts(dataclasses.replace(found, findings=(doubt("another"),)))]
     assert any("NOT mixed" in text for text in texts)
     assert "but see the doubt above" in report.render(found, [])
 
@@ -519,7 +558,14 @@ def test_page_says_what_matters_first(page: str) -> None:
 
 
 def test_what_is_left_out_is_said(calibration: Calibration) -> None:
-    text = Page(report.render(dataclasses.replace(calibration, left_out=["Residuals: none here."]), [])).text
+    text = Page(
+        report.render(
+            dataclasses.replace(
+                calibration, findings=(noticed(Code.RESIDUALS_LEFT_OUT, text="Residuals: none here."),)
+            ),
+            [],
+        )
+    ).text
     assert "Left out. Residuals: none here." in text
 
 
@@ -527,11 +573,11 @@ def test_page_names_every_parameter_and_section(page: str, calibration: Calibrat
     text = Page(page).text
     for summary in calibration.parameters:
         assert f"{summary.name} [kg m²]" in text
-        assert report.significant(summary.q05, summary.sd) in text
+        assert significant(summary.q05, summary.sd) in text
     for words in (
         "0.0123",
         "white",
-        "the last two trade",
+        "the last two = 2 ± 0.1 kg is determined; p1 and p2 alone are not",
         "pendulum.xml",
         "0.4 to 0.6 s",
         "held out",
@@ -555,13 +601,12 @@ def test_page_stands_alone(page: str, images: list[report.Picture]) -> None:
 
 def test_page_escapes_every_word_from_outside() -> None:
     found = make_calibration(names=(EVIL, "b", "c"))
-    found.warnings.append(EVIL)
-    found.ridges[0] = Ridge(EVIL, ("b", "c"))
-    found.run["config"] = {"name": EVIL}
-    found.noise[EVIL] = {"sd": 1.0, "tau": 0.5, "unit": EVIL}
-    found.logs[0] |= {"name": EVIL, "notes": [EVIL]}
+    found.ridges[0] = ridge("b", "c", combination=EVIL)
+    found.noise[EVIL] = ChannelNoise(1.0, 0.5, EVIL)
+    found.logs[0] = dataclasses.replace(found.logs[0], name=EVIL, findings=(noticed(Code.LOG_GAP, text=EVIL),))
     found.holdout[0] = dataclasses.replace(found.holdout[0], log=EVIL, channel=EVIL)
-    found.name = EVIL
+    findings = (*found.findings, noticed(Code.REMARK, text=EVIL))
+    found = dataclasses.replace(found, name=EVIL, findings=findings, run={"config": {"name": EVIL}})
     image = report.Picture("marginals", "marginals.png", b"", f'"{EVIL}')
     page = Page(report.render(found, [image]))
     assert "script" not in page.tags
@@ -580,8 +625,8 @@ def test_chains_that_have_not_mixed_come_first(calibration: Calibration) -> None
 @pytest.mark.parametrize("rhat", [None, 1.2, [1.0, 1.2, 1.0]])
 def test_mixing_in_every_shape(calibration: Calibration, rhat: Any) -> None:
     found = with_chains(calibration, 1.0)
-    found.mixing = {"rhat": rhat}
-    verdict = report.mixing_verdict(found)
+    found = dataclasses.replace(found, mixing=Mixing.of({"rhat": rhat}, found.posterior.space.names))
+    verdict = judged.mixing_verdict(found)
     assert (verdict is None) == (rhat is None)
     assert verdict is None or "1.20" in verdict.text
     Page(report.render(found, []))
@@ -597,7 +642,6 @@ def test_the_least_there_can_be(tmp_path: Path) -> None:
         [ParameterSummary("mass", "", (), 0.5, 0.0, 0.5, 0.5, 0.5, 0.5, None, 1.0)],
         train=[],
         holdout=[],
-        warnings=[],
     )
     path = report.write_report(bare, tmp_path)
     text = Page(path.read_text(encoding="utf-8")).text

@@ -1,0 +1,211 @@
+"""What a key of the TOML file may hold: types with their checks, and errors as one line with key, value and remedy."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from sipe_bayes.core.units import find_unit
+from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.inference.registry import ESTIMATORS
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message is one line with key, value and remedy."""
+
+
+def problem(message: str, *key: str | int) -> PydanticCustomError:
+    """An error at ``key`` below the table that is being checked; ``one_line`` says it."""
+    return PydanticCustomError("problem", "{message}", {"message": message, "key": key})
+
+
+def nearest(word: str, legal: Iterable[str]) -> str:
+    """The remedy for a word that is not in ``legal``: the nearest one, else all."""
+    words = [str(w) for w in legal]
+    return nearest_name(word, words).removeprefix("; ") or f"use one of {', '.join(map(repr, words))}"
+
+
+def nearest_file(path: Path) -> str:
+    """The remedy for a missing file: the nearest name in its folder."""
+    if not path.parent.is_dir():
+        return f"the folder {path.parent} does not exist; correct the path"
+    names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file())
+    return nearest_name(path.name, names, 0.5).removeprefix("; ") or (
+        "correct the path (it is relative to the TOML's folder)"
+    )
+
+
+def _resolved(value: Any, info: ValidationInfo) -> Any:
+    if not isinstance(value, str | Path):
+        return value
+    if not str(value).strip():
+        raise problem("expected a path, got an empty string; give the file's name")
+    folder = (info.context or {}).get("folder", Path())
+    return Path(folder, value)
+
+
+def _unit_word(word: str) -> str:
+    try:
+        return find_unit(word).word
+    except ValueError as error:
+        raise problem(str(error)) from None
+
+
+def _time_word(word: str) -> str:
+    try:
+        return find_unit(word, "time").word
+    except ValueError as error:
+        raise problem(str(error)) from None
+
+
+def _estimator(name: str) -> str:
+    if name not in ESTIMATORS:
+        raise problem(f"expected one of {', '.join(ESTIMATORS)}, got {name!r}; {nearest(name, ESTIMATORS)}")
+    return name
+
+
+def _checked_sign(value: Any) -> int:
+    if isinstance(value, bool) or value not in (1, -1):
+        raise problem(f"expected 1 or -1, got {value!r}; a sign only turns the direction, scaling is `unit`")
+    return int(value)
+
+
+def _window(value: object) -> object:
+    if value == "log":
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
+        raise problem(f"expected a length in seconds above zero, or 'log', got {value!r}; try 0.5 or 'log'")
+    return float(value)
+
+
+@dataclass(frozen=True)
+class MeasurementTarget:
+    """What a column measures.
+
+    Args:
+        kind: of what it is.
+        name: of the joint or sensor.
+        quantity: of the joint; ``reading`` of a sensor.
+        index: of the sensor's component, if it has several.
+    """
+
+    kind: Literal["joint", "sensor"]
+    name: str
+    quantity: Literal["position", "velocity", "reading"]
+    index: int | None = None
+
+
+_JOINT = re.compile(r"joint:(?P<name>.+)\.(?P<quantity>position|velocity)")
+_SENSOR = re.compile(r"sensor:(?P<name>[^\[\]]+)(\[(?P<index>\d+)\])?")
+
+
+def parse_measurement_target(target: str) -> MeasurementTarget:
+    """Read ``joint:NAME.position``, ``joint:NAME.velocity``, ``sensor:NAME`` or ``sensor:NAME[i]``.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if match := _JOINT.fullmatch(target):
+        quantity: Any = match["quantity"]
+        return MeasurementTarget("joint", match["name"], quantity)
+    if match := _SENSOR.fullmatch(target):
+        index = match["index"]
+        return MeasurementTarget("sensor", match["name"], "reading", None if index is None else int(index))
+    raise ValueError(
+        f"expected a measurement target, got {target!r}; "
+        "write 'joint:NAME.position', 'joint:NAME.velocity', 'sensor:NAME' or 'sensor:NAME[0]'"
+    )
+
+
+def _checked_target(target: str) -> str:
+    try:
+        parse_measurement_target(target)
+    except ValueError as error:
+        raise problem(str(error)) from None
+    return target
+
+
+Text = Annotated[str, Field(min_length=1), Strict()]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
+Pair = tuple[Number, Number]
+Location = Annotated[Path, BeforeValidator(_resolved)]
+UnitWord = Annotated[str, Strict(), AfterValidator(_unit_word)]
+TimeWord = Annotated[str, Strict(), AfterValidator(_time_word)]
+Sign = Annotated[int, BeforeValidator(_checked_sign)]
+EstimatorName = Annotated[str, Strict(), AfterValidator(_estimator)]
+TargetWord = Annotated[str, Strict(), AfterValidator(_checked_target)]
+Window = Annotated[float | Literal["log"] | None, BeforeValidator(lambda v: None if v is None else _window(v))]
+"""Seconds, or "log" for whole logs."""
+
+
+class Table(BaseModel):
+    """A TOML table: frozen, without unknown keys. ``also`` are keys that are turned into others."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    also: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        legal = [field.alias or name for name, field in cls.model_fields.items()] + list(cls.also)
+        for key in data:
+            if key not in legal:
+                raise problem(f"unknown key; {nearest(str(key), legal)}", str(key))
+        return data
+
+
+def check_ordered(pair: tuple[float, float], key: str, expected: str) -> None:
+    """Refuse a pair at ``key`` whose first number is not the smaller one; ``expected`` says what it stands for."""
+    low, high = pair
+    if low == high:
+        raise problem(f"expected {expected} with low < high, got [{low:g}, {high:g}]; widen it", key)
+    if low > high:
+        raise problem(f"reversed, got [{low:g}, {high:g}]; swap to [{high:g}, {low:g}]", key)
+
+
+def _key(location: Iterable[Any]) -> str:
+    """A key path in TOML's words: logs[0].file."""
+    words = ""
+    for part in location:
+        words += f"[{part}]" if isinstance(part, int) else f".{part}" if words else str(part)
+    return words
+
+
+def one_line(error: ErrorDetails) -> str:
+    """What pydantic says of a value, as key, value and remedy."""
+    context = error.get("ctx", {})
+    key = _key([*error["loc"], *context.get("key", ())])
+    where = f"key `{key}`: " if key else ""
+    if error["type"] == "problem":
+        return where + str(context["message"])
+    if error["type"] == "missing":
+        return f"{where}missing; add it"
+    message = error["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
+    got = error["input"]
+    remedy = "correct the value"
+    if error["type"] == "literal_error":
+        remedy = nearest(str(got), re.findall(r"'([^']*)'", str(context.get("expected", ""))))
+    return f"{where}{message}, got {_short(got)}; {remedy}"
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,205 @@
+"""The tables of the TOML file of ``sipe calibrate``, each with the checks that need nothing but itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, Strict, model_validator
+
+from sipe_bayes.calibration.config_fields import (
+    Location,
+    Number,
+    Pair,
+    Positive,
+    Sign,
+    Table,
+    TargetWord,
+    Text,
+    TimeWord,
+    UnitWord,
+    Window,
+    check_ordered,
+    problem,
+)
+
+Use = Literal["train", "holdout"]
+
+
+class TimeColumn(Table):
+    """The column that holds the clock."""
+
+    column: Text = "time"
+    unit: TimeWord = "s"
+
+
+class Columns(Table):
+    """Columns that are neither command nor measurement."""
+
+    time: TimeColumn = TimeColumn()
+
+
+class Resample(Table):
+    """The control grid. rate: Hz, default the log's own. max_gap: s, default five sample periods."""
+
+    rate: Positive | None = None
+    max_gap: Positive | None = None
+
+
+class Command(Table):
+    """The column that drives one actuator; ``sign`` * column in ``unit``."""
+
+    actuator: Text
+    column: Text
+    unit: UnitWord
+    sign: Sign = 1
+
+    @property
+    def target(self) -> str:
+        """``actuator:NAME``."""
+        return f"actuator:{self.actuator}"
+
+
+class Measurement(Table):
+    """A column that measures a joint or a sensor; ``sign`` * column in ``unit``.
+
+    fit: False keeps it out of the likelihood, for starting windows and plots only. noise_sd: in SI, if known.
+    """
+
+    column: Text
+    target: TargetWord
+    unit: UnitWord
+    sign: Sign = 1
+    fit: Annotated[bool, Strict()] = True
+    noise_sd: Positive | None = None
+    name: Text = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_name(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "name" not in data and "column" in data:
+            return {**data, "name": data["column"]}
+        return data
+
+
+class LogEntry(Table):
+    """One log, or one ``span`` (start, stop) of it in seconds from its first sample; ``window`` overrides the
+    configuration's for this log."""
+
+    file: Location
+    name: Text = ""
+    use: Use = "train"
+    span: Pair | None = None
+    window: Window = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_name(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "name" not in data and isinstance(data.get("file"), str | Path):
+            return {**data, "name": Path(data["file"]).stem}
+        return data
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.span is not None:
+            check_ordered(self.span, "span", "[start, stop] in seconds")
+            if self.span[0] < 0:
+                raise problem(f"starts before the log, got {list(self.span)}; count seconds from 0", "span")
+        return self
+
+
+class NormalPrior(Table):
+    """A normal prior truncated to the bounds, in the terms that they are given in: SI, or factors of the model's value."""
+
+    mean: Number
+    sd: Positive
+
+
+class ParameterEntry(Table):
+    """One unknown. Give ``bounds`` (SI) or ``factor`` (times the model's own value)."""
+
+    also: ClassVar[tuple[str, ...]] = ("target",)
+
+    name: Text
+    targets: Annotated[tuple[Text, ...], Field(min_length=1)]
+    bounds: Pair | None = None
+    factor: Pair | None = None
+    scale: Literal["linear", "log"] = "linear"
+    prior: NormalPrior | None = None
+    per_log: Annotated[bool, Strict()] = False
+    description: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_target(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        if ("target" in data) == ("targets" in data):
+            came = "both" if "target" in data else "neither"
+            raise problem(f"expected either `target` or `targets`, got {came}; give one of them", "target")
+        if "target" not in data:
+            return data
+        if not isinstance(data["target"], str):
+            raise problem(f"expected one string, got {data['target']!r}; for several use `targets`", "target")
+        return {**{k: v for k, v in data.items() if k != "target"}, "targets": [data["target"]]}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        self._check_bounds()
+        if len(set(self.targets)) < len(self.targets):
+            raise problem(f"names a target twice, got {list(self.targets)}; drop one", "targets")
+        if self.prior is not None:
+            self._check_prior(self.prior)
+        return self
+
+    def _check_bounds(self) -> None:
+        if (self.bounds is None) == (self.factor is None):
+            came = "neither" if self.bounds is None else "both"
+            raise problem(f"expected either `bounds` or `factor`, got {came}; give one of them", "bounds")
+        key = "factor" if self.bounds is None else "bounds"
+        pair = self.factor if self.bounds is None else self.bounds
+        if pair is None:
+            return
+        check_ordered(pair, key, "[low, high]")
+        if self.scale == "log" and pair[0] <= 0:
+            raise problem(
+                f"a log scale needs bounds above zero, got [{pair[0]:g}, {pair[1]:g}]; "
+                "raise the lower one or use scale = 'linear'",
+                key,
+            )
+
+    def _check_prior(self, prior: NormalPrior) -> None:
+        pair = self.factor if self.bounds is None else self.bounds
+        if pair is not None and not pair[0] <= prior.mean <= pair[1]:
+            low, high = pair
+            raise problem(
+                f"expected a mean within the bounds [{low:g}, {high:g}], got {prior.mean:g}; widen them",
+                "prior",
+                "mean",
+            )
+        if self.scale == "log" and prior.mean <= 0:
+            raise problem(f"expected a mean above zero on a log scale, got {prior.mean:g}", "prior", "mean")
+
+
+class Noise(Table):
+    """The model of the residuals."""
+
+    model: Literal["ar1", "white", "sandwich"] = "ar1"
+
+
+class PriorSource(Table):
+    """An earlier run's posterior (path without suffix) as the prior; in TOML the key is ``from``."""
+
+    source: Location = Field(alias="from")
+
+
+class Search(Table):
+    """How widely the optimum is looked for: starting points followed, and draws from the prior among which they are chosen."""
+
+    restarts: Annotated[int, Strict(), Field(gt=0)] = 2
+    candidates: Annotated[int, Strict(), Field(ge=0)] = 8
+
+
+def overlap(a: Pair | None, b: Pair | None) -> bool:
+    """Whether two spans in seconds share samples; None is the whole log."""
+    return a is None or b is None or (a[0] < b[1] and b[0] < a[1])

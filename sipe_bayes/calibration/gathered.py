@@ -1,0 +1,146 @@
+"""What a calibration's checks say, gathered as findings: of the parameters, their targets, the held-out logs, the logs read."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, Finding, Severity, finding
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge
+from sipe_bayes.diagnostics.result import ParameterSummary
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.posterior import Posterior
+
+_DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """A posterior by parameter.
+
+    Args:
+        space: of the N parameters.
+        theta: (N,) the mode.
+        sd: (N,) in theta.
+        contraction: (N,) 1 - sd / prior sd.
+        draws: (n, N) in units.
+    """
+
+    space: ParameterSpace
+    theta: FloatArray
+    sd: FloatArray
+    contraction: FloatArray
+    draws: FloatArray
+
+    @classmethod
+    def of(cls, posterior: Posterior, prior: Posterior, space: ParameterSpace, seed: int) -> Marginals:
+        """Those of a posterior.
+
+        Args:
+            posterior: of the parameters.
+            prior: that it started from.
+            space: of the parameters.
+            seed: of the draws.
+        """
+        sd = posterior.stddev.numpy()
+        contraction = 1 - sd / np.maximum(prior.stddev.numpy(), 1e-300)
+        draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
+        return cls(space, posterior.mode.numpy(), sd, contraction, draws)
+
+    def summaries(self) -> list[ParameterSummary]:
+        """One for each parameter."""
+        mode = self.space.values(self.theta)
+        quantiles = np.quantile(self.draws, [0.05, 0.5, 0.95], axis=0)
+        return [
+            ParameterSummary(
+                name=p.name,
+                unit=p.unit,
+                targets=p.targets,
+                mean=float(self.draws[:, j].mean()),
+                sd=float(self.draws[:, j].std()),
+                q05=float(quantiles[0, j]),
+                q50=float(quantiles[1, j]),
+                q95=float(quantiles[2, j]),
+                mode=float(mode[j]),
+                default=p.default,
+                contraction=float(self.contraction[j]),
+                nuisance=p.log is not None,
+            )
+            for j, p in enumerate(self.space)
+        ]
+
+    def findings(self, dead: dict[str, list[tuple[float, float]]], ridges: Sequence[Ridge]) -> list[Finding]:
+        """Of each parameter whether it does anything, is determined, and lies at a bound.
+
+        Args:
+            dead: parameter -> pieces of [0, 1] over which it changes nothing.
+            ridges: whose members are open by themselves, which is then worth no more than a note.
+        """
+        on_ridge = {name for ridge in ridges for name in ridge.parameters}
+        noticed = []
+        for j, p in enumerate(self.space):
+            about = functools.partial(finding, parameters=[p.name], unit=p.unit)
+            pieces = dead.get(p.name, [])
+            idle = any(low <= 0 and high >= 1 for low, high in pieces)
+            if idle:
+                noticed.append(about(Code.NO_EFFECT))
+            elif pieces:
+                ranges = ", ".join(f"{p.value(a):.4g} to {p.value(b):.4g}" for a, b in pieces)
+                noticed.append(about(Code.DEAD_RANGE, ranges=ranges))
+            if self.contraction[j] < THRESHOLDS.not_determined:
+                severity = Severity.NOTE if idle or p.name in on_ridge else Severity.CAUTION
+                contraction = float(self.contraction[j])
+                noticed.append(about(Code.NOT_DETERMINED, severity=severity, contraction=contraction))
+            elif self._at_bound(j):
+                noticed.append(about(Code.MODE_AT_BOUND, bound=_nearer_bound(p, float(self.theta[j]))))
+        return noticed
+
+    def _at_bound(self, j: int) -> bool:
+        near = THRESHOLDS.at_bound * min(1.0, THRESHOLDS.bound_sds * self.sd[j])
+        return bool(min(self.theta[j], 1 - self.theta[j]) < near)
+
+
+def _nearer_bound(parameter: Parameter, theta: float) -> float:
+    """The bound, in units, that the value of a theta is nearer to."""
+    value = float(parameter.value(theta))
+    return parameter.low if value - parameter.low < parameter.high - value else parameter.high
+
+
+def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:
+    """Parameters whose targets have different values in the model, where one number stands for the model as given."""
+    return [
+        finding(Code.UNEVEN_TARGETS, parameters=[p.name], default=p.default, unit=p.unit)
+        for p in environment.space
+        if environment.uneven(p)
+    ]
+
+
+def not_better(scores: Sequence[ChannelScore]) -> list[Finding]:
+    """Held-out channels that the calibrated model does not predict better than the model as given."""
+    noticed = []
+    for s in scores:
+        if not math.isfinite(s.rmse):
+            noticed.append(finding(Code.HELD_OUT_DIVERGES, log=s.log, channel=s.channel))
+        elif math.isfinite(s.rmse_default) and s.rmse >= s.rmse_default:
+            where = functools.partial(finding, log=s.log, channel=s.channel, unit=s.unit)
+            noticed.append(where(Code.HELD_OUT_WORSE, rmse=s.rmse, rmse_default=s.rmse_default))
+    return noticed
+
+
+def of_logs(reports: Sequence[LogReport]) -> list[Finding]:
+    """What the readers noticed; cautions where a log is not simply as it was recorded, else notes."""
+    return [
+        replace(
+            note, text=f"log {report.name}: {note.text}", severity=Severity.CAUTION if report.suspect else note.severity
+        )
+        for report in reports
+        for note in report.findings
+    ]

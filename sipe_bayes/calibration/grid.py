@@ -1,0 +1,123 @@
+"""The control grid of a log, and signals on it: passed through where they lie on it, else interpolated; commands held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+
+_REGULAR = 0.1  # of a period: a clock whose samples are as near to the grid as this is regular
+_GAP_PERIODS = 5.0  # default max_gap, in a column's own median sample periods
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log in SI.
+
+    Args:
+        time: (n,) s from zero.
+        commands: of each actuator (n,), NaN where there is no number.
+        measurements: of each channel (n,), NaN where there is no number.
+    """
+
+    time: FloatArray
+    commands: list[FloatArray]
+    measurements: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The control grid.
+
+    Args:
+        dt: s from one time to the next.
+        samples: how many times.
+        rows: (n,) where the log's rows stand, in periods; whole numbers when regular, else time / dt.
+        regular: whether the rows lie on the grid.
+    """
+
+    dt: float
+    samples: int
+    rows: FloatArray
+    regular: bool
+
+
+def control_grid(time: FloatArray, rate: float | None) -> Grid:
+    """The control grid of a log.
+
+    Args:
+        time: (n,) s from zero.
+        rate: Hz; default the log's own.
+    """
+    periods = np.diff(time)
+    dt = float(np.median(periods)) if rate is None else 1.0 / rate
+    if rate is None:
+        rows = np.append(0.0, np.cumsum(np.maximum(1.0, np.round(periods / dt))))
+        mean = float(time[-1] / rows[-1])
+        if np.abs(time - rows * mean).max() <= _REGULAR * mean:
+            return Grid(mean, int(rows[-1]) + 1, rows, True)
+    rows = np.round(time / dt)
+    if (np.diff(rows) > 0).all() and np.abs(time - rows * dt).max() <= _REGULAR * dt:
+        return Grid(dt, int(rows[-1]) + 1, rows, True)
+    return Grid(dt, int(time[-1] / dt + 1e-6) + 1, time / dt, False)
+
+
+def held(values: FloatArray, grid: Grid) -> FloatArray:
+    """Actions (T,): the last finite value (n,) at or before each control step."""
+    known = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    row = np.searchsorted(grid.rows, np.arange(grid.samples - 1) + 1e-6, side="right") - 1
+    return values[known][row]
+
+
+def sampled(time: FloatArray, values: FloatArray, grid: Grid, max_gap: float | None) -> FloatArray:
+    """Measurements (T+1,) on the grid, NaN where there is none.
+
+    Args:
+        time: (n,) s.
+        values: (n,) with NaN where there is none.
+        grid: the control grid.
+        max_gap: s between two samples, beyond which nothing is interpolated; default five of their periods.
+    """
+    out = np.full(grid.samples, np.nan)
+    if grid.regular:
+        out[grid.rows.astype(np.int64)] = values
+        return out
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        return out
+    return _interpolated(time[known], values[known], grid, max_gap)
+
+
+def _interpolated(time: FloatArray, values: FloatArray, grid: Grid, max_gap: float | None) -> FloatArray:
+    """Linear interpolation at those grid times that are the nearest one to some sample.
+
+    time, values (n,): finite samples, at least two.
+    """
+    limit = _GAP_PERIODS * float(np.median(np.diff(time))) if max_gap is None else max_gap
+    times = np.arange(grid.samples) * grid.dt
+    right = np.clip(np.searchsorted(time, times), 1, len(time) - 1)
+    inside = (time[right - 1] <= times) & (times <= time[right]) & (time[right] - time[right - 1] <= limit)
+    near = np.where(time[right] - times < times - time[right - 1], right, right - 1)
+    exact = np.abs(time[near] - times) <= 1e-6 * grid.dt
+    owned = np.zeros(grid.samples, dtype=np.bool_)
+    owned[np.minimum(np.round(time / grid.dt).astype(np.int64), grid.samples - 1)] = True
+    between = np.where(owned & inside, np.interp(times, time, values), np.nan)
+    return np.where(exact, values[near], between)
+
+
+def gaps(measured: BoolArray, dt: float, max_gap: float | None) -> tuple[tuple[float, float], ...]:
+    """Stretches (start, stop) in s without a measurement.
+
+    Args:
+        measured: (T+1,) where there is one.
+        dt: s from one to the next.
+        max_gap: s that are no gap yet; default five median periods of the measurements.
+    """
+    known = np.flatnonzero(measured)
+    spacing = float(np.median(np.diff(known))) if len(known) > 1 else 1.0
+    limit = _GAP_PERIODS * spacing * dt if max_gap is None else max_gap
+    edges = np.concatenate([[0], known, [len(measured) - 1]])
+    wide = np.flatnonzero(np.diff(edges) * dt > limit * (1 + 1e-9))
+    return tuple((float(edges[i] * dt), float(edges[i + 1] * dt)) for i in wide)

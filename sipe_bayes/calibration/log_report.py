@@ -1,0 +1,106 @@
+"""What a log held and what was done to it: the clock, gaps, masked samples, held commands, saturation."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+
+import numpy as np
+
+from sipe_bayes.calibration.config import Config
+from sipe_bayes.calibration.config_tables import LogEntry
+from sipe_bayes.calibration.grid import Grid, Recording, gaps
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.diagnostics.records import LogReport
+
+_CLIPPED_RUN = 5  # samples in a row at the extreme value that count as saturation
+_CLIPPED_SHARE = 0.01  # of the samples, above which that is worth a note: dry friction holds a turning joint for a few
+_LEVELS = 10  # different values: a signal with fewer is switched, not clipped
+_QUANTA = 2.5  # smallest steps: a signal that comes from as far was cut off, one from nearer turned round
+
+
+def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, trajectory: Trajectory) -> LogReport:
+    """What a log held and what was done to it.
+
+    Args:
+        config: the configuration.
+        log: which of its logs.
+        raw: as it was read.
+        grid: that it was put on.
+        trajectory: what came out.
+    """
+    finite = np.isfinite(trajectory.observations)
+    names = [*config.channels, *(c.target for c in config.commands)]
+    signals = [*raw.measurements, *raw.commands]
+    missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
+    clipped = {name: count_clipped(values) for name, values in zip(names, signals, strict=True)}
+    saturated = {name: n for name, n in clipped.items() if n > _CLIPPED_SHARE * len(raw.time)}
+    blank = {c.target: int((~np.isfinite(y[:-1])).sum()) for c, y in zip(config.commands, raw.commands, strict=True)}
+    holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
+    jitter = _jitter(raw.time)
+    note = functools.partial(finding, log=log.name)
+    return LogReport(
+        name=log.name,
+        file=str(log.file),
+        sha256=hashlib.sha256(log.file.read_bytes()).hexdigest(),
+        rate_hz=1.0 / grid.dt,
+        duration_s=(grid.samples - 1) * grid.dt,
+        samples=grid.samples,
+        jitter_s=jitter,
+        resampled=not grid.regular,
+        gaps=holes,
+        missing=missing,
+        clipped=clipped,
+        findings=(
+            _clock(log, raw, grid, jitter),
+            *(note(Code.LOG_GAP, start=start, stop=stop) for start, stop in holes),
+            *(note(Code.LOG_MISSING, channel=c, missing=n, samples=grid.samples) for c, n in missing.items() if n),
+            *(note(Code.LOG_BLANK_COMMANDS, channel=c, blank=n) for c, n in blank.items() if n),
+            *(note(Code.LOG_CLIPPED, channel=c, clipped=n) for c, n in saturated.items()),
+        ),
+    )
+
+
+def _clock(log: LogEntry, raw: Recording, grid: Grid, jitter: float) -> Finding:
+    return finding(
+        Code.LOG_CLOCK if grid.regular else Code.LOG_RESAMPLED,
+        log=log.name,
+        samples=len(raw.time),
+        rate=f"{1 / grid.dt:.4g} Hz",
+        own_rate=f"{1 / float(np.median(np.diff(raw.time))):.4g} Hz",
+        jitter_ms=1e3 * jitter,
+    )
+
+
+def _jitter(time: FloatArray) -> float:
+    periods = np.diff(time)
+    median = np.median(periods)
+    return float(np.abs(periods - median * np.maximum(1.0, np.round(periods / median))).max())
+
+
+def count_clipped(values: FloatArray) -> int:
+    """Samples of a signal (n,) stuck at its largest or smallest value, in runs of five or more.
+
+    A quantised signal that rests or turns there also repeats itself; clipping cuts off a moving one. So a run
+    counts only if two samples before or after it the signal is at least three quanta away, a quantum being
+    its smallest step. Switched and constant signals have none.
+    """
+    values = values[np.isfinite(values)]
+    if len(np.unique(values)) < _LEVELS:
+        return 0
+    low, high = float(values.min()), float(values.max())
+    steps = np.abs(np.diff(values))
+    far = _QUANTA * float(steps[steps > 1e-6 * (high - low)].min())
+    return sum(_stuck(values, extreme, far) for extreme in (low, high))
+
+
+def _stuck(values: FloatArray, extreme: float, far: float) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
+    away = np.concatenate([[0.0, 0.0], np.abs(values - extreme), [0.0, 0.0]])
+    return sum(
+        int(stop - start)
+        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+        if stop - start >= _CLIPPED_RUN and max(away[start], away[stop + 3]) >= far
+    )

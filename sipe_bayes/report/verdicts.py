@@ -1,0 +1,190 @@
+"""What to think of a calibration: which values can be trusted, whether it predicts, what the model lacks.
+
+Verdicts are decided by the codes and severities of findings and by numbers; words are only what they say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.finding_texts import TEXTS
+from sipe_bayes.core.findings import Code, Findings
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.records import ChannelScore, Comparison
+from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
+from sipe_bayes.report.words import listed, number
+
+_ONE = "The one value may be trusted within its interval"
+_NAMED, _DOUBTS = 6, 2  # parameters and doubts that a sentence lists
+
+_PROBLEMS = (
+    Code.MODE_AT_BOUND,
+    Code.NO_EFFECT,
+    Code.NOT_DETERMINED,
+    Code.LOGS_DISAGREE,
+    Code.LOGS_DISAGREE_UNEXPLAINED,
+    Code.MISFIT,
+    Code.MISFIT_SHIFTS,
+)
+"""Findings for which a parameter's value is not to be trusted, in the order in which its row names them."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of something: a ``tone`` (good, fair or bad) and words."""
+
+    tone: str
+    text: str
+
+
+def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdict:
+    """What to think of one parameter: what is wrong with it, else how far the logs determine it.
+
+    One that is poorly determined but belongs to a ridge is determined with the others of it. None is good while a
+    finding blocks.
+
+    Args:
+        parameter: its summary.
+        findings: of the calibration.
+    """
+    codes = {item.code for item in findings.about(parameter.name)}
+    on_ridge = [r.parameters for r in findings.of(Code.RIDGE_TO_RESOLVE) if parameter.name in r.parameters]
+    others = list(dict.fromkeys(n for names in on_ridge for n in names if n != parameter.name))
+    shared = bool(others) and parameter.contraction < THRESHOLDS.well_determined and Code.NO_EFFECT not in codes
+    if shared:
+        codes.discard(Code.NOT_DETERMINED)
+    problems = [TEXTS[code].row for code in _PROBLEMS if code in codes]
+    if problems:
+        return Verdict("bad", ", ".join(problems))
+    if shared:
+        return Verdict("fair", f"only with {listed(others)}")
+    if not parameter.sd > 0:
+        return Verdict("fair", "a point without uncertainty")
+    partly = f"; {TEXTS[Code.DEAD_RANGE].row}" if Code.DEAD_RANGE in codes else ""
+    if parameter.contraction < THRESHOLDS.well_determined:
+        return Verdict("fair", "weakly determined" + partly)
+    doubted = "; but see the doubt above" if findings.blocking else ""
+    return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
+
+
+def improvement(scores: Iterable[ChannelScore]) -> float:
+    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares."""
+    ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
+    ratios = [r for r in ratios if math.isfinite(r)]
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
+
+
+def headline(parameters: Sequence[ParameterSummary], findings: Findings) -> Verdict:
+    """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks.
+
+    Args:
+        parameters: a summary of each.
+        findings: of the calibration.
+    """
+    wanted = [p for p in parameters if not p.nuisance]
+    if not wanted:
+        return Verdict("fair", "Only nuisance parameters were estimated.")
+    doubts = findings.doubts
+    if doubts:
+        others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
+        said = "; ".join(doubts[:_DOUBTS])
+        return Verdict("bad", f"No value may be trusted within its interval yet: {said}{others}.")
+    good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
+    if not good:
+        return Verdict("bad", "No value may be trusted within its interval; the table says why.")
+    if len(good) == len(wanted):
+        text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
+        return Verdict("good", f"{text}.")
+    named = listed(good) if len(good) <= _NAMED else f"{listed(good[:_NAMED])} and others"
+    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals: {named}"
+    return Verdict("fair", f"{text}; the table says why not the others.")
+
+
+def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) -> Verdict:
+    """Whether the calibrated model foretells held-out logs better than the model as given.
+
+    Args:
+        scores: errors on the held-out logs.
+        comparison: of these errors; None where they cannot be compared.
+    """
+    if not scores:
+        text = "No log was held out, so nothing here shows how well the model predicts a log it has not seen."
+        return Verdict("fair", text)
+    lost = [s for s in scores if not math.isfinite(s.rmse)]
+    if lost:
+        where = listed([f"{s.log} ({s.channel})" for s in lost])
+        return Verdict("bad", f"On held-out logs the calibrated model has no finite error in {where}.")
+    if comparison is None:
+        return Verdict("fair", "On held-out logs the errors of the two models cannot be compared.")
+    error = f"{_margin(comparison)}; paired t-test on {comparison.pieces} pieces of the logs, p = {comparison.p:.2g}"
+    if comparison.starts is not None:
+        share = f"{100 * comparison.starts:.3g} %"
+        error += f"; from starts that each model fits, since those measured make {share} of the error"
+    error += ")"
+    if comparison.verdict == "worse":
+        return Verdict(
+            "bad", f"On held-out logs the calibrated model is WORSE than the model you had: its error is {error}."
+        )
+    if comparison.verdict == "not better":
+        text = (
+            "On held-out logs it is NOT shown that the calibrated model is better than the model you had: its error is "
+        )
+        return Verdict("bad", f"{text}{error}.")
+    alone = comparison.starts is None  # the errors by log are from measured starts
+    worse = [f"{s.log} ({s.channel})" for s in scores if alone and s.rmse > THRESHOLDS.alike * s.rmse_default]
+    text = f"On held-out logs the calibrated model is better than the model you had: its error is {error}"
+    if worse:
+        return Verdict("fair", f"{text}; but it is larger in {listed(worse)}.")
+    return Verdict("good" if comparison.ratio >= THRESHOLDS.alike else "fair", f"{text}.")
+
+
+def _margin(comparison: Comparison) -> str:
+    """The ratio in words with its 95 % interval, in the direction in which it lies."""
+    ratio, low, high = comparison.ratio, comparison.low, comparison.high
+    if ratio < 1:
+        ratio, low, high = 1 / ratio, 1 / high, 1 / low
+    digits = 3 if ratio < THRESHOLDS.alike else 2
+    word = "smaller" if comparison.ratio >= 1 else "larger"
+    return f"{number(ratio, digits)} times {word} (95 % interval {number(low, digits)} to {number(high, digits)}"
+
+
+def lack(calibration: Calibration) -> Verdict | None:
+    """What the model lacks, where that matters; the warnings say more."""
+    misfit = calibration.misfit
+    if misfit is None or not misfit.alarm:
+        return None
+    channel = max(misfit.share, key=lambda name: misfit.share[name])
+    share = f"{100 * misfit.share[channel]:.2g} % of the residual of {channel}"
+    if not misfit.matters:
+        return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
+    return Verdict("bad", f"The model lacks something: it looks like {misfit.cause} ({share}, p = {misfit.p:.2g}).")
+
+
+def mixing_verdict(calibration: Calibration) -> Verdict | None:
+    """Whether the Markov chains have mixed, when there are any that say so."""
+    worst = None if calibration.mixing is None else calibration.mixing.worst
+    if worst is None:
+        return None
+    rhat, name = worst
+    if rhat <= THRESHOLDS.mixed:
+        return Verdict("good", f"The chains have mixed (largest R-hat {rhat:.3f}).")
+    where = f" in {name}" if name else ""
+    text = f"The chains have NOT mixed (R-hat {rhat:.2f}{where}): do not use the intervals yet."
+    return Verdict("bad", text)
+
+
+def verdicts(calibration: Calibration) -> list[Verdict]:
+    """The sentences at the top of the report; the first says so where the calibration does not help."""
+    findings = Findings(calibration.findings)
+    predicted = prediction(calibration.holdout, calibration.comparison)
+    first = [headline(calibration.parameters, findings), predicted]
+    if predicted.tone == "bad":
+        first.reverse()
+    mixing = mixing_verdict(calibration)
+    if mixing is not None and mixing.tone == "bad" and any(f.code is Code.NOT_MIXED for f in findings.blocking):
+        mixing = None  # the headline says it
+    return [v for v in (*first, lack(calibration), mixing) if v]

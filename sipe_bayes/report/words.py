@@ -1,0 +1,59 @@
+"""Numbers and names as words of a report."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+from sipe_bayes.core.thresholds import THRESHOLDS
+
+
+def significant(value: float, sd: float, scale: float | None = None) -> str:
+    """``value`` to the second significant digit of ``sd``: significant(0.69751, 0.0030) is "0.6975".
+
+    Args:
+        value: the number.
+        sd: its uncertainty; without one, four significant digits.
+        scale: the largest of several numbers that stand together, so that all of them are written alike, either
+            plainly or, below 0.001 and from a million on, with a power of ten.
+    """
+    if not math.isfinite(value):
+        return "–"
+    if not (math.isfinite(sd) and sd > 0):
+        return f"{value:.4g}"
+    last = math.floor(math.log10(float(f"{sd:.1e}"))) - 1
+    size = max(abs(value), abs(scale or 0.0), sd)
+    exponent = math.floor(math.log10(size))
+    if -4 < exponent < 6:
+        return f"{round(value, -last) + 0.0:.{max(-last, 0)}f}"
+    return f"{round(value / 10.0**exponent, exponent - last) + 0.0:.{max(exponent - last, 0)}f}e{exponent}"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """``value`` to some significant digits, as short as it goes; a dash when it is missing or not finite."""
+    if value is None or not math.isfinite(float(value)):
+        return "–"
+    rounded = float(f"{float(value):.{digits - 1}e}")
+    text = f"{rounded:.0f}" if 10 ** (digits - 1) <= abs(rounded) < 1e6 else f"{rounded:.{digits}g}"
+    return re.sub(r"e([+-])0*", r"e\1", text).replace("e+", "e")
+
+
+def error_text(value: float) -> str:
+    """An error to three significant digits, zeros included."""
+    return f"{value:#.3g}".rstrip(".") if 1e-4 <= abs(value) < 1000 else number(value)
+
+
+def times(ratio: float) -> str:
+    """An error ratio (model as given over calibrated) in words."""
+    if not math.isfinite(ratio):
+        return "–"
+    if 1 / THRESHOLDS.alike < ratio < THRESHOLDS.alike:
+        return "about the same"
+    factor, word = (ratio, "smaller") if ratio > 1 else (1 / ratio, "larger")
+    return f"{factor:.1f} times {word}" if factor < 9.95 else f"{number(factor, 2)} times {word}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """The names as words of a sentence: "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
