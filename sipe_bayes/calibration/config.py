@@ -41,8 +41,10 @@ from sipe_bayes.core.units import find_unit
 
 
 class Config(Table):
-    """A whole configuration; ``load_config`` reads one. ``window`` in seconds, or "log" for whole logs; None where the likelihood
-    has no windows."""
+    """A whole configuration; ``load_config`` reads one.
+
+    ``window`` is in seconds, or "log" for whole logs; None where the likelihood has no windows.
+    """
 
     model: Location
     estimator: EstimatorName = "laplace"
@@ -155,10 +157,15 @@ def _check_unique(table: str, key: str, words: Sequence[str]) -> None:
 
 
 def check_dimensions(config: Config, dimensions: Mapping[str, str]) -> None:
-    """Raise ConfigError where a unit is of another kind than what the column stands for.
+    """Refuse a unit that is of another kind than what its column stands for.
 
-    dimensions: target -> dimension, e.g. {"joint:hinge.position": "angle", "actuator:motor": "torque"};
-    targets that are not in it are not checked.
+    Args:
+        config: the configuration.
+        dimensions: target -> dimension, e.g. {"joint:hinge.position": "angle", "actuator:motor": "torque"}; targets
+            that are not in it are not checked.
+
+    Raises:
+        ConfigError: for such a unit.
     """
     tables: tuple[tuple[str, Sequence[Command | Measurement]], ...] = (
         ("commands", config.commands),
@@ -174,7 +181,14 @@ def check_dimensions(config: Config, dimensions: Mapping[str, str]) -> None:
 
 
 def load_config(path: str | Path) -> Config:
-    """Read and check a configuration; raises ConfigError."""
+    """Read and check a configuration.
+
+    Args:
+        path: of the TOML file.
+
+    Raises:
+        ConfigError: for one that cannot be used.
+    """
     path = Path(path)
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -83,8 +83,10 @@ class Measurement(Table):
 
 
 class LogEntry(Table):
-    """One log, or one ``span`` (start, stop) of it in seconds from its first sample; ``window`` overrides the
-    configuration's for this log."""
+    """One log, or one ``span`` (start, stop) of it in seconds from its first sample.
+
+    ``window`` overrides the configuration's for this log.
+    """
 
     file: Location
     name: Text = ""
@@ -109,7 +111,7 @@ class LogEntry(Table):
 
 
 class NormalPrior(Table):
-    """A normal prior truncated to the bounds, in the terms that they are given in: SI, or factors of the model's value."""
+    """A normal prior truncated to the bounds, in their terms: SI, or factors of the model's value."""
 
     mean: Number
     sd: Positive
@@ -194,7 +196,10 @@ class PriorSource(Table):
 
 
 class Search(Table):
-    """How widely the optimum is looked for: starting points followed, and draws from the prior among which they are chosen."""
+    """How widely the optimum is looked for.
+
+    restarts: starting points that are followed; candidates: draws from the prior among which they are chosen.
+    """
 
     restarts: Annotated[int, Strict(), Field(gt=0)] = 2
     candidates: Annotated[int, Strict(), Field(ge=0)] = 8

@@ -1,4 +1,4 @@
-"""What a calibration's checks say, gathered as findings: of the parameters, their targets, the held-out logs, the logs read."""
+"""What a calibration's checks say, gathered as findings: of parameters, held-out logs and the logs as read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control grid of a log, and signals on it: passed through where they lie on it, else interpolated; commands held."""
+"""The control grid of a log, and signals on it: passed through or interpolated; commands are held."""
 
 from __future__ import annotations
 

@@ -69,8 +69,8 @@ class Problem:
     def segments(self) -> Segments:
         """The windows by which logs are scored, drawn and checked: the likelihood's own.
 
-        Beside a ``StateSpace`` they are of half a second, or what a held-out log's ``window`` says; a shorter log is one
-        window.
+        Beside a ``StateSpace`` they are of half a second, or what a held-out log's ``window`` says; a shorter log is
+        one window.
         """
         if isinstance(self.likelihood, Segments):
             return self.likelihood

@@ -245,7 +245,7 @@ class _Residuals:
         return out
 
     def moments(self, residuals: FloatArray) -> list[tuple[Moments, Moments]]:
-        """For each of residuals (W, L, C, S) the products without the probes and with them; the Jacobian's are formed once."""
+        """For each of residuals (W, L, C, S) the products without the probes and with them."""
         n, count, many = self.windows.num_theta, self.count, residuals.shape[-1]
         parts = (self.jacobian[..., :count], residuals, self.jacobian[..., count:])
         rows = np.concatenate(parts, axis=-1)
