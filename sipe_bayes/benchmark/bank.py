@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import torch
 
 from sipe_bayes.benchmark.executors.work import Done, Unit
 from sipe_bayes.benchmark.log import recorded
@@ -58,11 +57,6 @@ class _Blocks(Cache):
 
     def path(self, number: int) -> str:
         return f"{FOLDER}/{self.key}/block-{number:06d}.npz"
-
-    def drawn(self, number: int) -> np.ndarray:
-        """theta (BLOCK, N) that a block has to hold."""
-        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
-        return np.asarray(self.prior.sample((BLOCK,), generator=torch.Generator().manual_seed(seed)).numpy())
 
 
 @lru_cache(maxsize=2)

@@ -148,7 +148,7 @@ def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Fou
 
 def _simulated(estimator: PriorSampling, cell: Cell, log: Log, folder: Path) -> float:
     """See that the simulations which the method shares with others are there; the CPU seconds that they took, here or before."""
-    simulations, clock = estimator._simulations(log.trajectories), _Clock()
+    simulations, clock = estimator.prior_simulations(log.trajectories), _Clock()
     clock.time(lambda: simulations.first(cell.budget))
     return bank.cost(folder, simulations.key) or clock.cpu_seconds
 

@@ -97,6 +97,18 @@ class Code(StrEnum):
     PRIOR_COUNTED_TWICE = auto()
     EXPORT = auto()
 
+    # amortised: methods that learn from simulations of the prior
+    INVALID_SIMULATIONS = auto()
+    STILL_IMPROVING = auto()
+    OTHER_EXPERIMENT = auto()
+    UNLIKE_SIMULATIONS = auto()
+    TRAINED_ANEW = auto()
+    ROUNDED_OUTPUTS = auto()
+    FEW_DIFFERENT_PROPOSALS = auto()
+    FEW_ACCEPTED = auto()
+    INVALID_NEAR_ESTIMATE = auto()
+
+
 
 @dataclass(frozen=True)
 class Text:
@@ -316,4 +328,67 @@ TEXTS: dict[Code, Text] = {
         "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow",
     ),
     Code.EXPORT: Text(_CAUTION, "{text}"),
+    # amortised: methods that learn from simulations of the prior
+    INVALID_SIMULATIONS = auto()
+    STILL_IMPROVING = auto()
+    OTHER_EXPERIMENT = auto()
+    UNLIKE_SIMULATIONS = auto()
+    TRAINED_ANEW = auto()
+    ROUNDED_OUTPUTS = auto()
+    FEW_DIFFERENT_PROPOSALS = auto()
+    FEW_ACCEPTED = auto()
+    INVALID_NEAR_ESTIMATE = auto()
+
+    REMARK = auto()  # until every sentence has a code of its own
+
+
+@dataclass(frozen=True)
+class Text:
+    """How severe a finding usually is, and its text with {places}."""
+
+    severity: Severity
+    template: str
+
+
+_NOTE, _CAUTION, _BLOCKING = Severity.NOTE, Severity.CAUTION, Severity.BLOCKING
+
+TEXTS: dict[Code, Text] = {
+    # any estimator
+    Code.BUDGET_SPENT: Text(_CAUTION, "the budget of {budget} rollouts ran out before the method had converged"),
+    Code.AT_BOUND: Text(
+        _CAUTION,
+        "{parameters} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals",
+    ),
+    # amortised: methods that learn from simulations of the prior
+    Code.INVALID_SIMULATIONS: Text(
+        _CAUTION, "{invalid} of {made} simulations {failure}, {place}; the others were used"
+    ),
+    Code.STILL_IMPROVING: Text(_CAUTION, "the training was still improving after {passes} {unit}; raise {argument}"),
+    Code.OTHER_EXPERIMENT: Text(
+        _BLOCKING,
+        "the log's {differs} differ from those that the simulations replayed: the posterior is that of another "
+        "experiment; fit again with this log",
+    ),
+    Code.UNLIKE_SIMULATIONS: Text(
+        _BLOCKING,
+        "the log is unlike every simulation: widen the bounds, or correct the model, before you trust the result",
+    ),
+    Code.TRAINED_ANEW: Text(
+        _NOTE, "the log's {differs} differ from what was learned before: simulated and trained anew"
+    ),
+    Code.ROUNDED_OUTPUTS: Text(
+        _CAUTION, "x{outputs} vary by {sd:.0e} only, as rounding does; give fn's outputs in smaller units"
+    ),
+    Code.FEW_DIFFERENT_PROPOSALS: Text(
+        _CAUTION,
+        "round {number} looks where the prior hardly goes: {different:.0%} of its theta are different ones; take fewer "
+        "rounds, or a larger ``truncated``",
+    ),
+    Code.FEW_ACCEPTED: Text(
+        _CAUTION, "only {accepted} simulations were accepted; raise the budget or the accepted fraction"
+    ),
+    Code.INVALID_NEAR_ESTIMATE: Text(
+        _CAUTION,
+        "{invalid} of {made} simulations near the estimate {failure}; the gradient steps took the others",
+    ),
 }

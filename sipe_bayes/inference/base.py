@@ -25,7 +25,7 @@ from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.core.validation import path, whole
+from sipe_bayes.core.validation import flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
@@ -162,6 +162,7 @@ class Estimator(ABC, Generic[S]):
         self.findings = Findings()
         self.diagnostics: dict[str, Any] = {}
         self._last: Snapshot[S] | None = None
+        self._run = ""  # fingerprint of the run that it belongs to
         self._bound: tuple[Trajectories, Windows] | None = None
         self._given = Given()
         self._observed: Trajectory | None = None
@@ -204,11 +205,13 @@ class Estimator(ABC, Generic[S]):
     @abstractmethod
     def posterior(self, state: S, trajectories: Trajectories) -> Posterior: ...
 
-    def fit(self, trajectories: Recorded) -> Posterior:
-        """Infer.
+    def fit(self, trajectories: Recorded, *, retrain: bool = False) -> Posterior:
+        """Infer. Afterwards ``rollouts`` is what this fit simulated, with what a checkpoint of it had counted.
 
         Args:
             trajectories: one or several, or an environment, which stands for its reference demonstrations.
+            retrain: begin from nothing: an amortised method forgets what it learned in earlier fits, and any method
+                replaces its checkpoint. Methods that learn nothing that lasts begin from nothing in every fit.
 
         Returns:
             The posterior given them.
@@ -221,9 +224,9 @@ class Estimator(ABC, Generic[S]):
         batch = self._given.stack(self._recorded(trajectories), anew=True)
         fingerprint = self._fingerprint(batch)
         self.findings, self.diagnostics, self.rollouts, self._bound = Findings(), {}, 0, None
-        self._last = last = None
-        if self.checkpoint is not None and self.checkpoint.exists():
-            last = load_state(self.checkpoint, Snapshot[self.state_type], fingerprint)  # type: ignore[name-defined]
+        last = None if flag("retrain", retrain) else self._resumed(batch, fingerprint)
+        self._last, self._run = None, fingerprint
+        if last is not None:
             self.go_on_from(last)
         saved = time.monotonic()
         try:
@@ -250,6 +253,7 @@ class Estimator(ABC, Generic[S]):
         """
         batch, last = self._given.stack(self._recorded(trajectories)), self._last
         if last is None:
+            self._run = self._fingerprint(batch)
             try:
                 last = self._keep(self.start(batch))
             except BudgetExhausted as error:
@@ -270,6 +274,12 @@ class Estimator(ABC, Generic[S]):
             )
         self.go_on_from(self._last)
         return self._finished(self._last.state, self._given.stack(self._recorded(trajectories)))
+
+    def _resumed(self, trajectories: Trajectories, fingerprint: str) -> Snapshot[S] | None:
+        """Where a fit goes on: at its checkpoint, if there is one; amortised methods also where an earlier fit ended."""
+        if self.checkpoint is None or not self.checkpoint.exists():
+            return None
+        return load_state(self.checkpoint, Snapshot[self.state_type], fingerprint)  # type: ignore[name-defined]
 
     def _finished(self, state: S, trajectories: Trajectories) -> Posterior:
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
@@ -381,6 +391,7 @@ class Estimator(ABC, Generic[S]):
         }
 
     def _fingerprint(self, trajectories: Trajectories) -> str:
+        """What tells runs apart: all settings, and the trajectories."""
         return hashlib.sha256(f"{self.settings()!r}{digest(trajectories)}".encode()).hexdigest()
 
 

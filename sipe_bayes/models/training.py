@@ -1,4 +1,4 @@
-"""Training small networks: seeded, early stopping on held-out rows, weights as flat arrays for an estimator's state."""
+"""Training small networks: seeded, early stopping on held-out rows, weights as arrays that a checkpoint takes."""
 
 from __future__ import annotations
 
@@ -7,48 +7,58 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from sipe_bayes.core.validation import at_least, positive, share, whole
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
 
 Loss = Callable[[Tensor], Tensor]
 """Losses (b,) of the rows (b,) whose indices are given."""
+Weights = dict[str, FloatArray]
+"""A network's weights and buffers by name, each in its own type."""
+
+_LONGEST_GRADIENT = 5.0  # norm beyond which a gradient is shortened, so that one odd batch undoes nothing
+_HELD_OUT_BATCH = 2000  # rows whose loss is taken at once, for memory alone
 
 
 @dataclass(frozen=True)
-class Training:
-    """batch rows a step, at most ``epochs`` passes; stops ``patience`` passes after the held-out loss was last better;
-    ``held_out`` share of the rows; learning rate of Adam, with weight decay."""
+class Training(Options):
+    """How a network is trained by ``train``."""
 
-    batch: int = 100
-    epochs: int = 500
-    patience: int = 20
-    held_out: float = 0.1
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("batch", "epochs", "patience"):
-            object.__setattr__(self, name, whole(name, getattr(self, name)))
-        object.__setattr__(self, "held_out", share("held_out", self.held_out))
-        object.__setattr__(self, "learning_rate", positive("learning_rate", self.learning_rate))
-        object.__setattr__(self, "weight_decay", at_least("weight_decay", self.weight_decay, 0))
+    batch: int = option(100, "rows in a step", least=1)
+    epochs: int = option(500, "passes over the rows at most", least=1)
+    patience: int = option(20, "passes without a better held-out loss that end it", least=1)
+    held_out: float = option(0.1, "share of the rows that is not trained on", above=0, below=1)
+    learning_rate: float = option(1e-3, "of Adam", above=0)
+    weight_decay: float = option(0.0, "of Adam", least=0)
 
 
 @dataclass(frozen=True)
-class Trained:
-    """Mean loss of the held-out rows, passes made, optimiser's steps, and whether it stopped by itself."""
+class TrainedNetwork:
+    """What a training leaves.
 
+    Attributes:
+        weights: of its best look at the held-out rows.
+        held_out_loss: mean loss of these then.
+        passes: epochs, or gradient steps, that were made.
+        converged: whether it ended by itself, not at its limit on passes.
+    """
+
+    weights: Weights
     held_out_loss: float
-    epochs: int
-    steps: int
+    passes: int
     converged: bool
 
 
 class EarlyStopping:
-    """Keeps a network's weights where its held-out loss was least. A look counts as better when it is lower by ``absolute`` and by
-    a share ``relative``; after ``patience`` looks that are not, it is time to stop."""
+    """Keeps a network's weights where its held-out loss was least.
+
+    Args:
+        network: what is trained.
+        patience: looks without a better loss, after which it is time to stop.
+        absolute: a better loss is lower by this much,
+        relative: and by this share.
+    """
 
     def __init__(self, network: nn.Module, patience: int, absolute: float = 0.0, relative: float = 0.0) -> None:
         self.network, self.patience, self.absolute, self.relative = network, patience, absolute, relative
@@ -63,9 +73,10 @@ class EarlyStopping:
             self.waited += 1
         return self.waited >= self.patience
 
-    def restore(self) -> None:
-        """Put the best weights back into the network."""
+    def finish(self, passes: int) -> TrainedNetwork:
+        """Put the best weights back into the network, and say how its training went."""
         self.network.load_state_dict(self._weights)
+        return TrainedNetwork(weights(self.network), float(self.best), passes, self.waited >= self.patience)
 
 
 def check_device(device: str) -> str:
@@ -84,42 +95,51 @@ def split(rows: int, share: float, generator: torch.Generator) -> tuple[Tensor, 
     return order[held:], order[:held]
 
 
-def train(network: nn.Module, loss: Loss, rows: int, settings: Training, generator: torch.Generator) -> Trained:
-    """Minimise the mean ``loss`` with Adam and leave the weights of the best held-out pass in ``network``."""
+def descend(optimiser: torch.optim.Optimizer, parameters: list[nn.Parameter], loss: Tensor) -> None:
+    """One step of the optimiser down the gradient of ``loss``, which is shortened where it is very long."""
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(parameters, _LONGEST_GRADIENT)
+    optimiser.step()
+
+
+def train(network: nn.Module, loss: Loss, rows: int, settings: Training, generator: torch.Generator) -> TrainedNetwork:
+    """Minimise a mean loss with Adam.
+
+    Args:
+        network: left with the weights of the best held-out pass.
+        loss: of rows, given their indices.
+        rows: how many there are.
+        settings: how.
+        generator: of what is held out and of the batches.
+
+    Returns:
+        How it went; ``passes`` are epochs.
+    """
     parameters = [p for p in network.parameters() if p.requires_grad]
     optimiser = torch.optim.Adam(parameters, settings.learning_rate, weight_decay=settings.weight_decay, foreach=True)
     inside, outside = split(rows, settings.held_out, generator)
-    stopping, steps = EarlyStopping(network, settings.patience, absolute=1e-4), 0
+    stopping = EarlyStopping(network, settings.patience, absolute=1e-4)
     for epoch in range(1, settings.epochs + 1):  # noqa: B007 (returned)
         shuffled = inside[torch.randperm(len(inside), generator=generator)]
         for chosen in shuffled.split(settings.batch):
-            optimiser.zero_grad(set_to_none=True)
-            loss(chosen).mean().backward()
-            torch.nn.utils.clip_grad_norm_(parameters, 5.0)
-            optimiser.step()
-            steps += 1
+            descend(optimiser, parameters, loss(chosen).mean())
         with torch.no_grad():
-            now = float(torch.cat([loss(part) for part in outside.split(2000)]).mean())
+            now = float(torch.cat([loss(part) for part in outside.split(_HELD_OUT_BATCH)]).mean())
         if stopping.stops(now):
             break
-    stopping.restore()
-    return Trained(stopping.best, epoch, steps, stopping.waited >= settings.patience)
+    return stopping.finish(epoch)
 
 
 def _copy(network: nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
 
 
-def weights(network: nn.Module) -> dict[str, NDArray[np.generic]]:
-    """The network's weights and buffers as arrays, names prefixed ``weight.``."""
-    return {f"weight.{name}": tensor.detach().cpu().numpy().copy() for name, tensor in network.state_dict().items()}
+def weights(network: nn.Module) -> Weights:
+    """The network's weights and buffers as arrays on the CPU."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in network.state_dict().items()}
 
 
-def restore(network: nn.Module, state: dict[str, object]) -> None:
+def restore(network: nn.Module, stored: Weights) -> None:
     """Put ``weights`` back."""
-    found = {
-        k.removeprefix("weight."): torch.from_numpy(v)
-        for k, v in state.items()
-        if isinstance(v, np.ndarray) and k.startswith("weight.")
-    }
-    network.load_state_dict(found)
+    network.load_state_dict({name: torch.from_numpy(array) for name, array in stored.items()})

@@ -1,229 +1,273 @@
 """Model-agnostic meta-learning: a regression that a few gradient steps adapt to where the estimate lies.
 
 C. Finn, P. Abbeel, S. Levine 2017, "Model-Agnostic Meta-Learning for Fast Adaptation of Deep Networks"
-(https://arxiv.org/abs/1703.03400), in the regression setting of the SiPE paper (Mehta, Handa, Fox, Ramos 2020, appendix): two
-hidden layers of 60 units map a control step (s, a, s') to theta; inner and outer rate 0.005; the outer gradient is taken
-through the inner step (second order). A task is a random theta. Its support are simulations near it, its query its own,
+(https://arxiv.org/abs/1703.03400), in the regression setting of the SiPE paper (Mehta, Handa, Fox, Ramos 2020,
+appendix): two hidden layers of 60 units map a control step (s, a, s') to theta; inner and outer rate 0.005; the outer
+gradient is taken through the inner step (second order). A task is a random theta. Its support are simulations near it,
+its query its own,
 
     w' = w - alpha grad L(w; support),    w <- w - beta grad sum_tasks L(w'; query),
 
 so that training rehearses what happens at test time: ``gradient_steps`` times, simulate a few theta near the present
-estimate, take one inner step on them, and estimate again from the recorded control steps. The answer is a Dirac.
+estimate, take one inner step on them, and estimate again from the recorded control steps. The answer is a Dirac. A
+second ``fit`` keeps what meta-training has learned and adapts to its own log.
 
-Deviations: the papers do not say what the data at test time are, since the recorded trajectory has no labels; simulations
-near the estimate give them. Neighbours in training are the nearest other simulations of the prior. The outer step is Adam's.
-Inputs are standardised; s' enters as s' - s; training stops when held-out tasks no longer improve.
+Deviations:
+
+- The papers do not say what the data at test time are, since the recorded trajectory has no labels; simulations near
+  the estimate give them. Neighbours in training are the nearest other simulations of the prior.
+- The outer step is Adam's.
+- Inputs are standardised; s' enters as s' - s; training stops when held-out tasks no longer improve.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Generator, Tensor, from_numpy, nn
 from torch.func import functional_call, grad, vmap
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.seeding import seed_integer
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.core.validation import positive, share, whole
-from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, recorded_steps
+from sipe_bayes.inference.amortised.prior_sampling import (
+    PriorSampling,
+    PriorSamplingOptions,
+    PriorSamplingState,
+    recorded_steps,
+)
 from sipe_bayes.inference.amortised.simulations import Simulations
+from sipe_bayes.inference.base import digest
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.models.training import EarlyStopping, check_device, restore, split, weights
+from sipe_bayes.models.training import (
+    EarlyStopping,
+    TrainedNetwork,
+    Weights,
+    check_device,
+    descend,
+    restore,
+    split,
+    weights,
+)
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 
-Weights = dict[str, Tensor]
+_BETTER = 1e-5  # by which a look's loss must be lower to count as better
+_LOOKED_AT = 100  # held-out tasks in a look, for time alone
+
+Tensors = dict[str, Tensor]
+TaskLoss = Callable[[Tensor, Tensor, Generator], Tensor]
 
 
-class MAML(PriorSampling):
-    """A Dirac; see the module's docstring.
+@dataclass(frozen=True)
+class MAMLOptions(PriorSamplingOptions):
+    """Options of ``MAML``."""
 
-    gradient_steps: at test time, 0 or more. neighbours: simulations that one of them takes, their theta drawn around the
-    estimate with sd ``spread`` of the range. hidden: units of both layers. learning_rate: of the inner and the outer loop.
-    tasks: in a meta-batch. steps_per_simulation: control steps that enter one gradient. iterations: outer steps at most. held_out:
-    share of the simulations; patience: looks at them, every ``look_every`` outer steps, without improvement. device: where
-    meta-training runs.
+    gradient_steps: int = option(5, "at test time", least=0)
+    neighbours: int = option(5, "simulations that one of them takes", least=1)
+    spread: float = option(0.1, "sd of their theta about the estimate", "of the range", above=0)
+    hidden: int = option(60, "units of both layers, as in the paper", least=1)
+    learning_rate: float = option(0.005, "of the inner and the outer loop, as in the paper", above=0)
+    tasks: int = option(10, "in a meta-batch", least=1)
+    steps_per_simulation: int = option(40, "that enter one gradient", "control steps", least=1)
+    iterations: int = option(1000, "outer steps at most", least=1)
+    held_out: float = option(0.1, "share of the simulations that is not trained on", above=0, below=1)
+    patience: int = option(8, "looks at those without improvement that end the training", least=1)
+    look_every: int = option(50, "between two looks", "outer steps", least=1)
+    device: str = option("cpu", "where meta-training runs")
+
+    def __post_init__(self) -> None:
+        """Check, also the device."""
+        super().__post_init__()
+        check_device(self.device)
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """Where test time has come to.
+
+    Attributes:
+        weights: of the network.
+        steps: gradient steps taken.
+        near: simulations near the estimate.
+        invalid: of these.
     """
 
-    name: ClassVar[str] = "maml"
-    amortised: ClassVar[bool] = False
+    weights: Weights
+    steps: int = 0
+    near: int = 0
+    invalid: int = 0
 
-    def __init__(
-        self,
-        simulator: Any,
-        *,
-        gradient_steps: int = 5,
-        neighbours: int = 5,
-        spread: float = 0.1,
-        hidden: int = 60,
-        learning_rate: float = 0.005,
-        tasks: int = 10,
-        steps_per_simulation: int = 40,
-        iterations: int = 1000,
-        held_out: float = 0.1,
-        patience: int = 8,
-        look_every: int = 50,
-        device: str = "cpu",
-        **settings: Any,
-    ) -> None:
-        super().__init__(simulator, **settings)
-        self.gradient_steps = whole("gradient_steps", gradient_steps, 0)
-        self.neighbours, self.spread = whole("neighbours", neighbours), positive("spread", spread)
-        self.hidden, self.learning_rate = whole("hidden", hidden), positive("learning_rate", learning_rate)
-        self.tasks = whole("tasks", tasks)
-        self.steps_per_simulation = whole("steps_per_simulation", steps_per_simulation)
-        self.iterations, self.held_out = whole("iterations", iterations), share("held_out", held_out)
-        self.patience, self.look_every = whole("patience", patience), whole("look_every", look_every)
-        self.device = check_device(device)
+
+@dataclass(frozen=True)
+class MAMLState(PriorSamplingState[TrainedNetwork]):
+    """How far a fit is. adapted: None before the first gradient step at test time."""
+
+    adapted: Adapted | None = None
+
+
+class MAML(PriorSampling[MAMLState, TrainedNetwork]):
+    """A Dirac; see the module's docstring."""
+
+    name: ClassVar[str] = "maml"
+    amortised: ClassVar[bool] = False  # it simulates for every log
+    options_type: ClassVar[type[Options]] = MAMLOptions
+    state_type: ClassVar = MAMLState
+    options: MAMLOptions
 
     @property
     def reserved(self) -> int:
-        return self.gradient_steps * self.neighbours
+        """Those that test time takes."""
+        return self.options.gradient_steps * self.options.neighbours
 
-    def settings(self) -> dict[str, Any]:
-        own = ("gradient_steps", "neighbours", "spread", "hidden", "learning_rate", "tasks", "iterations")
-        rest = ("steps_per_simulation", "held_out", "patience", "look_every", "device")
-        return {**super().settings(), **{name: getattr(self, name) for name in own + rest}}
-
-    def step(self, state: State, trajectories: Trajectories) -> State:
+    def step(self, state: MAMLState, trajectories: Trajectories) -> MAMLState:
         """A block of simulations, the meta-training, or one gradient step at test time."""
-        if not state["trained"]:
-            state = super().step(state, trajectories)
-            return {**state, "adapted": 0, "done": state["trained"] and not self.gradient_steps}
-        return self._adapted(state, trajectories)
+        if state.learned is not None:
+            return self._adapt(state, trajectories)
+        state = super().step(state, trajectories)
+        return replace(state, done=state.learned is not None and not self.options.gradient_steps)
 
-    def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
-        seed = int(np.random.SeedSequence([self.seed, 3]).generate_state(1)[0])
-        generator = torch.Generator().manual_seed(seed)
-        steps = torch.from_numpy(control_steps(simulations.observations, trajectories.actions, trajectories.length))
+    def recall(self, state: MAMLState, trajectories: Trajectories) -> MAMLState:
+        """After meta-training, before test time."""
+        return replace(state, log=digest(trajectories), adapted=None, done=not self.options.gradient_steps)
+
+    def train(self, simulations: Simulations, trajectories: Trajectories) -> TrainedNetwork:
+        """Meta-training; ``passes`` are outer steps."""
+        options, seed = self.options, seed_integer([self.seed, 3])
+        generator = Generator().manual_seed(seed)
+        steps = from_numpy(control_steps(simulations.observations, trajectories.actions, trajectories.length))
         theta = torch.tensor(simulations.theta, dtype=torch.float32)
         network = self._network(steps.shape[-1], seed)
         network.standardise.fit(steps)
         network.begin_at(theta.mean(0))
-        network.to(self.device)
+        network.to(options.device)
         with torch.no_grad():
-            inputs = network.standardise(steps.to(self.device)).nan_to_num()
-        good, targets = steps.isfinite().all(-1).float().to(self.device), theta.to(self.device)
+            inputs = network.standardise(steps.to(options.device)).nan_to_num()
+        good, targets = steps.isfinite().all(-1).float().to(options.device), theta.to(options.device)
         loss = self._meta_loss(network, inputs, targets, good)
-        inside, outside = split(len(theta), self.held_out, generator)
+        inside, outside = split(len(theta), options.held_out, generator)
         parameters = list(network.parameters())
-        optimiser = torch.optim.Adam(parameters, self.learning_rate, foreach=True)
-        stopping = EarlyStopping(network, self.patience, absolute=1e-5)
-        for k in range(1, self.iterations + 1):
-            chosen = inside[torch.randint(len(inside), (self.tasks,), generator=generator)]
-            optimiser.zero_grad(set_to_none=True)
-            loss(chosen, inside, generator).mean().backward()
-            torch.nn.utils.clip_grad_norm_(parameters, 5.0)
-            optimiser.step()
-            if k % self.look_every and k < self.iterations:
+        optimiser = torch.optim.Adam(parameters, options.learning_rate, foreach=True)
+        stopping = EarlyStopping(network, options.patience, absolute=_BETTER)
+        for k in range(1, options.iterations + 1):
+            # an outer step on a meta-batch
+            chosen = inside[torch.randint(len(inside), (options.tasks,), generator=generator)]
+            descend(optimiser, parameters, loss(chosen, inside, generator).mean())
+            # a look at the held-out tasks, always with the same draws
+            if k % options.look_every and k < options.iterations:
                 continue
-            fixed = torch.Generator().manual_seed(seed)
-            now = float(loss(outside[:100], inside, fixed).mean().detach())
-            if stopping.stops(now):
+            fixed = Generator().manual_seed(seed)
+            if stopping.stops(float(loss(outside[:_LOOKED_AT], inside, fixed).mean().detach())):
                 break
-        stopping.restore()
-        converged = stopping.waited >= self.patience
-        self.still_improving(converged, k, "iterations", "iterations")
-        return {
-            **weights(network),
-            "held_out_loss": float(stopping.best),
-            "iterations": k,
-            "converged": converged,
-            "near": 0,
-            "near_invalid": 0,
-        }
+        trained = stopping.finish(k)
+        self.still_improving(trained.converged, k, "iterations", "iterations")
+        return trained
 
-    def _meta_loss(self, network: _Regressor, inputs: Tensor, theta: Tensor, good: Tensor) -> Any:
-        """A function of tasks (t,), the rows their neighbours come from, and a generator: query losses (t,) after the inner
-        step."""
+    def _meta_loss(self, network: Regressor, inputs: Tensor, theta: Tensor, good: Tensor) -> TaskLoss:
+        """Query losses (t,) after the inner step, of tasks (t,), the rows that neighbours come from, and a generator."""
+        options = self.options
 
-        def inner(weights: Weights, steps: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        def inner(weights: Tensors, steps: Tensor, target: Tensor, weight: Tensor) -> Tensor:
             error = (functional_call(network, weights, (steps,)) - target[:, None]).square().mean(-1)
             return (error * weight).sum() / weight.sum().clamp_min(1)
 
-        def adapted_loss(weights: Weights, support: tuple[Tensor, ...], query: tuple[Tensor, ...]) -> Tensor:
+        def adapted_loss(weights: Tensors, support: tuple[Tensor, ...], query: tuple[Tensor, ...]) -> Tensor:
             gradient = grad(inner)(weights, *support)
-            moved = {name: w - self.learning_rate * gradient[name] for name, w in weights.items()}
+            moved = {name: w - options.learning_rate * gradient[name] for name, w in weights.items()}
             return inner(moved, *query)
 
         batched = vmap(adapted_loss, in_dims=(None, 0, 0))
 
-        def loss(tasks: Tensor, pool: Tensor, generator: torch.Generator) -> Tensor:
+        def loss(tasks: Tensor, pool: Tensor, generator: Generator) -> Tensor:
+            # the nearest others in the pool
             distance = torch.cdist(theta[tasks], theta[pool])
             distance = distance + (tasks[:, None] == pool).to(distance) * 1e6
-            near = pool[distance.topk(min(self.neighbours, len(pool) - 1), largest=False).indices.cpu()]
-            picked = torch.randint(
-                inputs.shape[1], (min(self.steps_per_simulation, inputs.shape[1]),), generator=generator
-            )
+            near = pool[distance.topk(min(options.neighbours, len(pool) - 1), largest=False).indices.cpu()]
+            # some of the control steps, the same ones of all
+            count = min(options.steps_per_simulation, inputs.shape[1])
+            picked = torch.randint(inputs.shape[1], (count,), generator=generator)
             support = (inputs[near][:, :, picked], theta[near], good[near][:, :, picked])
             query = (inputs[tasks][:, None, picked], theta[tasks][:, None], good[tasks][:, None, picked])
             return batched(dict(network.named_parameters()), support, query)
 
         return loss
 
-    def _adapted(self, state: State, trajectories: Trajectories) -> State:
+    def _adapt(self, state: MAMLState, trajectories: Trajectories) -> MAMLState:
         """One gradient step on simulations near the estimate; raises BudgetExhausted."""
-        if self.rollouts + self.neighbours * len(trajectories) > self.budget:
-            raise BudgetExhausted(
-                f"{self.neighbours} simulations near the estimate are not left of {self.budget} rollouts"
-            )
+        options, count = self.options, self.options.neighbours
+        if self.rollouts + count * len(trajectories) > self.budget:
+            raise BudgetExhausted(f"{count} simulations near the estimate are not left of {self.budget} rollouts")
+        before = self._adapted(state)
         steps = recorded_steps(trajectories)
-        network = self._network(steps.shape[-1], 0)
-        restore(network, state)
-        rng = np.random.default_rng([self.seed, 4, state["adapted"]])
-        theta = np.clip(
-            self._estimate(network, steps) + self.spread * rng.standard_normal((self.neighbours, self.n)), 0, 1
-        )
-        made = self.simulate(theta, trajectories, rng)
-        self.rollouts += self.neighbours * len(trajectories)
-        if made.valid.any():
-            inputs = torch.from_numpy(
-                control_steps(made.observations[made.valid], trajectories.actions, trajectories.length)
-            )
-            targets = torch.tensor(made.theta[made.valid], dtype=torch.float32)[:, None].expand(-1, inputs.shape[1], -1)
+        network = self._restored(before, steps)
+        # simulations about the estimate
+        rng = np.random.default_rng([self.seed, 4, before.steps])
+        around = options.spread * rng.standard_normal((count, len(self.space)))
+        made = self.simulate(np.clip(_estimate(network, steps) + around, 0, 1), trajectories, rng)
+        self.rollouts += count * len(trajectories)
+        # one step down their gradient
+        usable = made.usable()
+        if len(usable):
+            inputs = from_numpy(control_steps(usable.observations, trajectories.actions, trajectories.length))
+            targets = torch.tensor(usable.theta, dtype=torch.float32)[:, None].expand(-1, inputs.shape[1], -1)
             good = inputs.isfinite().all(-1)
             error = (network(network.standardise(inputs[good])) - targets[good]).square().mean()
             parameters = list(network.parameters())
             for parameter, slope in zip(parameters, torch.autograd.grad(error, parameters), strict=True):
-                parameter.data.sub_(self.learning_rate * slope)
-        adapted = state["adapted"] + 1
-        near = {"near": state["near"] + len(made), "near_invalid": state["near_invalid"] + int((~made.valid).sum())}
-        return {**state, **weights(network), **near, "adapted": adapted, "done": adapted == self.gradient_steps}
+                parameter.data.sub_(options.learning_rate * slope)
+        near, invalid = before.near + count, before.invalid + count - len(usable)
+        adapted = Adapted(weights(network), before.steps + 1, near, invalid)
+        return replace(state, adapted=adapted, done=adapted.steps == options.gradient_steps)
 
-    def infer(self, state: State, trajectories: Trajectories) -> Dirac:
+    def posterior(self, state: MAMLState, trajectories: Trajectories) -> Dirac:
+        """As the base's, of the network as it is adapted so far."""
+        adapted = state.adapted
+        if adapted is not None and state.learned is not None:
+            now = replace(state.learned, content=replace(state.learned.content, weights=adapted.weights))
+            state = replace(state, learned=now)
+        estimate = super().posterior(state, trajectories)
+        near, invalid = (0, 0) if adapted is None else (adapted.near, adapted.invalid)
+        self.diagnostics.update(near=near, near_invalid=invalid)
+        if invalid:
+            failure = self.simulator.failure
+            self.find(Code.INVALID_NEAR_ESTIMATE, invalid=invalid, made=near, failure=failure)
+        assert isinstance(estimate, Dirac)  # as infer makes it
+        return estimate
+
+    def infer(self, learned: TrainedNetwork, trajectories: Trajectories) -> Dirac:
+        """The network's estimate."""
         steps = recorded_steps(trajectories)
+        self.diagnostics.update(
+            held_out_loss=learned.held_out_loss, iterations=learned.passes, converged=learned.converged
+        )
+        return Dirac(_estimate(self._restored(Adapted(learned.weights), steps), steps), self.space)
+
+    def _adapted(self, state: MAMLState) -> Adapted:
+        """Where test time has come to, also before its first step."""
+        if state.adapted is not None:
+            return state.adapted
+        assert state.learned is not None  # meta-training comes first
+        return Adapted(state.learned.content.weights)
+
+    def _restored(self, adapted: Adapted, steps: Tensor) -> Regressor:
         network = self._network(steps.shape[-1], 0)
-        restore(network, state)
-        told = ("held_out_loss", "iterations", "converged", "near", "near_invalid")
-        self.diagnostics.update({name: state[name] for name in told})
-        if state["near_invalid"]:
-            self.warn(
-                f"{state['near_invalid']} of {state['near']} simulations near the estimate {self.simulator.failure}; the "
-                "gradient steps took the others"
-            )
-        return Dirac(self._estimate(network, steps), self.space)
+        restore(network, adapted.weights)
+        return network
 
-    @property
-    def n(self) -> int:
-        """N."""
-        return len(self.space)
-
-    def _estimate(self, network: _Regressor, steps: Tensor) -> NDArray[np.float64]:
-        with torch.no_grad():
-            mean: NDArray[np.float64] = network(network.standardise(steps)).double().mean(0).numpy()
-        return np.clip(mean, 0, 1)
-
-    def _network(self, features: int, seed: int) -> _Regressor:
+    def _network(self, features: int, seed: int) -> Regressor:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            return _Regressor(features, self.hidden, self.n)
+            return Regressor(features, self.options.hidden, len(self.space))
 
 
-class _Regressor(nn.Module):
-    """Standardised control steps (..., F) to theta (..., N)."""
+class Regressor(nn.Module):
+    """Standardised control steps (..., F) to theta (..., N): two hidden layers."""
 
     def __init__(self, features: int, hidden: int, n: int) -> None:
         super().__init__()
@@ -240,5 +284,13 @@ class _Regressor(nn.Module):
             last.bias.copy_(theta)  # type: ignore[operator]
 
     def forward(self, steps: Tensor) -> Tensor:
+        """theta (..., N) of steps (..., F)."""
         out: Tensor = self.layers(steps)
         return out
+
+
+def _estimate(network: Regressor, steps: Tensor) -> FloatArray:
+    """Mean (N,) over recorded control steps (M, F), in the cube."""
+    with torch.no_grad():
+        mean: FloatArray = network(network.standardise(steps)).double().mean(0).numpy()
+    return np.clip(mean, 0, 1)

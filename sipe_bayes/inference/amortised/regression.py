@@ -1,108 +1,111 @@
 """Linear regression of theta on single control steps, by stochastic gradient: the SiPE paper's baseline.
 
-B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", section 2.3 and appendix: a single
-layer maps each concatenated (s, a, s') to theta; mean squared error, plain stochastic gradient, learning rate 0.001, batch 320.
-The estimate is the average over the recorded control steps: a Dirac.
+B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", section 2.3 and appendix:
+a single layer maps each concatenated (s, a, s') to theta; mean squared error, plain stochastic gradient, learning rate
+0.001, batch 320. The estimate is the average over the recorded control steps: a Dirac.
 
-Deviations: s' enters as s' - s, and inputs x (F,) with mean m and covariance C = V diag(l) V' enter as z = diag(l)^-1/2 V' (x - m).
-The linear maps are the same ones, but the time of plain gradient descent goes as 1 / l, and half-cheetah's standardised inputs have l
-from 5 to 7e-4: its error is half-way from the prior mean's to least squares' after 10^5 steps, on z there after 10^4. At most 200
-control steps of each simulation are used, spread evenly; training stops when held-out simulations no longer improve; the average is
-clipped to the cube.
+Deviations:
+
+- s' enters as s' - s, and inputs x (F,) with mean m and covariance C = V diag(l) V' enter as
+  z = diag(l)^-1/2 V' (x - m). The linear maps are the same ones, but the time of plain gradient descent goes as 1 / l,
+  and half-cheetah's standardised inputs have l from 5 to 7e-4: its error is half-way from the prior mean's to least
+  squares' after 10^5 steps, on z there after 10^4.
+- At most 200 control steps of each simulation are used, spread evenly.
+- Training stops when held-out simulations no longer improve.
+- The average is clipped to the cube.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
-from torch import nn
+from torch import Generator, Tensor, from_numpy, nn
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.core.validation import positive, share, whole
-from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, recorded_steps
+from sipe_bayes.inference.amortised.prior_sampling import (
+    PriorSampling,
+    PriorSamplingOptions,
+    PriorSamplingState,
+    recorded_steps,
+)
 from sipe_bayes.inference.amortised.simulations import Simulations
-from sipe_bayes.models.training import EarlyStopping, restore, split, weights
+from sipe_bayes.models.training import EarlyStopping, TrainedNetwork, restore, split
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 
-_LOOK = 500  # steps at least between two looks at the held-out simulations
-_RELATIVE, _ABSOLUTE = 1e-4, 1e-8  # by which a look's loss must be lower
+_LOOK = 500  # steps at least between two looks at the held-out simulations, for time alone
+_RELATIVE, _ABSOLUTE = 1e-4, 1e-8  # by which a look's loss must be lower to count as better
 _FLAT = 1e-8  # of the largest variance: what float32's rounding leaves of none
-_ROWS = 20_000  # whose covariance is taken at once
+_ROWS = 20_000  # whose covariance is taken at once, for memory alone
 
 
-class Regression(PriorSampling):
-    """A Dirac; see the module's docstring.
+@dataclass(frozen=True)
+class RegressionOptions(PriorSamplingOptions):
+    """Options of ``Regression``."""
 
-    learning_rate, batch: of the stochastic gradient, in control steps. iterations: gradient steps at most. held_out: share of the
-    simulations; patience: looks at them, one pass or 500 steps apart, without a lower loss.
-    """
+    learning_rate: float = option(1e-3, "of the stochastic gradient, as in the paper", above=0)
+    batch: int = option(320, "of the stochastic gradient, as in the paper", "control steps", least=1)
+    iterations: int = option(1_000_000, "gradient steps at most", least=1)
+    held_out: float = option(0.1, "share of the simulations that is not trained on", above=0, below=1)
+    patience: int = option(5, "looks at those, one pass or 500 steps apart, without a lower loss", least=1)
+
+
+class Regression(PriorSampling[PriorSamplingState[TrainedNetwork], TrainedNetwork]):
+    """A Dirac; see the module's docstring."""
 
     name: ClassVar[str] = "regression"
+    options_type: ClassVar[type[Options]] = RegressionOptions
+    state_type: ClassVar = PriorSamplingState[TrainedNetwork]
+    options: RegressionOptions
 
-    def __init__(
-        self,
-        simulator: Any,
-        *,
-        learning_rate: float = 1e-3,
-        batch: int = 320,
-        iterations: int = 1_000_000,
-        held_out: float = 0.1,
-        patience: int = 5,
-        **settings: Any,
-    ) -> None:
-        super().__init__(simulator, **settings)
-        self.learning_rate = positive("learning_rate", learning_rate)
-        self.batch, self.iterations = whole("batch", batch), whole("iterations", iterations)
-        self.held_out, self.patience = share("held_out", held_out), whole("patience", patience)
-
-    def settings(self) -> dict[str, Any]:
-        own = ("learning_rate", "batch", "iterations", "held_out", "patience")
-        return {**super().settings(), **{name: getattr(self, name) for name in own}}
-
-    def train(self, simulations: Simulations, trajectories: Trajectories) -> State:
-        generator = torch.Generator().manual_seed(self.seed)
-        steps = torch.from_numpy(control_steps(simulations.observations, trajectories.actions, trajectories.length))
+    def train(self, simulations: Simulations, trajectories: Trajectories) -> TrainedNetwork:
+        """The map, at its best look at the held-out simulations."""
+        options, generator = self.options, Generator().manual_seed(self.seed)
+        steps = from_numpy(control_steps(simulations.observations, trajectories.actions, trajectories.length))
         theta = torch.tensor(simulations.theta, dtype=torch.float32)
-        network = _Linear(steps.shape[-1], len(self.space))
-        inside, outside = split(len(theta), self.held_out, generator)
+        network = LinearMap(steps.shape[-1], len(self.space))
+        inside, outside = split(len(theta), options.held_out, generator)
         network.fit_inputs(steps[inside])
         network.bias.data.copy_(theta.mean(0))
         inputs, targets = _rows(network, steps[inside], theta[inside])
         held_inputs, held_targets = _rows(network, steps[outside], theta[outside])
-        stopping, taken, looked = EarlyStopping(network, self.patience, absolute=_ABSOLUTE, relative=_RELATIVE), 0, 0
-        while taken < self.iterations:
-            order = torch.randperm(len(inputs), generator=generator).split(self.batch)
-            for chosen in order[: self.iterations - taken]:
-                network.descend(inputs[chosen], targets[chosen], self.learning_rate)
-            taken += min(len(order), self.iterations - taken)
-            if taken < min(looked + _LOOK, self.iterations):
+        stopping, taken, looked = EarlyStopping(network, options.patience, _ABSOLUTE, _RELATIVE), 0, 0
+        while taken < options.iterations:
+            # a pass over the rows, or what is left of it
+            order = torch.randperm(len(inputs), generator=generator).split(options.batch)
+            for chosen in order[: options.iterations - taken]:
+                network.descend(inputs[chosen], targets[chosen], options.learning_rate)
+            taken += min(len(order), options.iterations - taken)
+            # a look at the held-out rows, where the last one is long enough ago
+            if taken < min(looked + _LOOK, options.iterations):
                 continue
             looked = taken
             if stopping.stops(float((network.map(held_inputs) - held_targets).square().mean().detach())):
                 break
-        stopping.restore()
-        converged = stopping.waited >= self.patience
-        self.still_improving(converged, taken, "gradient steps", "iterations, or learning_rate")
-        loss = float(stopping.best)
-        return {**weights(network), "held_out_loss": loss, "iterations": taken, "converged": converged}
+        trained = stopping.finish(taken)
+        self.still_improving(trained.converged, taken, "gradient steps", "iterations, or learning_rate")
+        return trained
 
-    def infer(self, state: State, trajectories: Trajectories) -> Dirac:
+    def infer(self, learned: TrainedNetwork, trajectories: Trajectories) -> Dirac:
+        """The average over the recorded control steps."""
         steps = recorded_steps(trajectories)
-        network = _Linear(steps.shape[-1], len(self.space))
-        restore(network, state)
+        network = LinearMap(steps.shape[-1], len(self.space))
+        restore(network, learned.weights)
         with torch.no_grad():
             estimate = network.map(network.inputs(steps)).double().mean(0)
-        self.diagnostics.update({name: state[name] for name in ("held_out_loss", "iterations", "converged")})
+        self.diagnostics.update(
+            held_out_loss=learned.held_out_loss, iterations=learned.passes, converged=learned.converged
+        )
         return Dirac(estimate.clamp(0, 1), self.space)
 
 
-class _Linear(nn.Module):
-    """Control steps (..., F) to theta (..., N)."""
+class LinearMap(nn.Module):
+    """Control steps (..., F), whitened, to theta (..., N)."""
 
-    whiten: torch.Tensor
+    whiten: Tensor
 
     def __init__(self, features: int, n: int) -> None:
         super().__init__()
@@ -111,7 +114,7 @@ class _Linear(nn.Module):
         self.slope = nn.Parameter(torch.zeros(features, n))
         self.bias = nn.Parameter(torch.zeros(n))
 
-    def fit_inputs(self, steps: torch.Tensor) -> None:
+    def fit_inputs(self, steps: Tensor) -> None:
         """Take mean and covariance from steps (..., F); directions in which they hardly vary become zero."""
         self.standardise.fit(steps)
         covariance = torch.zeros(self.whiten.shape, dtype=torch.float64)
@@ -122,22 +125,29 @@ class _Linear(nn.Module):
         scale = torch.where(variance > _FLAT * variance[-1], variance, torch.inf).rsqrt()
         self.whiten.copy_(axes * scale)
 
-    def inputs(self, steps: torch.Tensor) -> torch.Tensor:
+    def inputs(self, steps: Tensor) -> Tensor:
         """Control steps (..., F) as the map takes them."""
         return torch.as_tensor(self.standardise(steps) @ self.whiten)
 
     @torch.no_grad()
-    def descend(self, inputs: torch.Tensor, targets: torch.Tensor, rate: float) -> None:
-        """One step down the gradient of the mean squared error, written out: autograd would take most of the time."""
+    def descend(self, inputs: Tensor, targets: Tensor, rate: float) -> None:
+        """One step down the gradient of the mean squared error, written out: autograd would take most of the time.
+
+        Args:
+            inputs: (b, F), as ``inputs`` makes them.
+            targets: (b, N).
+            rate: of learning.
+        """
         slope = (self.map(inputs) - targets) * (-2 * rate / targets.numel())
         self.slope.data.addmm_(inputs.T, slope)
         self.bias.data.add_(slope.sum(0))
 
-    def map(self, inputs: torch.Tensor) -> torch.Tensor:
+    def map(self, inputs: Tensor) -> Tensor:
+        """theta (..., N) of inputs (..., F)."""
         return inputs @ self.slope + self.bias
 
 
-def _rows(network: _Linear, steps: torch.Tensor, theta: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _rows(network: LinearMap, steps: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
     """Finite control steps (m, F), whitened, and the theta (m, N) that each was simulated with."""
     good = steps.isfinite().all(-1)
     return network.inputs(steps[good]), theta[:, None].expand(-1, steps.shape[1], -1)[good]

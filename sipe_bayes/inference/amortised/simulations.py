@@ -1,30 +1,31 @@
 """Simulations drawn from the prior: one cache, shared by the estimators that learn from them.
 
 Row i of the cache depends on the seed and on i alone (rows come in blocks, each with its own generator), so a larger
-budget extends it, and a run that lost it makes the same rows again. On disk it is one folder for each content hash (model,
-parameters, prior, seed, actions, starts), one npz file for each block, written atomically. Simulations that diverged stay:
-they are counted, marked and described.
+budget extends it, and a run that lost it makes the same rows again. On disk it is one folder for each content hash
+(model, parameters, prior, seed, actions, starts, goals), one npz file for each block, written atomically. Simulations
+that diverged stay: they are counted, marked and described.
 """
 
 from __future__ import annotations
 
 import hashlib
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.stats
-import torch
 from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.posterior import Posterior
-
-FloatArray = NDArray[np.float64]
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
 
 BLOCK = 50  # rows; one file, one generator
 _SHIFTED = 1e-3  # p-value below which invalid simulations are said to lie elsewhere in the prior
@@ -32,28 +33,53 @@ _SHIFTED = 1e-3  # p-value below which invalid simulations are said to lie elsew
 
 @dataclass(frozen=True)
 class Simulations:
-    """theta (n, N), observations (n, R, T+1, O) float32 of R replayed trajectories, NaN from where one diverged and on its
-    padding, and valid (n,): whether all R are."""
+    """Simulations of R replayed trajectories each.
+
+    Attributes:
+        theta: (n, N).
+        observations: (n, R, T+1, O) float32, NaN from where one diverged and on its padding.
+        valid: (n,): whether all R of them are.
+    """
 
     theta: FloatArray
     observations: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    valid: BoolArray
 
     def __len__(self) -> int:
         return len(self.theta)
 
+    def __getitem__(self, rows: slice | BoolArray) -> Simulations:
+        return Simulations(self.theta[rows], self.observations[rows], self.valid[rows])
+
     def usable(self) -> Simulations:
         """The valid ones."""
-        return Simulations(self.theta[self.valid], self.observations[self.valid], self.valid[self.valid])
+        return self[self.valid]
+
+    @staticmethod
+    def joined(parts: Sequence[Simulations]) -> Simulations:
+        """Several, one after the other."""
+        return Simulations(
+            np.concatenate([part.theta for part in parts]),
+            np.concatenate([part.observations for part in parts]),
+            np.concatenate([part.valid for part in parts]),
+        )
 
 
 class Cache:
-    """Simulations of theta drawn from ``prior``, replaying R ``trajectories`` from ``starts`` (R, S); in memory, and in
-    ``folder`` if one is given."""
+    """Simulations of theta drawn from a prior, in memory and perhaps on disk.
+
+    Args:
+        simulator: what simulates.
+        prior: that theta comes from.
+        trajectories: R of them, whose actions are replayed.
+        starts: (R, S), states that they are replayed from.
+        seed: of the draws.
+        folder: kept there, in a folder of its own; None for memory alone.
+    """
 
     def __init__(
         self,
-        simulator: Any,
+        simulator: Simulator | CallableSimulator,
         prior: Posterior,
         trajectories: Trajectories,
         starts: FloatArray,
@@ -72,50 +98,43 @@ class Cache:
         plain = (self.simulator.checksum(), self.simulator.space.to_dict(), repr(self.prior), prior, self.seed)
         digest.update(repr((*plain, self.trajectories.names)).encode())
         arrays = (self.trajectories.actions, self.trajectories.dt, self.trajectories.length, self.starts)
-        for array in (
-            *arrays,
-            np.nan_to_num(self.trajectories.observations[:, 0]),
-        ):  # holds the goals, if there are any
+        goals = np.nan_to_num(self.trajectories.observations[:, 0])  # first samples hold them, if there are any
+        for array in (*arrays, goals):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:24]
 
     def first(self, count: int) -> Simulations:
         """The first ``count`` rows, simulating what is not there yet."""
-        for k in range((count + BLOCK - 1) // BLOCK):
+        blocks = (count + BLOCK - 1) // BLOCK
+        for k in range(blocks):
             want = min(BLOCK, count - k * BLOCK)
             if k == len(self._blocks):
                 self._blocks.append(self._read(k) or self._none())
             if len(self._blocks[k]) < want:
                 self._blocks[k] = self._extended(k, want)
-        parts = self._blocks[: (count + BLOCK - 1) // BLOCK]
-        theta, observations, valid = (
-            np.concatenate([getattr(part, name) for part in parts])[:count]
-            for name in ("theta", "observations", "valid")
-        )
-        return Simulations(theta, observations, valid)
+        return Simulations.joined(self._blocks[:blocks])[:count]
 
     def _none(self) -> Simulations:
-        shape = self.trajectories.observations.shape
-        n = len(self.simulator.space)
+        shape, n = self.trajectories.observations.shape, len(self.simulator.space)
         return Simulations(np.empty((0, n)), np.empty((0, *shape), np.float32), np.empty(0, bool))
+
+    def drawn(self, block: int) -> FloatArray:
+        """All theta (BLOCK, N) of a block."""
+        theta: FloatArray = self.prior.sample((BLOCK,), generator=torch_generator([self.seed, block])).numpy()
+        return theta
 
     def _extended(self, block: int, rows: int) -> Simulations:
         old = self._blocks[block]
-        generator = torch.Generator().manual_seed(int(np.random.SeedSequence([self.seed, block]).generate_state(1)[0]))
-        theta = self.prior.sample((BLOCK,), generator=generator).numpy()[len(old) : rows]
-        parts = (old, self.simulate(theta))
-        both = Simulations(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("theta", "observations", "valid"))
-        )
-        self._write(block, both)
-        return both
+        whole = Simulations.joined((old, self.simulate(self.drawn(block)[len(old) : rows])))
+        self._write(block, whole)
+        return whole
 
     def simulate(self, theta: FloatArray) -> Simulations:
         """Simulations of any theta (n, N), which are not kept."""
         motion = self.simulator.replay(theta, self.trajectories, self.starts)
         count = len(self.trajectories)
         inside = np.arange(motion.valid.shape[1]) <= motion.length[:, None]
-        valid = (motion.valid | ~inside).reshape(len(theta), -1).all(1)
+        valid = np.asarray((motion.valid | ~inside).reshape(len(theta), -1).all(1))
         seen = np.where(motion.valid[..., None], motion.observations, np.nan).astype(np.float32)
         return Simulations(theta, seen.reshape(len(theta), count, *seen.shape[1:]), valid)
 
@@ -136,16 +155,11 @@ class Cache:
             return None
 
 
-def describe_invalid(simulations: Simulations, space: ParameterSpace, failure: str = "diverged") -> str | None:
-    """A sentence on how many simulations diverged, or what else their ``failure`` was, and where in the prior they lie; None if none
-    did."""
-    bad = ~simulations.valid
-    if not bad.any():
-        return None
-    where = []
+def place_of_invalid(simulations: Simulations, space: ParameterSpace) -> str:
+    """Where in the prior the invalid simulations lie, in words that end a sentence on them."""
+    bad, where = ~simulations.valid, []
     for j, name in enumerate(space.names):
         inside, outside = simulations.theta[~bad, j], simulations.theta[bad, j]
         if len(inside) and scipy.stats.mannwhitneyu(inside, outside).pvalue < _SHIFTED:
             where.append(f"{'high' if np.median(outside) > np.median(inside) else 'low'} {name}")
-    place = f", mostly at {' and '.join(where)}" if where else ", all over the prior"
-    return f"{int(bad.sum())} of {len(bad)} simulations {failure}{place}; the others were used"
+    return f"mostly at {' and '.join(where)}" if where else "all over the prior"

@@ -89,9 +89,9 @@ class Search(Estimator[P]):
     uncertain: ClassVar[bool] = False
     begins_with_prior: ClassVar[bool] = True
 
-    def fit(self, trajectories: Recorded) -> Posterior:
+    def fit(self, trajectories: Recorded, *, retrain: bool = False) -> Posterior:
         """As ``Estimator.fit``; a finding if a prior was given, of which a search makes little use."""
-        posterior = super().fit(trajectories)
+        posterior = super().fit(trajectories, retrain=retrain)
         if (self.prior.gaussian_moments()[1].diagonal() < 1).any():  # a uniform prior counts as enormously wide
             use = "uses the prior only to begin" if self.begins_with_prior else "does not use the prior"
             self.find(Code.PRIOR_HARDLY_USED, method=self.name, use=use)

@@ -1,0 +1,172 @@
+"""What a training depends on besides the estimator's settings: the experiment that its simulations replayed.
+
+Simulations replay the actions of the log in hand from its starts, with its noise and without the samples that it
+lacks. What they taught therefore holds for other logs of the same experiment, and for no others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
+
+_NEIGHBOURS = 20  # of the local outlier factor, as its authors advise at least
+_FIRST_SAMPLE_SDS = 3.0  # of the noise: how far from all simulated first samples a log may begin
+_NOISE_RATIO = 2.0  # by which estimates of one noise differ from log to log; velocities of 60 samples by 1.3
+_ROUNDING = 1e-5  # of a number, after float32
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment, with what of the log in hand its simulations took over.
+
+    Attributes:
+        actions: (R, T, A), as replayed.
+        length: (R,) control steps.
+        dt: (R,) seconds of one.
+        starts: starting states (R, S) where they were recorded, else (0, 0).
+        lowest, highest: (R, O), the range of the simulations' first samples.
+        goals: (R, G) of a task with goals, else (0, 0).
+        names: of the logs where a parameter belongs to one of them, else none.
+        measured: (R, T+1), whether all channels were.
+        noise: (O,), sd that the simulations got.
+    """
+
+    actions: FloatArray
+    length: IntArray
+    dt: FloatArray
+    starts: FloatArray
+    lowest: FloatArray
+    highest: FloatArray
+    goals: FloatArray
+    names: tuple[str, ...]
+    measured: BoolArray
+    noise: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        simulator: Simulator | CallableSimulator,
+        trajectories: Trajectories,
+        noise: FloatArray,
+        first: NDArray[np.floating],
+    ) -> Experiment:
+        """That of a log.
+
+        Args:
+            simulator: of it.
+            trajectories: R, the log in hand.
+            noise: (O,), sd.
+            first: (n, R, O), the simulations' first samples.
+        """
+        states, none = trajectories.states, np.empty((0, 0))
+        return cls(
+            np.asarray(trajectories.actions, float),
+            np.asarray(trajectories.length, np.int64),
+            np.asarray(trajectories.dt, float),
+            none if states is None else np.asarray(states[:, 0], float),
+            np.asarray(first.min(0), float),
+            np.asarray(first.max(0), float),
+            _goals(simulator, trajectories),
+            _names(simulator, trajectories),
+            measured(trajectories),
+            noise,
+        )
+
+    def other(self, trajectories: Trajectories, noise: FloatArray) -> str | None:
+        """What makes trajectories those of another experiment; None where nothing does.
+
+        Actions, lengths and seconds have to be equal. So have starting states where both are recorded; else the first
+        samples must lie within the simulated ones' range, give or take three sds of the ``noise`` (O,): velocities do
+        not show in them.
+        """
+        if not np.array_equal(self.length, trajectories.length):
+            return "number or lengths"
+        same_dt = np.allclose(self.dt, trajectories.dt, rtol=1e-9, atol=0)
+        if not (same_dt and np.allclose(self.actions, trajectories.actions, rtol=1e-9)):
+            return "actions"
+        if len(self.starts) and trajectories.states is not None:  # noise may have been added to what was observed
+            same = np.allclose(self.starts[:, 1:], trajectories.states[:, 0, 1:], rtol=1e-6, atol=1e-6)
+            return None if same else "starting states"
+        first, size = trajectories.observations[:, 0], np.maximum(np.abs(self.lowest), np.abs(self.highest))
+        slack = _FIRST_SAMPLE_SDS * noise + _ROUNDING * (1 + size)
+        return "starting states" if ((first < self.lowest - slack) | (first > self.highest + slack)).any() else None
+
+    def other_form(
+        self, simulator: Simulator | CallableSimulator, trajectories: Trajectories, noise: FloatArray
+    ) -> str | None:
+        """Why a training on this experiment is not one for these trajectories; None where it is.
+
+        They have the same form where ``other`` finds nothing, and goals, missing samples and, where a parameter
+        belongs to one of the logs, names are the same, and no channel's ``noise`` (O,) is more than twice the other's.
+        """
+        other = self.other(trajectories, noise)
+        if other is not None:
+            return other
+        goals = _goals(simulator, trajectories)
+        if goals.shape != self.goals.shape or not np.allclose(goals, self.goals, equal_nan=True):
+            return "goals"
+        if _names(simulator, trajectories) != self.names:
+            return "names"
+        if not np.array_equal(measured(trajectories), self.measured):
+            return "missing samples"
+        louder = (noise > _NOISE_RATIO * self.noise) | (self.noise > _NOISE_RATIO * noise)
+        return "noise" if louder.any() else None
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What tells a log from simulations: of n of them, statistics (n, F) and some of their samples as they are (n, K)."""
+
+    statistics: FloatArray
+    samples: FloatArray
+
+    def unlikeness(self, log: Looks) -> float:
+        """How far a log (n = 1) is from all simulations, the larger of ``outlier_factor`` of both looks."""
+        looks = ((self.statistics, log.statistics), (self.samples, log.samples))
+        return max(outlier_factor(seen, one[0]) for seen, one in looks)
+
+
+def outlier_factor(seen: FloatArray, log: FloatArray) -> float:
+    """Local outlier factor of a log among simulations, over the largest of the simulations' own.
+
+    M. Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers" (https://doi.org/10.1145/342009.335388).
+
+    Args:
+        seen: (n, F) of simulations.
+        log: (F,).
+
+    Returns:
+        Above 1 by chance once in n + 1 logs, of two looks twice as often; 0 where nothing varies.
+    """
+    from sklearn.neighbors import LocalOutlierFactor
+
+    sd = seen.std(0)
+    varies = sd > 1e-9 * (np.abs(seen).max(0) + 1e-30)
+    if not varies.any() or not np.isfinite(log).all():
+        return 0.0
+    scaled, point = seen[:, varies] / sd[varies], log[varies] / sd[varies]
+    factor = LocalOutlierFactor(min(_NEIGHBOURS, len(scaled) - 1), novelty=True).fit(scaled)
+    return float(-factor.score_samples(point[None])[0] / np.max(-factor.negative_outlier_factor_))
+
+
+def measured(trajectories: Trajectories) -> BoolArray:
+    """(R, T+1): samples of which all channels were measured."""
+    return np.asarray(np.isfinite(trajectories.observations).all(-1))
+
+
+def _goals(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
+    goals = None
+    if isinstance(simulator, Simulator):
+        goals = simulator.environment.recorded_goals(trajectories.observations[:, 0])
+    return np.empty((0, 0)) if goals is None else np.asarray(goals, float)
+
+
+def _names(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> tuple[str, ...]:
+    return tuple(trajectories.names) if any(p.log is not None for p in simulator.space) else ()
