@@ -97,7 +97,7 @@ def ours(seed: int, budget: int, seen: np.ndarray) -> tuple[list[Callable[[int],
     """A sampler for each observation, of one training, and its time."""
     npe, first = estimator(seed, budget), sipe.Trajectories.stack(log_of(seen[0]))
     state = npe.start(first)
-    while state["simulated"] < budget:
+    while state.simulated < budget:
         state = npe.step(state, first)
     began = time.process_time()
     state = npe.step(state, first)
@@ -123,7 +123,7 @@ def direct(seed: int, budget: int, seen: np.ndarray, density: str) -> tuple[list
     """As ``ours``, by sbi as its tutorial calls it, on the same simulations."""
     npe, first = estimator(seed, budget), sipe.Trajectories.stack(log_of(seen[0]))
     state = npe.start(first)
-    while state["simulated"] < budget:
+    while state.simulated < budget:
         state = npe.step(state, first)
     made = npe.simulations(state, first)
     theta = torch.tensor(SPACE.values(made.theta), dtype=torch.float32)

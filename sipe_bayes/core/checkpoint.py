@@ -108,9 +108,8 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
         return _restored(name, plain, _member([a for a in arguments if a is not type(None)], plain), arrays)
     whole = origin if dataclasses.is_dataclass(origin) else kind
     if dataclasses.is_dataclass(whole) and isinstance(whole, type):
-        hints = typing.get_type_hints(whole)
-        stands_for = dict(zip(getattr(whole, "__parameters__", ()), arguments, strict=False))
-        hints = {k: _filled_in(v, stands_for) for k, v in hints.items()}
+        stands_for = _type_variables(kind)
+        hints = {k: _filled_in(v, stands_for) for k, v in typing.get_type_hints(whole).items()}
         return whole(
             **{
                 f.name: _restored(f"{name}.{f.name}", plain[f.name], hints[f.name], arrays)
@@ -125,6 +124,16 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
     if origin is dict:
         return {k: _restored(f"{name}.{k}", v, arguments[1], arrays) for k, v in plain.items()}
     return plain
+
+
+def _type_variables(kind: Any) -> dict[Any, Any]:
+    """What a generic dataclass's type variables stand for, with those of the generic ones that it inherits from."""
+    whole = typing.get_origin(kind) or kind
+    stands_for = dict(zip(getattr(whole, "__parameters__", ()), typing.get_args(kind), strict=False))
+    for base in vars(whole).get("__orig_bases__", ()):
+        if dataclasses.is_dataclass(typing.get_origin(base)):
+            stands_for |= _type_variables(_filled_in(base, stands_for))
+    return stands_for
 
 
 def _filled_in(hint: Any, stands_for: dict[Any, Any]) -> Any:

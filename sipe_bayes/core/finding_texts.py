@@ -109,7 +109,6 @@ class Code(StrEnum):
     INVALID_NEAR_ESTIMATE = auto()
 
 
-
 @dataclass(frozen=True)
 class Text:
     """How severe a finding usually is, its text with {places}, and what a row of a table says of a parameter with it."""
@@ -328,37 +327,6 @@ TEXTS: dict[Code, Text] = {
         "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow",
     ),
     Code.EXPORT: Text(_CAUTION, "{text}"),
-    # amortised: methods that learn from simulations of the prior
-    INVALID_SIMULATIONS = auto()
-    STILL_IMPROVING = auto()
-    OTHER_EXPERIMENT = auto()
-    UNLIKE_SIMULATIONS = auto()
-    TRAINED_ANEW = auto()
-    ROUNDED_OUTPUTS = auto()
-    FEW_DIFFERENT_PROPOSALS = auto()
-    FEW_ACCEPTED = auto()
-    INVALID_NEAR_ESTIMATE = auto()
-
-    REMARK = auto()  # until every sentence has a code of its own
-
-
-@dataclass(frozen=True)
-class Text:
-    """How severe a finding usually is, and its text with {places}."""
-
-    severity: Severity
-    template: str
-
-
-_NOTE, _CAUTION, _BLOCKING = Severity.NOTE, Severity.CAUTION, Severity.BLOCKING
-
-TEXTS: dict[Code, Text] = {
-    # any estimator
-    Code.BUDGET_SPENT: Text(_CAUTION, "the budget of {budget} rollouts ran out before the method had converged"),
-    Code.AT_BOUND: Text(
-        _CAUTION,
-        "{parameters} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals",
-    ),
     # amortised: methods that learn from simulations of the prior
     Code.INVALID_SIMULATIONS: Text(
         _CAUTION, "{invalid} of {made} simulations {failure}, {place}; the others were used"

@@ -62,3 +62,22 @@ def log(
     motion = simulator.rollout(theta, actions, simulator.default_state(), dt=DT)
     noise = coloured(rng, steps + 1, sd, rho)[:, None]
     return Trajectory(motion.observations[0] + noise, actions, DT, name=name, channels=simulator.environment.channels)
+
+
+def repeated(
+    simulator: Simulator,
+    actions: np.ndarray,
+    angle: float = 0.0,
+    states: bool = False,
+    seed: int = 5,
+    sd: float = 0.01,
+) -> Trajectory:
+    """A log of another theta under given actions from a given angle."""
+    start = simulator.default_state()
+    start[1] = angle
+    motion = simulator.rollout(np.array([0.8, 0.3]), actions, start, dt=DT)
+    seen = motion.observations[0] + sd * np.random.default_rng(seed).standard_normal(motion.observations[0].shape)
+    assert motion.states is not None
+    return Trajectory(
+        seen, actions, DT, motion.states[0] if states else None, "repeated", simulator.environment.channels
+    )

@@ -109,7 +109,8 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
             if state.done:
                 return state
             wanted = most * (state.round + 1) // rounds - until
-            return replace(state, round=state.round + 1, proposed=self._propose(state, wanted, trajectories))
+            posterior = self.infer(state.learned.content, trajectories)  # type: ignore[union-attr]  # just trained
+            return replace(state, round=state.round + 1, proposed=self._propose(posterior, state.round, wanted))
         # within a round: a block of the prior's simulations, or of what was proposed
         count = min(BLOCK, until - state.simulated)
         if state.proposed is None:
@@ -137,17 +138,15 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
         self.judge(Simulations.joined((first, state.later)))
         return Simulations.joined((self._usable(first, trajectories), state.later.usable()))
 
-    def _propose(self, state: RoundsState[L], count: int, trajectories: Trajectories) -> FloatArray:
-        """``count`` theta (count, N) of the prior where the posterior has all but 1e-4 of its mass."""
-        assert state.learned is not None  # proposals follow a training
-        posterior = self.infer(state.learned.content, trajectories)
-        generator = torch_generator([self.seed, 3, state.round])
+    def _propose(self, posterior: Posterior, number: int, count: int) -> FloatArray:
+        """theta (count, N) of the prior where the posterior after round ``number`` has all but 1e-4 of its mass."""
+        generator = torch_generator([self.seed, 3, number])
         own = posterior.sample((_DENSITY_DRAWS,), generator=generator)
         threshold = posterior.log_prob(own).quantile(self.options.truncated)
         # draws of the prior, as far as they fall into the region
         tried = self.prior.sample((_PROPOSALS,), generator=generator)
         inside = tried[posterior.log_prob(tried) >= threshold]
-        self.diagnostics[f"truncated_prior_{state.round + 1}"] = len(inside) / _PROPOSALS
+        self.diagnostics[f"truncated_prior_{number + 1}"] = len(inside) / _PROPOSALS
         if len(inside) >= count and len(inside) > _RARE * _PROPOSALS:
             return inside[:count].numpy()
         # draws of the posterior, accepted with the prior's density
@@ -155,7 +154,7 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
         density = posterior.log_prob(own)
         log_weight = torch.where(density >= threshold, self.prior.log_prob(own) - density, -torch.inf)
         if not torch.isfinite(log_weight).any():
-            raise BudgetExhausted(f"the truncated prior of round {state.round + 1} is too small to draw theta from")
+            raise BudgetExhausted(f"the truncated prior of round {number + 1} is too small to draw theta from")
         weight = (log_weight - log_weight.max()).exp()
         accepted = own[torch.rand(len(own), dtype=torch.float64, generator=generator) < weight]
         if len(accepted) >= count:
@@ -163,5 +162,5 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
         # too few: with replacement, and a warning
         chosen = own[torch.multinomial(weight, count, replacement=True, generator=generator)]
         different = len(chosen.unique(dim=0)) / count
-        self.find(Code.FEW_DIFFERENT_PROPOSALS, number=state.round + 1, different=different)
+        self.find(Code.FEW_DIFFERENT_PROPOSALS, number=number + 1, different=different)
         return chosen.numpy()

@@ -109,8 +109,8 @@ def test_doubts_and_wrong_input() -> None:
     assert any("unlike every simulation" in w for w in method.warnings)
     assert any("only 5 simulations" in w for w in method.warnings)
     table: list[tuple[Any, str]] = [
-        (lambda: ABC(simulator, accepted=0.0), "accepted: expected a positive number"),
-        (lambda: ABC(simulator, accepted=1.5), "accepted: expected a fraction"),
+        (lambda: ABC(simulator, accepted=0.0), "accepted: expected a share above 0 and at most 1, got 0.0"),
+        (lambda: ABC(simulator, accepted=1.5), "accepted: expected a share above 0 and at most 1, got 1.5"),
         (
             lambda: ABC(simulator, budget=50, regression=True, likelihood=QUIET).fit(seen(0.4, 0.5)),
             "leave the regression",

@@ -9,7 +9,7 @@ from torch.func import functional_call
 import sipe_bayes as sipe
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.amortised.maml import MAML
+from sipe_bayes.inference.amortised.maml import MAML, _estimate
 from sipe_bayes.inference.amortised.prior_sampling import recorded_steps
 from sipe_bayes.models.training import restore
 from sipe_bayes.models.transitions import control_steps
@@ -39,7 +39,7 @@ def test_mamls_outer_gradient_goes_through_the_inner_step() -> None:
         return (out - theta[rows][:, None]).square().mean()
 
     inner = torch.autograd.grad(mean_square(parameters, near), list(parameters.values()), create_graph=True)
-    moved = {n: w - method.learning_rate * g for (n, w), g in zip(parameters.items(), inner, strict=True)}
+    moved = {n: w - method.options.learning_rate * g for (n, w), g in zip(parameters.items(), inner, strict=True)}
     plain = torch.autograd.grad(mean_square(moved, tasks), list(parameters.values()))
     for a, b in zip(outer, plain, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-7)
@@ -62,7 +62,7 @@ def trained(budget: int = 150) -> tuple[MAML, Counting, Trajectories]:
     simulator = Counting()
     method = MAML(simulator, budget=budget, **FORM["maml"])
     recorded = Trajectories.stack(log(simulator, TRUTH, 1, steps=60))
-    while method.state is None or not method.state["trained"]:
+    while method.state is None or method.state.learned is None:
         method.update_parameter_estimate(recorded)
     return method, simulator, recorded
 
@@ -74,9 +74,10 @@ def test_a_step_at_test_time_goes_down_the_gradient() -> None:
     assert state is not None
     steps = recorded_steps(recorded)
     network = method._network(steps.shape[-1], 0)
-    restore(network, state)
+    assert state.learned is not None
+    restore(network, state.learned.content.weights)
     rng = np.random.default_rng([method.seed, 4, 0])
-    theta = method._estimate(network, steps) + method.spread * rng.standard_normal((method.neighbours, 2))
+    theta = _estimate(network, steps) + method.options.spread * rng.standard_normal((method.options.neighbours, 2))
     made = method.simulate(np.clip(theta, 0, 1), recorded, rng)
     inputs = torch.from_numpy(control_steps(made.observations, recorded.actions, recorded.length))
     targets = torch.tensor(made.theta, dtype=torch.float32)[:, None]
@@ -86,8 +87,12 @@ def test_a_step_at_test_time_goes_down_the_gradient() -> None:
 
     before = float(loss().detach())
     slopes = torch.autograd.grad(loss(), list(network.parameters()))
-    expected = [p.detach() - method.learning_rate * g for p, g in zip(network.parameters(), slopes, strict=True)]
-    restore(network, method.step(state, recorded))
+    expected = [
+        p.detach() - method.options.learning_rate * g for p, g in zip(network.parameters(), slopes, strict=True)
+    ]
+    adapted = method.step(state, recorded).adapted
+    assert adapted is not None
+    restore(network, adapted.weights)
     for found, wanted in zip(network.parameters(), expected, strict=True):
         torch.testing.assert_close(found.detach(), wanted)
     assert float(loss().detach()) < before
@@ -102,7 +107,7 @@ def test_adapting_ends_where_the_budget_does() -> None:
         method.update_parameter_estimate(both)
     assert simulator.lanes == 20
     assert method.rollouts == 145
-    assert method.state["done"]
+    assert method.ended
     assert any("ran out" in w for w in method.warnings)
 
 

@@ -224,7 +224,7 @@ def test_wrong_input() -> None:
         (lambda: NPE(pendulum(), embedding="none", budget=50).fit(missing), "use 'transitions'"),
         (lambda: NPE(pendulum(), max_epochs=1, budget=50).fit(missing), "no control step"),
         (lambda: NPE(simulator, **{**TINY, "budget": 5}).fit(seen(0.4, 0.5)), "raise the budget"),
-        (lambda: trained.posterior(trained.state or {}, Trajectories.stack(longer)), "logs of one length only"),
+        (lambda: trained.posterior(trained.state, Trajectories.stack(longer)), "logs of one length only"),
     ]
     for call, words in table:
         with pytest.raises(ValueError, match=words):

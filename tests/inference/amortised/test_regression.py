@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.amortised.regression import Regression, _Linear
+from sipe_bayes.inference.amortised.regression import LinearMap, Regression
 from tests.problems.linear_map import MATRIX, SPACE, TRUTH
 
 
@@ -19,7 +19,7 @@ def fitted(unit: np.ndarray | float = 1.0, **settings: float) -> tuple[Regressio
 
 def test_regression_descends_the_gradient_of_autograd() -> None:
     torch.manual_seed(0)
-    network, inputs, targets = _Linear(3, 2), torch.randn(7, 3), torch.randn(7, 2)
+    network, inputs, targets = LinearMap(3, 2), torch.randn(7, 3), torch.randn(7, 2)
     slope, bias = torch.autograd.grad((network.map(inputs) - targets).square().mean(), list(network.parameters()))
     before = [p.detach().clone() for p in network.parameters()]
     network.descend(inputs, targets, 0.1)
@@ -47,7 +47,7 @@ def test_whitened_inputs_have_unit_covariance_and_no_flat_direction() -> None:
     steps = torch.randn(5000, 4, generator=rng) @ torch.randn(4, 4, generator=rng)
     steps = torch.cat([steps, steps[:, :1] + steps[:, 1:2], torch.ones(5000, 1)], 1)
     steps[7] = torch.nan
-    network = _Linear(6, 2)
+    network = LinearMap(6, 2)
     network.fit_inputs(steps)
     inputs = network.inputs(steps[steps.isfinite().all(1)]).double()
     covariance, expected = torch.cov(inputs.T), torch.tensor([0.0, 0, 1, 1, 1, 1], dtype=torch.float64).diag()
