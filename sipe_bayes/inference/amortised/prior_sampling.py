@@ -137,7 +137,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
     def infer(self, learned: L, trajectories: Trajectories) -> Posterior:
         """The posterior of the trajectories."""
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """As the base's, without the cache, which changes no result."""
         return {name: value for name, value in super().settings().items() if name != "cache"}
 
