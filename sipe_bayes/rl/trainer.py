@@ -133,8 +133,8 @@ class Trainer:
             "goals": lanes.goals,
             "observations": lanes.observations,
             "elapsed": lanes.elapsed,
-            "derived": lanes._derived,
-            "over": lanes._over,
+            "derived": lanes.derived,
+            "over": lanes.over,
         }
         return {f"lanes.{name}": value for name, value in found.items() if value is not None}
 

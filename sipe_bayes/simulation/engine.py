@@ -1,64 +1,79 @@
-"""Native runs of written models: open loop on ``mujoco.rollout``, control step by control step, or lane by lane.
+"""Native runs of written models: open loop on ``mujoco.rollout``, control step by control step, or on MjData itself.
 
-All three give the states of the samples, what an Environment derives from them, and which samples are sound. MuJoCo's own
-messages are held back meanwhile: nothing on the terminal, no MUJOCO_LOG.TXT.
+All three give the states of the samples, what an Environment derives from them, and which samples are valid. MuJoCo's
+own messages are held back meanwhile: nothing on the terminal, no MUJOCO_LOG.TXT.
 """
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.base import Environment
-from sipe_bayes.simulation import mjdata as by_lane
+from sipe_bayes.simulation import mjdata
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
-_TIME_TOLERANCE = 0.5  # of a physics step
+_TIME_TOLERANCE = 0.5  # of a physics step: a reset or a repeated sample is a whole one off
 _FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+_SHORT, _PIECES = 32, 4  # of so few physics steps a thread takes few pieces: to fetch more costs more than it balances
 HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
 
 
+class Motion(NamedTuple):
+    """What happened in B simulations of T control steps.
+
+    Args:
+        states: (B, T+1, S).
+        derived: (B, T+1, D), aligned as the environment has it, or None.
+        valid: (B, T+1), which samples are neither reset, repeated nor huge.
+    """
+
+    states: FloatArray
+    derived: FloatArray | None
+    valid: BoolArray
+
+
 class _Quiet:
-    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the
-    GIL."""
+    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the GIL."""
 
     def __init__(self) -> None:
         self._lock, self._inside, self._before = threading.Lock(), 0, mujoco.MjLogConfig.get()
 
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
+    def __enter__(self) -> None:
         with self._lock:
             if not self._inside:
                 self._before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
                 silent.logto_console = silent.logto_file = False
                 silent.set()
             self._inside += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._inside -= 1
-                if not self._inside:
-                    self._before.set()
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                self._before.set()
 
 
 quiet = _Quiet()
 
 
 class Engine:
-    """Runs models that are like ``model``, on native threads. physics_size: numbers of MuJoCo's full physics state."""
+    """Runs models that are like the environment's own, on native threads.
 
-    def __init__(self, environment: Environment, model: Any, num_threads: int) -> None:
-        self.environment, self.model = environment, model
+    Args:
+        environment: what is simulated.
+        model: its compiled model.
+        num_threads: native threads.
+    """
+
+    def __init__(self, environment: Environment, model: mujoco.MjModel, num_threads: int) -> None:
+        self.environment, self.model, self.num_threads = environment, model, num_threads
         self.physics_size = int(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._threads = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
@@ -67,30 +82,46 @@ class Engine:
     def derived_size(self) -> int:
         """D: the numbers of ``derived``, sensordata or MjData's own."""
         fields = self.environment.data_fields
-        return by_lane.fields_size(self._datas[0], fields) if fields else int(self.model.nsensordata)
+        return mjdata.fields_size(self._datas[0], fields) if fields else int(self.model.nsensordata)
+
+    @property
+    def reads_sensors(self) -> bool:
+        """Whether sensordata is wanted with the states."""
+        return self.environment.needs_derived or self.environment.stepwise
 
     def advance(
         self,
         skip: int,
-        models: list[Any],
+        models: Sequence[mujoco.MjModel],
         timesteps: FloatArray,
         actions: FloatArray,
         start: FloatArray,
         first: bool = True,
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """States (B, T+1, S), sensordata aligned as the environment has it (B, T+1, D) or None, and which samples
-        (B, T+1) are sound, of lanes with ``models`` and ``skip`` physics steps a control step. Without ``first`` the
-        derived quantities of sample 0 may be missing."""
-        with quiet():
+    ) -> Motion:
+        """Simulate T control steps of B simulations.
+
+        Args:
+            skip: physics steps of a control step.
+            models: one for each simulation.
+            timesteps: (B,) seconds of their physics steps.
+            actions: (B, T, A).
+            start: states (B, S) to begin at.
+            first: whether the derived quantities of sample 0 are wanted; without, they may be missing.
+        """
+        with quiet:
             if self.environment.data_fields:
-                return self._by_lane(skip, models, timesteps, actions, start, first)
+                return self._on_data(skip, models, timesteps, actions, start, first)
             run = self._stepwise if self.environment.stepwise else self._open_loop
             return run(skip, models, timesteps, actions, start)
 
     def _open_loop(
-        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """States (B, T+1, S), sensordata aligned with them (B, T+1, D) and which samples are sound."""
+        self,
+        skip: int,
+        models: Sequence[mujoco.MjModel],
+        timesteps: FloatArray,
+        actions: FloatArray,
+        start: FloatArray,
+    ) -> Motion:
         environment, horizon = self.environment, actions.shape[1]
         controls = np.repeat(environment.control(self.model, start, actions), skip, axis=1)
         # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one
@@ -106,74 +137,91 @@ class Engine:
             derived = sensors[:, ::skip][:, : horizon + 1]
         elif environment.needs_derived:
             derived = np.concatenate([sensors[:, :1], sensors[:, skip - 1 : horizon * skip : skip]], axis=1)
-        return states, derived, _sound(states, out, skip, timesteps[:, None], aligned)
+        return Motion(states, derived, _valid(states, out, skip, timesteps[:, None], aligned))
 
     def _stepwise(
-        self, skip: int, models: list[Any], timesteps: FloatArray, actions: FloatArray, start: FloatArray
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """The same for an environment whose control depends on the state."""
-        environment, horizon, own = self.environment, actions.shape[1], self.physics_size
+        self,
+        skip: int,
+        models: Sequence[mujoco.MjModel],
+        timesteps: FloatArray,
+        actions: FloatArray,
+        start: FloatArray,
+    ) -> Motion:
+        """For an environment whose control depends on the state."""
+        environment, horizon, size = self.environment, actions.shape[1], self.physics_size
         states = np.empty((len(start), horizon + 1, start.shape[1]))
         derived = np.empty((len(start), horizon + 1, self.model.nsensordata)) if environment.needs_derived else None
-        sound = np.ones((len(start), horizon + 1), bool)
+        valid = np.ones((len(start), horizon + 1), bool)
         states[:, 0] = start
         if derived is not None:
             derived[:, 0] = self.sensors(models, start)
-        sound[:, 0] = (np.abs(start) <= HUGE).all(1)
+        valid[:, 0] = (np.abs(start) <= HUGE).all(1)
         for t in range(horizon):
-            begin = np.ascontiguousarray(states[:, t, :own])
+            # hold the control for the physics steps of a control step
+            begin = np.ascontiguousarray(states[:, t, :size])
             control = environment.control(self.model, states[:, t], actions[:, t])
             out, _ = self._native(models, begin, np.repeat(control[:, None], skip, axis=1))
             ends = np.stack([begin, out[:, -1]], axis=1)
-            sound[:, t : t + 2] &= _sound(ends, out, skip, timesteps[:, None], False)
+            valid[:, t : t + 2] &= _valid(ends, out, skip, timesteps[:, None], False)
+            # what the environment edits afterwards, and what it remembers of the sensors
             after = environment.settle(self.model, out[:, -1])
             before = out[:, -2] if skip > 1 else begin
-            seen = self.sensors(models, environment.probe(self.model, before, after))
-            states[:, t + 1, :own], states[:, t + 1, own:] = after, environment.remember(seen)
+            sensors = self.sensors(models, environment.probe(self.model, before, after))
+            states[:, t + 1, :size], states[:, t + 1, size:] = after, environment.remember(sensors)
             if derived is not None:
-                derived[:, t + 1] = seen
-        return states, derived, sound
+                derived[:, t + 1] = sensors
+        return Motion(states, derived, valid)
 
-    def _by_lane(
+    def _on_data(
         self,
         skip: int,
-        models: list[Any],
+        models: Sequence[mujoco.MjModel],
         timesteps: FloatArray,
         actions: FloatArray,
         start: FloatArray,
         first: bool,
-    ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-        """The same for an environment that reads MjData itself."""
+    ) -> Motion:
+        """For an environment that reads MjData itself."""
         environment = self.environment
         controls = environment.control(self.model, start, actions)
-        states, derived, clean = by_lane.advance(
+        states, derived, clean = mjdata.advance(
             models, self._datas, environment.data_fields, skip, controls, start, first
         )
-        return states, derived, clean & _sound(states, states[:, 1:], 1, skip * timesteps[:, None], False)
+        valid = clean & _valid(states, states[:, 1:], 1, skip * timesteps[:, None], False)
+        return Motion(states, derived, valid)
 
-    def sensors(self, models: list[Any], states: FloatArray) -> FloatArray:
-        """Sensordata (B, D) of states (B, S), without control."""
+    def sensors(self, models: Sequence[mujoco.MjModel], states: FloatArray) -> FloatArray:
+        """What states hold for the sensors.
+
+        Args:
+            models: one for each of B simulations.
+            states: (B, S).
+
+        Returns:
+            Sensordata (B, D), without control.
+        """
         if self.environment.data_fields:
-            with quiet():
-                return by_lane.forward(models, self._datas, self.environment.data_fields, states)
+            with quiet:
+                return mjdata.forward(models, self._datas, self.environment.data_fields, states)
         width = mujoco.mj_stateSize(self.model, self.environment.control_spec)
         own = np.ascontiguousarray(states[:, : self.physics_size])
         flags = int(self.model.opt.disableflags)
         try:
             for model in models:
                 model.opt.disableflags = flags | _FORCES if self.environment.kinematic else flags
-            with quiet():
+            with quiet:
                 return np.asarray(self._native(models, own, np.zeros((len(states), 1, width)))[1][:, 0])
         finally:
             for model in models:
                 model.opt.disableflags = flags
 
-    def _native(self, models: list[Any], start: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (B, P, S) and sensordata (B, P, D) of physics steps with controls (B, P, U)."""
+    def _native(
+        self, models: Sequence[mujoco.MjModel], start: FloatArray, controls: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """States (B, P, S) and sensordata (B, P, D) of P physics steps, with controls (B, P, U)."""
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
-        read = self.environment.needs_derived or self.environment.stepwise
-        sensors = np.empty((batch, steps, self.model.nsensordata)) if read else None
+        sensors = np.empty((batch, steps, self.model.nsensordata)) if self.reads_sensors else None
         self._threads.rollout(
             models,
             self._datas,
@@ -184,22 +232,33 @@ class Engine:
             nstep=steps,
             state=out,
             sensordata=sensors,
+            chunk_size=math.ceil(batch / (_PIECES * self.num_threads)) if steps <= _SHORT else None,
         )
         return out, np.empty((batch, steps, 0)) if sensors is None else sensors
 
 
-def _sound(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:
-    """Which samples ``kept`` (B, T+1, S) of the physics steps ``out`` (B, P, S) are neither reset, repeated
-    nor huge; with ``derived`` the step that filled their sensordata must have been as well."""
+def _valid(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:
+    """Which samples are neither reset, repeated nor huge.
+
+    Args:
+        kept: the samples (B, T+1, S).
+        out: the physics steps (B, P, S) that they were taken of.
+        skip: physics steps of a control step.
+        timestep: (B, 1).
+        derived: whether the step that filled the samples' sensordata must have been valid too.
+    """
     count = kept.shape[1]
     expected = kept[:, :1, 0] + np.arange(count) * skip * timestep
-    sound = (np.abs(kept[..., 0] - expected) < _TIME_TOLERANCE * timestep) & (np.abs(kept) <= HUGE).all(-1)
+    valid = np.abs(kept[..., 0] - expected) < _TIME_TOLERANCE * timestep
+    size = np.abs(kept)
+    if not size.max() <= HUGE:  # NaN as well
+        valid &= (size <= HUGE).all(-1)
     after = out[:, ::skip][:, :count]  # the physics step that follows sample 0, 1, ...
-    sound &= _not_repeated(kept, after)
+    valid &= _not_repeated(kept, after)
     if derived:
-        sound &= np.abs(after[..., 0] - expected - timestep) < _TIME_TOLERANCE * timestep
-        sound &= _not_repeated(after, out[:, 1::skip])
-    return sound
+        valid &= np.abs(after[..., 0] - expected - timestep) < _TIME_TOLERANCE * timestep
+        valid &= _not_repeated(after, out[:, 1::skip])
+    return np.asarray(valid)
 
 
 def _not_repeated(states: FloatArray, following: FloatArray) -> BoolArray:

@@ -9,13 +9,14 @@ Seconds depend on the machine and on what else it does; ratios should not.
 from __future__ import annotations
 
 import argparse
+import cProfile
 import importlib.metadata
 import os
 import platform
+import pstats
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,9 @@ import mujoco.rollout
 import numpy as np
 import transfer
 
-import sipe_bayes.inference.laplace.estimator as laplace_module
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "simple_pendulum" / "calibrate.toml"
@@ -161,28 +160,29 @@ def rival(pairs: int) -> None:
         print(f"{name:<40}{error:>14.3f}{half:>17.3f}{inside:>9} of {5 * len(estimates)}")
 
 
-@contextmanager
-def stopwatch(table: dict[str, float], owner: Any, name: str, stage: str) -> Iterator[None]:
-    """Adds the seconds spent in ``owner.name`` to ``table[stage]``."""
-    inner = getattr(owner, name)
+STAGES = {  # stage: (file, function) pairs whose cumulative seconds it is; none of a stage calls another of it
+    "simulate": (("simulation/simulator.py", "rollout"),),
+    "noise": (("likelihood/noise.py", "estimate_noise"), ("likelihood/noise_spread.py", "noise_cloud")),
+}
 
-    def timed(*args: Any, **kwargs: Any) -> Any:
-        begin = time.perf_counter()
-        try:
-            return inner(*args, **kwargs)
-        finally:
-            table[stage] = table.get(stage, 0.0) + time.perf_counter() - begin
 
-    setattr(owner, name, timed)
-    try:
-        yield
-    finally:
-        setattr(owner, name, inner)
+def profiled(work: Callable[[], int]) -> tuple[dict[str, float], int]:
+    """Seconds of each of the ``STAGES`` and of the whole, and what ``work`` returned."""
+    profile = cProfile.Profile()
+    rollouts = profile.runcall(work)
+    stats: Any = pstats.Stats(profile)
+    table = dict.fromkeys((*STAGES, "total"), 0.0)
+    for (file, _, function), (*_, cumulative, _callers) in stats.stats.items():
+        for stage, places in STAGES.items():
+            if any(place in file.replace(os.sep, "/") and function == name for place, name in places):
+                table[stage] += cumulative
+    table["total"] = stats.total_tt
+    return table, rollouts
 
 
 def stages(pairs: int) -> None:
-    print("\nWhere a laplace fit spends its time (medians, seconds)")
-    print(f"{'problem':<34}{'simulate':>10}{'noise':>8}{'algebra':>9}{'total':>8}{'rollouts':>10}")
+    print("\nWhere a laplace fit spends its time, by a profile, which slows Python's share (medians, seconds)")
+    print(f"{'problem':<34}{'simulate':>10}{'noise':>8}{'other':>9}{'total':>8}{'rollouts':>10}")
     pendulum = prepare(PENDULUM)
     log = arm.arm_log(0)
     simulator = arm.arm_simulator()
@@ -193,18 +193,12 @@ def stages(pairs: int) -> None:
     for name, work in problems.items():
         rows = []
         for _ in range(pairs):
-            table: dict[str, float] = {}
-            with (
-                stopwatch(table, Windows, "predict", "simulate"),
-                stopwatch(table, laplace_module, "estimate_noise", "noise"),
-                stopwatch(table, laplace_module, "noise_cloud", "noise"),
-            ):
-                begin = time.perf_counter()
-                rollouts = work()
-                total = time.perf_counter() - begin
-            rows.append((table["simulate"], table["noise"], total - table["simulate"] - table["noise"], total))
-        a, b, c, d = np.median(rows, axis=0)
-        print(f"{name:<34}{a:>10.2f}{b:>8.2f}{c:>9.2f}{d:>8.2f}{rollouts:>10}")
+            table, rollouts = profiled(work)
+            if not all(table.values()):
+                raise RuntimeError(f"stages: nothing was measured of {[k for k, v in table.items() if not v]}")
+            rows.append((table["simulate"], table["noise"], table["total"]))
+        a, b, d = np.median(rows, axis=0)
+        print(f"{name:<34}{a:>10.2f}{b:>8.2f}{d - a - b:>9.2f}{d:>8.2f}{rollouts:>10}", flush=True)
 
 
 def _pendulum_fit(problem: Any) -> int:

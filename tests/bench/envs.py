@@ -61,7 +61,7 @@ def _found(file: str) -> str:
 
 
 def _load(file: str) -> Any:
-    with quiet(), warnings.catch_warnings():  # settotalmass is deprecated
+    with quiet, warnings.catch_warnings():  # settotalmass is deprecated
         warnings.simplefilter("ignore")
         return mujoco.MjModel.from_xml_path(file)
 
@@ -165,7 +165,7 @@ def _writing(lanes: Lanes) -> float:
     rng = np.random.default_rng()
     simulator, theta = lanes.simulator, rng.random(lanes.theta.shape)
     timesteps = np.full(LANES, simulator.model.opt.timestep)
-    pooled = seconds(lambda: simulator._models(theta, timesteps, [None] * LANES))
+    pooled = seconds(lambda: simulator.pool.take(theta, timesteps, [None] * LANES))
     simulator.reset(lanes.theta)
     assert simulator.episodes is not None
     set_theta = simulator.episodes.set_theta
@@ -197,7 +197,7 @@ def _against_async(lanes: Lanes, pairs: int, side_by_side: SideBySide) -> float:
 def _published(name: str) -> Any:
     """One of the 64, made in its own process."""
     settings = {"terminate_when_unhealthy": False} if name.startswith("Humanoid") else {}
-    with quiet(), warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
+    with quiet, warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
         warnings.simplefilter("ignore")
         if name.startswith("Adroit"):
             import gymnasium_robotics
@@ -221,7 +221,7 @@ class Reparsed(gymnasium.Env[np.ndarray, np.ndarray]):
         with tempfile.NamedTemporaryFile("wb", suffix=".xml") as file:
             tree.write(file)
             file.flush()
-            with quiet(), warnings.catch_warnings():
+            with quiet, warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self.env = gymnasium.make("HalfCheetah-v5", xml_file=file.name)
         return self.env.reset(seed=seed)

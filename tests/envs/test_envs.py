@@ -132,8 +132,8 @@ def test_one_step_windows_and_stepping_give_the_bits_of_a_rollout(task: Task, si
     episodes.states[:], episodes.observations[:] = case.start, whole.observations[:, 0]
     if episodes.goals is not None and case.goals is not None:
         episodes.goals[:] = case.goals
-    if episodes._derived is not None:
-        episodes._derived[:] = simulator.engine.sensors(episodes._models, case.start)
+    if episodes.derived is not None:
+        episodes.derived[:] = simulator.engine.sensors(episodes.models, case.start)
     for t in range(STEPS):
         lanes = len(case.theta)
         window = simulator.rollout(
@@ -146,7 +146,7 @@ def test_one_step_windows_and_stepping_give_the_bits_of_a_rollout(task: Task, si
         if not task.data_fields:  # the humanoid's first derived numbers are those of the state itself
             np.testing.assert_array_equal(window.rewards[:, 0], whole.rewards[:, t])
         step = simulator.step(case.actions[:, t])
-        going = ~step.terminated & ~episodes._over
+        going = ~step.terminated & ~episodes.over
         np.testing.assert_array_equal(episodes.states[going], whole.states[going, t + 1])
         np.testing.assert_array_equal(step.observations[going], whole.observations[going, t + 1])
         np.testing.assert_array_equal(step.rewards[going], whole.rewards[going, t])
@@ -226,7 +226,7 @@ def test_writing_leaves_nothing_behind(task: Task, simulator: Simulator) -> None
     theta = rng.random(len(task.space))
     fresh, used = simulator.written(theta), simulator.written(rng.random(len(task.space)))
     for values in (rng.random(len(task.space)), theta):
-        simulator._write_into(used, values, float(used.opt.timestep), None)
+        simulator.written(values, used)
     for name in dir(fresh):
         array = getattr(fresh, name)
         if isinstance(array, np.ndarray):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment
 from sipe_bayes.simulation.engine import Engine
-from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.simulation.simulator import Memory, Simulator
 
 FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 HORIZON = 24
@@ -199,11 +199,12 @@ def test_one_step_windows_make_the_whole_horizon(name: str) -> None:
 def test_many_chunks_are_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, theta, actions, starts = draw(CASES["arm"])
     whole = simulator.rollout(theta, actions, starts)
-    monkeypatch.setattr("sipe_bayes.simulation.simulator._POOL", 3 * mujoco.mj_sizeModel(simulator.model))
+    room = Memory(model_bytes=3 * mujoco.mj_sizeModel(simulator.model))
+    monkeypatch.setattr("sipe_bayes.simulation.simulator.MEMORY", room)
     small = Simulator(simulator.environment, 1)
     cut = small.rollout(theta, actions, starts)
     np.testing.assert_array_equal(cut.observations, whole.observations)
-    assert len(small._pool) == 3
+    assert len(small.pool.slots) == 3
 
 
 def test_single_rows_stand_for_all_lanes() -> None:
