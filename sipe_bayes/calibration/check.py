@@ -344,9 +344,9 @@ def study_of_config(
     """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs: autoregressive, or with a
     ``StateSpace`` white, and process noise."""
     from sipe_bayes.calibration.problem import method_of, prepare
-    from sipe_bayes.inference.recalibrated import fitted_noise
+    from sipe_bayes.inference.log_noise import fitted_noise
 
     problem = prepare(path, threads)
     method = method_of(problem, estimator, seed, budget)
-    noise, process, _ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
-    return Study(str(path), method, problem.train, noise, refits, seed, process)
+    fitted = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
+    return Study(str(path), method, problem.train, fitted.noise, refits, seed, fitted.process)

@@ -111,7 +111,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
 
     import numpy as np
 
-    from sipe_bayes.inference.recalibrated import fitted_noise
+    from sipe_bayes.inference.log_noise import fitted_noise
     from sipe_bayes.likelihood.noise import Noise
 
     channels = list(problem.simulator.environment.channels)
@@ -121,7 +121,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
         noise = json.loads(record.read_text(encoding="utf-8"))["noise"]
         if set(fitted) <= set(noise):
             return Noise(*(np.array([noise[c][what] for c in fitted]) for what in ("sd", "tau")))
-    every, *_ = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior)
+    every = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior).noise
     chosen = [channels.index(c) for c in fitted]
     return Noise(every.sd[chosen], every.tau[chosen])
 

@@ -15,11 +15,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
 from sipe_bayes.core.options import Options
@@ -27,6 +28,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
+from sipe_bayes.envs.task import Task
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
 from sipe_bayes.likelihood.windows import Windows
@@ -37,8 +39,19 @@ from sipe_bayes.simulation.simulator import Simulator
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
-Recorded = Trajectory | Iterable[Trajectory] | Trajectories | Any
-"""One or several trajectories, or an environment: a task's name, a Task, a Simulator of one, ``sipe.make(...)``."""
+
+
+class GymnasiumEnvironment(Protocol):
+    """What ``sipe.make`` returns, wrapped or not."""
+
+    @property
+    def unwrapped(self) -> object: ...
+
+
+Observed = FloatArray | Iterable[float]
+Recorded = Trajectory | Iterable[Trajectory] | Trajectories | Observed | str | Task | Simulator | GymnasiumEnvironment
+"""One or several trajectories, what a function was observed to give, or an environment: a task's name, a Task, a
+Simulator of one, ``sipe.make(...)``."""
 
 
 S = TypeVar("S", bound=Any)  # SearchState, once every method's state is a dataclass
@@ -295,7 +308,7 @@ class Estimator(ABC, Generic[S]):
             self.find(Code.AT_BOUND, parameters=at)
         return posterior
 
-    def _recorded(self, given: Recorded) -> Recorded:
+    def _recorded(self, given: Recorded) -> Any:
         """``given``, or the trajectory that an observed x (D,) of a CallableSimulator stands for."""
         if not isinstance(self.simulator, CallableSimulator) or isinstance(given, Trajectory | Trajectories):
             return given

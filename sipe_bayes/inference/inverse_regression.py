@@ -1,10 +1,14 @@
-"""A linear regression turned round: theta given one observed estimate, with the line known from R pairs (theta, estimate) alone.
+"""A linear regression turned round: theta given one observed estimate, the line known from R pairs of them alone.
 
-With estimate m = a + B theta + e, e ~ N(0, V), and the flat prior |V|^(-(N+1)/2), (a, B, V) have a matrix-normal inverse-Wishart
-posterior given the pairs. Each draw of it makes a normal in theta, weighted by its evidence N(m_0; a + B mu_0, V + B P_0^-1 B') under
-the prior N(mu_0, P_0^-1); together they are a mixture, whose tails are as heavy as few pairs deserve.
-P. Brown 1982, "Multivariate calibration" (JRSS B 44, https://doi.org/10.1111/j.2517-6161.1982.tb01209.x). Deviation: a mixture of 16
-draws in place of his density in closed form, because a mixture can be cut off at the cube's faces exactly.
+With estimate m = a + B theta + e, e ~ N(0, V), and the flat prior |V|^(-(N+1)/2), (a, B, V) have a matrix-normal
+inverse-Wishart posterior given the pairs (theta, estimate). Each draw of it makes a normal in theta, weighted by its
+evidence N(m_0; a + B mu_0, V + B P_0^-1 B') under the prior N(mu_0, P_0^-1); together they are a mixture, whose tails
+are as heavy as few pairs deserve.
+
+P. Brown 1982, "Multivariate calibration" (JRSS B 44, https://doi.org/10.1111/j.2517-6161.1982.tb01209.x). Deviation:
+
+- A mixture of 16 draws in place of his density in closed form, because a mixture can be cut off at the cube's faces
+  exactly.
 """
 
 from __future__ import annotations
@@ -13,27 +17,32 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 
-FloatArray = NDArray[np.float64]
-
-_COMPONENTS = 16
 _ROUNDING = 1e-9  # sd of an estimate, in the cube, below which its scatter is rounding
 
 
 @dataclass(frozen=True)
 class Line:
-    """Regression of R estimates on theta, standardised by middle (N,) and scale (N,). design (R, N + 1); coefficients (N + 1, N);
-    square (N, N): sum of squares of what the line leaves."""
+    """Regression of R estimates on theta.
+
+    Args:
+        middle: (N,), which standardises theta.
+        scale: (N,), which standardises theta.
+        design: (R, N + 1), a column of ones and theta, standardised.
+        coefficients: (N + 1, N).
+        residual: what the line leaves (R, N).
+        square: its sum of squares (N, N).
+    """
 
     middle: FloatArray
     scale: FloatArray
     design: FloatArray
     coefficients: FloatArray
+    residual: FloatArray
     square: FloatArray
-    left: FloatArray
 
     @classmethod
     def fit(cls, theta: FloatArray, estimates: FloatArray) -> Line:
@@ -41,9 +50,9 @@ class Line:
         middle, scale = theta.mean(0), theta.std(0)
         design = np.concatenate([np.ones((len(theta), 1)), (theta - middle) / scale], axis=1)
         coefficients = np.linalg.lstsq(design, estimates, rcond=None)[0]
-        left = estimates - design @ coefficients
-        square = left.T @ left + len(theta) * _ROUNDING**2 * np.eye(theta.shape[1])
-        return cls(middle, scale, design, coefficients, square, left)
+        residual = estimates - design @ coefficients
+        square = residual.T @ residual + len(theta) * _ROUNDING**2 * np.eye(theta.shape[1])
+        return cls(middle, scale, design, coefficients, residual, square)
 
     @property
     def freedom(self) -> int:
@@ -58,39 +67,62 @@ class Line:
     def inverted(
         self, coefficients: FloatArray, scatter: FloatArray, observed: FloatArray, prior: QuadraticPrior
     ) -> tuple[float, FloatArray, FloatArray]:
-        """Log evidence, mean (N,) and covariance (N, N) of theta given an observed estimate (N,), for one line and V."""
+        """Theta given an observed estimate, for one line.
+
+        Args:
+            coefficients: of the line (N + 1, N).
+            scatter: V (N, N).
+            observed: the estimate (N,).
+            prior: of theta.
+
+        Returns:
+            Log evidence, mean (N,) and covariance (N, N).
+        """
         slope = coefficients[1:].T / self.scale  # (estimate, theta)
-        left = observed - coefficients[0] + slope @ self.middle
+        offset = observed - coefficients[0] + slope @ self.middle
         gain = slope.T @ np.linalg.inv(scatter)
         inverse = gain @ slope + prior.precision
         covariance = np.linalg.inv(0.5 * (inverse + inverse.T))
-        mean = covariance @ (gain @ left + prior.precision @ prior.mean)
+        mean = covariance @ (gain @ offset + prior.precision @ prior.mean)
         spread = scatter + slope @ np.linalg.inv(prior.precision) @ slope.T
-        evidence = scipy.stats.multivariate_normal.logpdf(left, slope @ prior.mean, spread, allow_singular=True)
+        evidence = scipy.stats.multivariate_normal.logpdf(offset, slope @ prior.mean, spread, allow_singular=True)
         return float(evidence), mean, 0.5 * (covariance + covariance.T)
 
     def mixture(
-        self, observed: FloatArray, prior: QuadraticPrior, rng: np.random.Generator
+        self, observed: FloatArray, prior: QuadraticPrior, rng: np.random.Generator, components: int = 16
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log weights (K,), means (K, N) and covariances (K, N, N) for K draws of the line and V."""
+        """Theta given an observed estimate, for as many draws of the line and V.
+
+        Args:
+            observed: the estimate (N,).
+            prior: of theta.
+            rng: draws them.
+            components: K, how many.
+
+        Returns:
+            Log weights (K,), means (K, N) and covariances (K, N, N).
+        """
         root = np.linalg.cholesky(np.linalg.inv(self.design.T @ self.design))
         scatter = scipy.stats.invwishart(self.freedom, self.square)
-        found = []
-        for _ in range(_COMPONENTS):
+        drawn = []
+        for _ in range(components):
             v = np.atleast_2d(scatter.rvs(random_state=rng))
             noise = rng.standard_normal(self.coefficients.shape)
-            drawn = self.coefficients + root @ noise @ np.linalg.cholesky(v).T
-            found.append(self.inverted(drawn, v, observed, prior))
-        weights, means, covariances = (np.stack(x) for x in zip(*found, strict=True))
+            line = self.coefficients + root @ noise @ np.linalg.cholesky(v).T
+            drawn.append(self.inverted(line, v, observed, prior))
+        weights, means, covariances = (np.stack(x) for x in zip(*drawn, strict=True))
         return weights, means, covariances
 
     def normality(self) -> float:
-        """p-value of normal scatter about the line: each estimate's distance from the line through the others has an F
-        distribution then, compared by Kolmogorov and Smirnov's test."""
+        """p-value of normal scatter about the line.
+
+        Each estimate's distance from the line through the others has an F distribution then, compared by Kolmogorov and
+        Smirnov's test.
+        """
         n, freedom = len(self.square), self.freedom - 1
         inverse = np.linalg.inv(self.design.T @ self.design)
         lever = 1 - np.einsum("ri,ij,rj->r", self.design, inverse, self.design)
-        within = np.einsum("ri,ij,rj->r", self.left, np.linalg.inv(self.square), self.left) / lever
+        within = np.einsum("ri,ij,rj->r", self.residual, np.linalg.inv(self.square), self.residual) / lever
         others = within / np.maximum(1 - within, 1e-12)
         values = scipy.stats.f.cdf(others * (freedom - n + 1) / n, n, freedom - n + 1)
         return float(scipy.stats.kstest(values, "uniform").pvalue)

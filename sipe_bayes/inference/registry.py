@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from sipe_bayes.core.validation import nearest_name
 
 if TYPE_CHECKING:
     from sipe_bayes.envs.task import Task
-    from sipe_bayes.inference.base import Estimator
+    from sipe_bayes.inference.base import Estimator, GymnasiumEnvironment
     from sipe_bayes.simulation.callable_simulator import CallableSimulator
     from sipe_bayes.simulation.simulator import Simulator
 
@@ -28,13 +28,6 @@ ESTIMATORS = {
     "adr": ("sipe_bayes.inference.search.adr", "ADR"),
     "cem": ("sipe_bayes.inference.search.cem", "CEM"),
 }
-
-
-class GymnasiumEnvironment(Protocol):
-    """What ``sipe.make`` returns, wrapped or not."""
-
-    @property
-    def unwrapped(self) -> object: ...
 
 
 def estimator_class(name: str) -> type[Estimator]:
