@@ -31,9 +31,9 @@ from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator, Progress
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import observation_noise
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.windows import Windows

@@ -39,10 +39,10 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.probes import probe_effects
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
 

@@ -57,9 +57,9 @@ from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator, Progress, Recorded
 from sipe_bayes.inference.inverse_regression import Line
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.log_noise import NOISE_BUDGET, fitted_noise, noise_is_unknown, process_noise
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import Replicas, observation_noise
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.posterior import GaussianMixture, Posterior

@@ -230,6 +230,7 @@ class Windows:
     def _cut_subset(self) -> Windows:
         within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
         view, keep = copy.copy(self), np.flatnonzero(within % 2 == 0)
+        vars(view).pop("spread", None)
         for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]
@@ -237,6 +238,11 @@ class Windows:
         sample = view.start[:, None] + np.arange(view.observed.shape[1])
         view.sequences = sequences(view.observed, sample, view.log, view.dt)
         return view
+
+    @cached_property
+    def spread(self) -> FloatArray:
+        """Sd (C,) of what each channel measured."""
+        return np.asarray(np.nanstd(np.where(self.observed, self.measured, np.nan), axis=(0, 1)))
 
     @cached_property
     def rounding(self) -> FloatArray:

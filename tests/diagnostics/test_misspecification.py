@@ -15,10 +15,10 @@ from sipe_bayes.diagnostics.misspecification import Misfit, _Residuals, misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import Replicas
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, prior

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.laplace.loose_jumps import rarity, tightening
 from sipe_bayes.inference.laplace.smoother import border
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
     ChainNoise,

@@ -152,7 +152,7 @@ def test_noise_that_rounding_cannot_bear_is_raised() -> None:
 
 
 def _flat(n: int):  # type: ignore[no-untyped-def]
-    from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
+    from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 
     return QuadraticPrior(np.full(n, 0.5), np.zeros((n, n)))
 

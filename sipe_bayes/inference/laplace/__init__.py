@@ -1,0 +1,79 @@
+r"""Laplace's approximation of the posterior: search its optima, take the curvature there.
+
+**Objective.** With theta in the unit cube, x the windows' starts (or all states), r the residual of the simulation,
+V(noise) its covariance, P_x the weak prior of the starts and N(mu, P^{-1}) the prior's normal, the search minimises
+
+.. math::
+
+    E(\theta, x; \text{noise}) = \tfrac12\, r(\theta, x)^\top V^{-1} r(\theta, x)
+        + \tfrac12\, x^\top P_x\, x + \tfrac12\, (\theta - \mu)^\top P\, (\theta - \mu),
+    \qquad 0 \le \theta \le 1,
+
+and the noise maximises its restricted likelihood, in which theta and x are integrated out
+(``sipe_bayes.likelihood.restricted``). At an optimum the starts are marginalised,
+
+.. math::
+
+    p(\theta \mid y) \approx \mathcal N\bigl(\theta;\ \hat\theta + H^{-1} g,\ H^{-1}\bigr)\ \text{on}\ [0, 1]^N,
+    \qquad H = A_{\theta\theta} - A_{\theta x} A_{xx}^{-1} A_{x\theta} + P,
+
+with A = J' V^{-1} J + diag(0, P_x) and g what still pulls on theta: where a parameter sits at a bound, the normal's mean
+lies beyond it, and the truncated density is right up to the bound.
+
+**Steps** (``estimator.Laplace``):
+
+1. Choose starting points: the model as given and the best of a few draws from the prior (``window_search.screen``).
+2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
+3. Record where that ends (``window_optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
+   over a handful of weighted noise values.
+4. Look around (``pattern_search``) and go on from a better place, or from the middle of a ridge.
+5. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
+   of a mixture, weighted by their restricted likelihood.
+6. Probe whether a single optimum's normal is the posterior (``inference.importance``); where it is not, importance draws
+   and kernels on them take its place.
+
+**Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::
+
+    starting point
+        |                  starts are measured
+        +-----------------------------------------> SUBSET  theta alone, every other window
+        |                                             |  a step gains little
+        |          some window diverges               v
+        +<----------------------------------------- WHOLE   first step on all windows
+        v                                             |
+      ROUGH  white noise of the residuals' size <-----+
+        |  nothing left to gain          \  half of the steps are taken
+        v                                 v
+      NOISE  estimated anew, a step  --> DESCEND  noise as it was
+        |    ^-----------------------------+  nothing left to gain
+        |  nothing moves any more
+        v
+      optimum --> middle of a ridge, longer differences, or a better point around: DESCEND from there
+        |
+        v
+      next starting point, or done
+
+With ``StateSpace`` every sample's state is unknown and ``state_space_search`` takes the place of ``window_search``, or
+``known_start_search`` where the first states are known. All are a ``strategy.Strategy``: made of a ``SearchProblem`` and
+the bound logs, with a frozen state of their own.
+
+**To change how steps are damped**, change ``levenberg_marquardt.DampingRule.after``: every search asks it and nothing
+else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbers of the search are the fields of
+``options.LaplaceTuning``, each with its reason: ``Laplace(simulator, tuning=LaplaceTuning(...))``.
+
+**Deviations** from the textbook:
+
+- Directions that the data leave open get a normal of sd 10 about the cube's centre, flat within the cube to half a
+  percent, so that the covariance exists and the result does not depend on the start.
+- The uncertainty of the noise widens the normal (not with ``StateSpace``).
+- Residuals below what the simulation's own rounding leaves are no independent evidence: such a channel counts as one
+  sample, not as many.
+- With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from autoregressive noise
+  (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts the
+  misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what predicts
+  best.
+- Whether the posterior is normal is not asked where starts are estimated or states inferred, where there are several
+  optima, where residuals are as small as the simulation's rounding or intervals as small as the search resolves, where
+  the intervals are guessed, or where the budget has no room left for draws (2 N + 1 rollouts to ask, and some hundreds
+  where it is not).
+"""

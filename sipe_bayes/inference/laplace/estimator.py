@@ -1,31 +1,6 @@
-"""Laplace's approximation of the posterior by windowed least squares.
+"""The estimator ``laplace``: a search for optima, their normals, and draws where the posterior is no normal.
 
-Theta and the windows' starts minimise the whitened squares of the residuals plus the prior (``least_squares``), the
-noise maximises its restricted likelihood (``sipe_bayes.likelihood.noise``); the two alternate, after a rough search with white
-noise of the size of the present residuals. At the optimum the starts are marginalised and the curvature gives a normal in
-theta, truncated to the unit cube. Where a parameter sits at a bound, the normal's mean lies beyond it, at the optimum
-of the quadratic model: the truncated density is right up to the bound.
-
-With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from the autoregressive
-noise (``noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts the misfit down to slow
-noise and may leave the parameters behind it undetermined; plain least squares keeps what predicts best.
-
-Several starting points (the model as given and the best of a few draws from the prior) are followed; optima that are
-not the same become components of a mixture, weighted by their restricted likelihood; with ``StateSpace`` also by the prior of the
-process noise and the price of jumps let go.
-
-The curvature at the optimum need not be that of the posterior. Where a few points around a single optimum say that it is not, the normal gives way to
-kernels on importance draws, or a warning (``importance``, which costs 2 N + 1 rollouts, and some hundreds where the normal is wrong). It is not asked where the starts are
-estimated or states inferred, where there are several optima, where residuals are as small as the simulation's rounding or intervals as small as the search resolves, where the
-intervals are guessed, or where the budget has no room left for draws.
-
-How the search spares simulations, follows ridges and looks around an optimum is said in ``window_search``. With ``StateSpace`` every
-sample's state is unknown and the search is that of ``state_space_search``, or where the first ones are known of ``known_start_search``.
-
-Deviations from the textbook: directions that the data leave open get a normal of sd 10 about the cube's centre, flat
-within the cube to half a percent, so that the covariance exists and the result does not depend on the start; the
-uncertainty of the noise widens the normal by the moments over a handful of weighted noise values (not with ``StateSpace``). Residuals below what the
-simulation's own rounding leaves are no independent evidence: such a channel counts as one sample, not as many.
+What it computes, step by step, stands in the package's docstring.
 """
 
 from __future__ import annotations
@@ -38,12 +13,11 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace import importance
+from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.chain_state import ChainOptimum, ChainState, process_diagnostics
-from sipe_bayes.inference.laplace.importance import Draws
 from sipe_bayes.inference.laplace.known_start_search import KnownStartSearch
-from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.state_space_search import StateSpaceSearch
@@ -51,6 +25,7 @@ from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strate
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows

@@ -17,8 +17,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.laplace.smoother import border, sound
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
     ChainNoise,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.inference.laplace.importance import ImportanceTuning
+from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.pattern_search import PatternTuning
 

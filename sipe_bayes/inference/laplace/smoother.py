@@ -35,9 +35,9 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.block_tridiagonal import Border
 from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,

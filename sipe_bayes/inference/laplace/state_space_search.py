@@ -27,7 +27,6 @@ from sipe_bayes.inference.laplace.chain_state import (
     recorded,
     screened,
 )
-from sipe_bayes.inference.laplace.least_squares import QuadraticPrior
 from sipe_bayes.inference.laplace.loose_jumps import needed, outstanding
 from sipe_bayes.inference.laplace.smoother import (
     Point,
@@ -40,6 +39,7 @@ from sipe_bayes.inference.laplace.smoother import (
     sound,
 )
 from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise

@@ -19,11 +19,11 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import SearchState
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.inference.laplace.least_squares import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.inference.laplace.options import LaplaceOptions
+from sipe_bayes.likelihood.block_tridiagonal import inverse
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
-_LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal: what rounding leaves of an open direction
 _DROP = 10.0  # nats below the best optimum: weight e^-10
 
 
@@ -94,7 +94,7 @@ class SearchProblem:
             Mean (N,) and covariance (N, N) of the normal, before truncation.
         """
         prior = self.quadratic_prior
-        covariance = _inverse(precision + prior.precision + FLAT_PRECISION * np.eye(len(theta)))
+        covariance = inverse(precision + prior.precision + FLAT_PRECISION * np.eye(len(theta)))[0]
         pull = gradient + prior.pull(theta) + FLAT_PRECISION * (0.5 - theta)
         return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
 
@@ -152,10 +152,3 @@ def mixture(optima: Sequence[Optimum], space: ParameterSpace) -> GaussianMixture
     weights = torch.from_numpy(evidence - evidence.max())
     means, covariances = np.stack([o.mean for o in optima]), np.stack([o.covariance for o in optima])
     return GaussianMixture(weights, means, covariances, space)
-
-
-def _inverse(precision: FloatArray) -> FloatArray:
-    """Positive definite also where rounding leaves a precision that is not, between parameters that do the same."""
-    sd = 1 / np.sqrt(np.diag(precision))
-    eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)
-    return sd[:, None] * ((axes / np.maximum(eigenvalues, _LEAST_EIGENVALUE)) @ axes.T) * sd

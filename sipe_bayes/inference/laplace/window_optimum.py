@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.inference.laplace.least_squares import energy_of
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.inference.laplace.pattern_search import Surroundings, nearest_points, pattern_search, pattern_size
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_noise import (
+from sipe_bayes.inference.laplace.window_energy import (
+    WindowEnergy,
     beyond_rounding,
     free_noise,
+    misfit,
     noise_at_least,
     pulls,
     updated_noise,
@@ -31,14 +33,37 @@ _RIDGE_TRIALS = np.array([0.0, 1.0, 0.5, 0.25])  # of the way to the middle of a
 
 @dataclass(frozen=True)
 class Ending:
-    """Where a search stood still: theta (N,), starts (W, D), noise, and the Jacobian (W, L, C, N + D) there with its
-    moments."""
+    """Where a search stood still, and how it came there.
+
+    Args:
+        theta: (N,).
+        starts: (W, D).
+        noise: for which theta and starts are best.
+        moments: of the linearisation there.
+        residual: (W, L, C), likewise.
+        jacobian: (W, L, C, N + D), likewise.
+        begin: (N,), the starting point.
+        steps: from there.
+        first_misfit: of the residuals at the starting point, in units of the channels' spread.
+        refused: nats that the last steps were to gain, none of which gained anything.
+        settled: whether nothing moved any more.
+        cut_short: whether the budget ends.
+        bettered: the optimum before, from which a pattern search led here; this one is to be no narrower.
+    """
 
     theta: FloatArray
     starts: FloatArray
     noise: Noise
     moments: Moments
+    residual: FloatArray
     jacobian: FloatArray
+    begin: FloatArray
+    steps: int
+    first_misfit: float
+    refused: float
+    settled: bool
+    cut_short: bool
+    bettered: WindowOptimum | None
 
 
 def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
@@ -106,7 +131,7 @@ def surroundings(
         return None
     if windows.rollouts + pattern_size(len(theta), tuning) * len(windows.trajectories) >= windows.budget:
         return None
-    starts, prior = windows.no_starts(), problem.quadratic_prior
+    starts = windows.no_starts()
 
     def simulated(thetas: FloatArray) -> tuple[FloatArray, BoolArray]:
         return windows.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
@@ -114,14 +139,14 @@ def surroundings(
     near = nearest_points(theta)
     residual, valid = simulated(near)
     noise = noise_at_least(windows, noise, residual[valid])
+    energy = WindowEnergy(windows, noise, problem.quadratic_prior)
 
     def energies(thetas: FloatArray) -> FloatArray:
         residual, valid = simulated(thetas)
-        values = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(thetas, residual, strict=True)]
-        return np.where(valid, values, np.inf)
+        return np.where(valid, energy.each(thetas, starts, residual), np.inf)
 
-    levels = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(near[valid], residual[valid], strict=True)]
-    return pattern_search(energies, theta, covariance, tuning, max(levels) if levels else -np.inf)
+    level = float(energy.each(near[valid], starts, residual[valid]).max(initial=-np.inf))
+    return pattern_search(energies, theta, covariance, tuning, level)
 
 
 def middle_of_ridge(problem: SearchProblem, windows: Windows, optimum: WindowOptimum) -> FloatArray | None:
@@ -140,8 +165,43 @@ def middle_of_ridge(problem: SearchProblem, windows: Windows, optimum: WindowOpt
     trials = np.clip(theta + _RIDGE_TRIALS[:, None] * move, 0, 1)
     if windows.rollouts + len(trials) * len(windows.trajectories) > windows.budget:
         return None
-    prior = problem.quadratic_prior
     residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
-    values = [energy_of(windows, noise, prior, t, starts, r) for t, r in zip(trials, residual, strict=True)]
+    values = WindowEnergy(windows, noise, problem.quadratic_prior).each(trials, starts, residual)
     good = [k for k in range(1, len(trials)) if valid[k] and values[k] < values[0] + tuning.as_good]
     return trials[good[0]] if good else None
+
+
+def judged(
+    problem: SearchProblem, windows: Windows, optimum: WindowOptimum, around: Surroundings | None, ending: Ending
+) -> WindowOptimum:
+    """The optimum as wide as its surroundings ask for, with what is to be said against it.
+
+    Args:
+        problem: what the search is given.
+        windows: the logs.
+        optimum: as ``summarised``.
+        around: its surroundings; None where they were not looked at.
+        ending: how the search came to it.
+    """
+    unsmooth, covariance = ending.refused > problem.options.tuning.windows.most_drift, optimum.covariance
+    reason: Finding | None = None
+    if ending.cut_short and not ending.settled:
+        reason = finding(Code.SEARCH_CUT_SHORT)
+    elif not ending.settled:
+        reason = finding(Code.SEARCH_UNSETTLED, steps=ending.steps)
+    elif unsmooth:
+        reason = finding(Code.NOT_SMOOTH, gain=ending.refused)
+    if around is not None:
+        covariance = around.covariance
+        reason = finding(Code.ROUGH_EVERYWHERE) if around.rough else reason
+    elif not windows.num_start:
+        reason = reason or finding(Code.NOT_LOOKED_AROUND)
+    if around is None and ending.bettered is not None:
+        covariance = covariance + ending.bettered.covariance
+    guessed = not windows.num_start and ((ending.cut_short and not ending.settled) or unsmooth)
+    guessed = guessed or (around is not None and around.rough)
+    if guessed:
+        left = misfit(windows, ending.residual) / ending.first_misfit
+        way = float(np.sqrt(((ending.theta - ending.begin) ** 2).mean()))
+        covariance = covariance + (way * min(1.0, left)) ** 2 * np.eye(len(ending.theta))
+    return replace(optimum, covariance=covariance, guessed=guessed, finding=reason)

@@ -34,31 +34,36 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.core.findings import Code, Finding, finding
-from sipe_bayes.inference.laplace.least_squares import LinearisedWindows, WindowPoint
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
-from sipe_bayes.inference.laplace.pattern_search import SHORTEST, Surroundings, pattern_size
+from sipe_bayes.inference.laplace.pattern_search import SHORTEST, pattern_size
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_noise import present_noise, same_noise, updated_noise
+from sipe_bayes.inference.laplace.window_energy import (
+    LinearisedWindows,
+    WindowEnergy,
+    WindowPoint,
+    misfit,
+    present_noise,
+    same_noise,
+    updated_noise,
+)
 from sipe_bayes.inference.laplace.window_optimum import (
     Ending,
+    judged,
     middle_of_ridge,
     sandwiches,
     summarised,
     surroundings,
 )
-from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowOptimum, WindowState
+from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowState
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 _ROUGH = (Phase.WHOLE, Phase.ROUGH)
-_NEAR = 0.1  # of the way to a known optimum, within which a search has come to it
-_STILL = 1e-9  # of the largest spread of a channel: one below it does not move
 _LEAST_SPREAD = 1e-12  # of a channel, in its unit
-_TINY = 1e-300  # so that nothing is divided by zero
 
 
 @dataclass(frozen=True)
@@ -130,8 +135,9 @@ class WindowSearch:
         )
         fixed = np.zeros((*lin.residual.shape, windows.num_start))
         lin = replace(lin, jacobian=np.concatenate([lin.jacobian, fixed], axis=-1))
-        noise, point = present_noise(view, lin.residual), WindowPoint(here.theta, starts, lin.residual)
-        linearised = LinearisedWindows(view, noise, self.problem.quadratic_prior, point, view.moments(lin, white=True))
+        energy = WindowEnergy(view, present_noise(view, lin.residual), self.problem.quadratic_prior)
+        point = WindowPoint(here.theta, starts, lin.residual)
+        linearised = LinearisedWindows(energy, point, view.moments(lin, white=True))
         tolerance = max(tuning.rough_tolerance * linearised.energy, tuning.tolerance)
         fit = descend(linearised, here.damping, tolerance, self._tuning.damping)
         if view is not windows:
@@ -151,7 +157,7 @@ class WindowSearch:
             kept=replace(here.kept, residual=point.residual if again or view is windows else None),
         )
         state = replace(state, here=here)
-        return self._next_point(state) if known(state) else state
+        return self._next_point(state) if state.known else state
 
     def _whole(self, state: WindowState) -> WindowState:
         """The first step on all windows: every other one went well, but perhaps not all do."""
@@ -212,7 +218,8 @@ class WindowSearch:
         """A step downhill, and whether there is nothing left to gain for this noise."""
         windows, here, tuning = self.windows, state.here, self._tuning.windows
         point = WindowPoint(here.theta, here.starts, lin.residual)
-        linearised = LinearisedWindows(windows, noise, self.problem.quadratic_prior, point, moments)
+        energy = WindowEnergy(windows, noise, self.problem.quadratic_prior)
+        linearised = LinearisedWindows(energy, point, moments)
         tolerance = tuning.tolerance
         if here.phase in _ROUGH:
             tolerance = max(tuning.rough_tolerance * linearised.energy, tolerance)
@@ -251,7 +258,7 @@ class WindowSearch:
         ends = self._unrecorded(state) and (step.cut_short or self._leaves_no_room())
         if settled or ends or after.iteration >= self._tuning.windows.most_steps:
             return self._recorded(onward, state.here, step, settled, ends)
-        return self._next_point(onward) if not after.revisits and known(onward) else onward
+        return self._next_point(onward) if not after.revisits and onward.known else onward
 
     def _recorded(
         self, state: WindowState, before: Position, step: Step, settled: bool, cut_short: bool
@@ -268,10 +275,25 @@ class WindowSearch:
         windows, tuning, here = self.windows, self._tuning, state.here
         theta, noise = before.theta, step.noise
         moments = windows.moments(step.lin) if before.phase in _ROUGH and not self._white else step.moments
-        optimum = summarised(self.problem, windows, Ending(theta, before.starts, noise, moments, step.lin.jacobian))
+        ending = Ending(
+            theta,
+            before.starts,
+            noise,
+            moments,
+            step.lin.residual,
+            step.lin.jacobian,
+            begin=state.points[state.point],
+            steps=here.iteration,
+            first_misfit=here.misfit,
+            refused=step.fit.refused,
+            settled=settled,
+            cut_short=cut_short,
+            bettered=state.optima[-1] if here.patterns else None,
+        )
+        optimum = summarised(self.problem, windows, ending)
         searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
         around = surroundings(self.problem, windows, theta, searched, optimum.covariance)
-        optimum = self._judged(state, optimum, around, before, step, settled, cut_short)
+        optimum = judged(self.problem, windows, optimum, around, ending)
         further = None if here.centred else middle_of_ridge(self.problem, windows, optimum)
         if further is not None:
             return replace(state, here=replace(here.afresh(tuning.damping), theta=further, centred=True))
@@ -287,41 +309,6 @@ class WindowSearch:
         size = min(here.theta_step, max(float(np.abs(around.better - theta).max()), SHORTEST))
         better = replace(here.afresh(tuning.damping), theta=around.better, theta_step=size, iteration=0)
         return replace(state, here=replace(better, patterns=here.patterns + 1))
-
-    def _judged(
-        self,
-        state: WindowState,
-        optimum: WindowOptimum,
-        around: Surroundings | None,
-        before: Position,
-        step: Step,
-        settled: bool,
-        cut_short: bool,
-    ) -> WindowOptimum:
-        """The optimum as wide as its surroundings ask for, with what is to be said against it."""
-        windows, tuning, here = self.windows, self._tuning.windows, state.here
-        unsmooth, covariance = step.fit.refused > tuning.most_drift, optimum.covariance
-        reason: Finding | None = None
-        if cut_short and not settled:
-            reason = finding(Code.SEARCH_CUT_SHORT)
-        elif not settled:
-            reason = finding(Code.SEARCH_UNSETTLED, steps=here.iteration)
-        elif unsmooth:
-            reason = finding(Code.NOT_SMOOTH, gain=step.fit.refused)
-        if around is not None:
-            covariance = around.covariance
-            reason = finding(Code.ROUGH_EVERYWHERE) if around.rough else reason
-        elif not windows.num_start:
-            reason = reason or finding(Code.NOT_LOOKED_AROUND)
-        if around is None and here.patterns:  # no narrower than the optimum before, which this one betters
-            covariance = covariance + state.optima[-1].covariance
-        guessed = not windows.num_start and ((cut_short and not settled) or unsmooth)
-        guessed = guessed or (around is not None and around.rough)
-        if guessed:
-            left = misfit(windows, step.lin.residual) / here.misfit
-            way = float(np.sqrt(((before.theta - state.points[state.point]) ** 2).mean()))
-            covariance = covariance + (way * min(1.0, left)) ** 2 * np.eye(len(before.theta))
-        return replace(optimum, covariance=covariance, guessed=guessed, finding=reason)
 
     def _next_point(self, state: WindowState) -> WindowState:
         """Turn to the next starting point, or end."""
@@ -361,20 +348,6 @@ class WindowSearch:
 def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
     """Whether a step gained what the linearisation foretold."""
     return abs(fit.gained - fit.expected) < tuning.foretold * max(fit.expected, tuning.tolerance)
-
-
-def known(state: WindowState) -> bool:
-    """Whether the search has come to one of the optima found earlier: in each principal direction of its normal within
-    one sd, or within a tenth of the way that it had to come."""
-    begin = state.points[state.point]
-    for optimum in state.optima:
-        eigenvalues, axes = np.linalg.eigh(optimum.covariance)
-        sd = np.sqrt(eigenvalues)
-        left = np.abs((state.here.theta - optimum.mean) @ axes) / sd
-        whole = np.abs((begin - optimum.mean) @ axes) / sd
-        if (left < np.maximum(1.0, _NEAR * whole)).all():
-            return True
-    return False
 
 
 def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
@@ -417,18 +390,10 @@ def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
 def _plain_loss(windows: Windows, points: FloatArray) -> FloatArray:
     """Squared residuals (B,) of points (B, N), in units of each channel's spread; infinite where one diverges."""
     residual, valid = windows.residuals(points, np.tile(windows.no_starts(), (len(points), 1, 1, 1)))
-    spread = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), _LEAST_SPREAD)
+    spread = np.maximum(windows.spread, _LEAST_SPREAD)
     return np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
 
 
 def _by_loss(loss: FloatArray) -> IntArray:
     """Places of the finite ones, the least first."""
     return np.argsort(loss, kind="stable")[: int(np.isfinite(loss).sum())]
-
-
-def misfit(windows: Windows, residual: FloatArray) -> float:
-    """Root mean square of residuals (W, L, C), in units of the spread of each channel that has one."""
-    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
-    moves = spread > _STILL * spread.max()
-    size = np.where(moves, spread, np.inf) if moves.any() else np.ones_like(spread)
-    return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or _TINY

@@ -16,6 +16,7 @@ from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.windows import Windows
 
 _FIRST_SHARE = 0.1  # of a channel's spread: a first guess of its noise, which the first step replaces
+_NEAR = 0.1  # of the way to a known optimum, within which a search has come to it
 _LEAST_SD = 1e-9  # of a first guess, in the channel's unit
 
 
@@ -96,8 +97,7 @@ class Position:
             subset: whether every other window is to be tried first.
         """
         fixed = windows.fixed_sd
-        spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
-        sd = np.where(np.isnan(fixed), np.maximum(_FIRST_SHARE * spread, _LEAST_SD), fixed)
+        sd = np.where(np.isnan(fixed), np.maximum(_FIRST_SHARE * windows.spread, _LEAST_SD), fixed)
         phase = Phase.SUBSET if subset else Phase.ROUGH
         noise = Noise(sd, np.zeros(len(sd)))
         return cls(phase, theta, windows.no_starts(), noise, rule.first, windows.theta_step)
@@ -151,3 +151,17 @@ class WindowState:
     def describe(self) -> str:
         """Starting point and step."""
         return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
+
+    @property
+    def known(self) -> bool:
+        """Whether the search has come to one of the optima found earlier: in each principal direction of its normal
+        within one sd, or within a tenth of the way that it had to come."""
+        begin = self.points[self.point]
+        for optimum in self.optima:
+            eigenvalues, axes = np.linalg.eigh(optimum.covariance)
+            sd = np.sqrt(eigenvalues)
+            left = np.abs((self.here.theta - optimum.mean) @ axes) / sd
+            whole = np.abs((begin - optimum.mean) @ axes) / sd
+            if (left < np.maximum(1.0, _NEAR * whole)).all():
+                return True
+        return False

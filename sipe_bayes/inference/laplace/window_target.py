@@ -1,15 +1,16 @@
-"""log p(theta | y) of windows with their starts and the noise integrated out, for ``mcmc`` and ``importance``: one simulation of the
-logs a value.
+"""log p(theta | y) of windows with their starts and the noise integrated out: one simulation of the logs a value.
 
-With r the residual at the predicted starts x(theta), V(noise) its covariance and J_x the starts' Jacobian,
+For ``mcmc`` and ``importance``. With r the residual at the predicted starts x(theta), V(noise) its covariance and J_x
+the starts' Jacobian,
 
-    log p(theta | y) = log prior + max over noise of -1/2 [log|V| + log|A| + r' V^-1 r - b' A^-1 b + x' P_x x] + a constant,
+    log p(theta | y) = log prior + max over noise of -1/2 [log|V| + log|A| + r' V^-1 r - b' A^-1 b + x' P_x x] + const,
     A = J_x' V^-1 J_x + P_x,   b = J_x' V^-1 r - P_x x.
 
-The starts are integrated out exactly where the prediction is linear in them over their (narrow) conditional posterior: x(theta) = x_hat - S (theta -
-theta_hat) and J_x are those of the ``laplace`` optimum. The noise is integrated out by Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations
-for Posterior Moments and Marginal Densities", J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at
-the optimum hardly depends on theta; exact for white noise of one channel whose starts are known.
+The starts are integrated out exactly where the prediction is linear in them over their (narrow) conditional posterior:
+x(theta) = x_hat - S (theta - theta_hat) and J_x are those of the ``laplace`` optimum. The noise is integrated out by
+Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations for Posterior Moments and Marginal Densities",
+J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at the optimum hardly depends on theta;
+exact for white noise of one channel whose starts are known.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.window_noise import beyond_rounding, free_noise
+from sipe_bayes.inference.laplace.window_energy import beyond_rounding, estimated, free_noise
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.restricted import Pulls, estimate_noise, marginal
+from sipe_bayes.likelihood.restricted import Pulls, marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
@@ -64,6 +65,7 @@ class WindowTarget:
         return np.asarray(optimum.starts - moved)
 
     def __call__(self, points: FloatArray) -> FloatArray:
+        """Log densities (B,) of points (B, N)."""
         out = np.full(len(points), -np.inf)
         inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
         if not len(inside):
@@ -78,17 +80,17 @@ class WindowTarget:
         return np.where(np.isnan(out), -np.inf, out)
 
     def _integrated(self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray) -> tuple[float, FloatArray]:
-        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), up to a constant, with the noise that fits best there, and the best
-        change of the starts."""
+        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), and the best change of the starts (W, D).
+
+        Up to a constant, with the noise that fits best there. jacobian (W, L, C, D): by the starts.
+        """
         windows, nothing = self.windows, np.zeros(0)
         moments = Moments(residual, jacobian, 0, windows.sequences, windows.settings.noise == "white")
         noise = self.noise
         if len(free_noise(windows)):
             pull = -windows.start_precision * starts
             context = Pulls(np.zeros((0, 0)), nothing, windows.start_precision, pull, np.zeros(0, bool))
-            shortest, longest = float(windows.dt.min()), windows.trajectories.longest
-            coloured = windows.settings.noise == "ar1"
-            noise = estimate_noise(moments, noise, context, windows.fixed_sd, coloured, shortest, longest)
+            noise = estimated(windows, moments, noise, context, windows.settings.noise == "ar1")
         noise = Noise(np.maximum(noise.sd, self.least_sd), noise.tau)
         return marginal(moments, noise, starts, windows.start_precision)
 
@@ -100,8 +102,8 @@ class WindowTarget:
     def refreshed(self, point: FloatArray) -> float:
         """The target at one point (N,) with the starts' Jacobian taken there, after one step of the starts."""
         starts, value = self.starts(point[None])[0], -np.inf
-        for _ in range(2):
-            found = self.windows.linearise(point, starts, with_theta=False)
-            value, move = self._integrated(found.residual, found.jacobian, starts)
+        for _ in range(2):  # a step, then the value
+            lin = self.windows.linearise(point, starts, with_theta=False)
+            value, move = self._integrated(lin.residual, lin.jacobian, starts)
             starts = starts + move
         return value + float(self.prior.log_prob(torch.from_numpy(point)))

@@ -11,10 +11,10 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import default_prior
-from sipe_bayes.inference.laplace import importance
+from sipe_bayes.inference.importance import Draws, ImportanceTuning
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.importance import Draws, ImportanceTuning
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.binding import bind

@@ -1,0 +1,175 @@
+"""The energy of theta and the windows' starts, -log of likelihood x prior, and the noise that it is for.
+
+For given noise it is half the whitened squares of the residuals plus the priors; its normal equations are an arrow, of
+which the starts are eliminated (``sipe_bayes.likelihood.restricted``). The noise itself is given, of the size of present
+residuals, or maximises the restricted likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.inference.laplace.levenberg_marquardt import QuadraticModel
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.windows import Windows
+
+_SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
+_STILL = 1e-9  # of the largest spread of a channel: one below it does not move
+_TINY = 1e-300  # so that nothing is divided by zero
+
+
+@dataclass(frozen=True)
+class WindowPoint:
+    """theta (N,), starts (W, D), and the residual (W, L, C) of the simulation there."""
+
+    theta: FloatArray
+    starts: FloatArray
+    residual: FloatArray
+
+
+@dataclass(frozen=True)
+class WindowEnergy:
+    """The energy for one noise.
+
+    Args:
+        windows: the logs.
+        noise: of the residuals.
+        prior: on theta.
+    """
+
+    windows: Windows
+    noise: Noise
+    prior: QuadraticPrior
+
+    def __call__(self, theta: FloatArray, starts: FloatArray, residual: FloatArray) -> float:
+        """At theta (N,) and starts (W, D), of the residual (W, L, C) there."""
+        fit = 0.5 * float(self.windows.chi_square(residual[None], self.noise)[0])
+        return fit + self.prior.energy(theta) + 0.5 * float((starts**2 @ self.windows.start_precision).sum())
+
+    def each(self, thetas: FloatArray, starts: FloatArray, residuals: FloatArray) -> FloatArray:
+        """At thetas (B, N) and the same starts (W, D), of their residuals (B, W, L, C)."""
+        return np.array([self(theta, starts, residual) for theta, residual in zip(thetas, residuals, strict=True)])
+
+
+class LinearisedWindows:
+    """A ``levenberg_marquardt.LinearisedEnergy`` of windows.
+
+    Args:
+        of: the energy.
+        point: where it is known.
+        moments: of the linearisation there, or at an earlier point.
+    """
+
+    def __init__(self, of: WindowEnergy, point: WindowPoint, moments: Moments) -> None:
+        self.of, self.point, self.moments = of, point, moments
+        self.theta, self.energy = point.theta, of(point.theta, point.starts, point.residual)
+
+    @cached_property
+    def _normal(self) -> FloatArray:
+        return self.moments.normal(self.of.noise)
+
+    def model(self, damping: float) -> QuadraticModel:
+        """The quadratic model in theta, the starts eliminated."""
+        precision, prior = self.of.windows.start_precision, self.of.prior
+        pull = -precision * self.point.starts
+        solved = eliminate_starts(self._normal, self.moments.num_theta, precision, pull, damping)
+        hessian, gradient = solved.precision + prior.precision, solved.gradient + prior.pull(self.theta)
+        return QuadraticModel(hessian, gradient, solved.explained, solved.blocks)
+
+    def simulated(self, theta: FloatArray, change: FloatArray) -> tuple[WindowPoint, float]:
+        """The point at theta (N,) with the starts changed by (W, D), and its energy."""
+        starts = self.point.starts + change
+        residual, valid = self.of.windows.residuals(theta[None], starts[None])
+        point = WindowPoint(theta, starts, residual[0])
+        return point, self.of(theta, starts, residual[0]) if valid[0] else np.inf
+
+
+def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
+    """Priors and bounds at theta (N,) and starts (W, D); force (N,): the data's on theta, which may press it to a bound."""
+    pull = prior.pull(theta)
+    flat = FLAT_PRECISION * np.eye(len(theta))
+    start_pull = -windows.start_precision * starts
+    free = free_to_move(theta, force + pull)
+    return Pulls(prior.precision + flat, pull, windows.start_precision, start_pull, free)
+
+
+def present_noise(windows: Windows, residual: FloatArray) -> Noise:
+    """White noise with the root-mean-square of a residual (W, L, C), or the given sds."""
+    fixed, counts = windows.fixed_sd, windows.observed.sum(axis=(0, 1))
+    size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1))
+    return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
+
+
+def noise_at_least(windows: Windows, noise: Noise, residuals: FloatArray) -> Noise:
+    """The noise with sds no less than the root-mean-squares of residuals (B, W, L, C), the given ones kept."""
+    if not len(residuals):
+        return noise
+    size = np.max([present_noise(windows, r).sd ** 2 for r in residuals], axis=0) ** 0.5
+    return Noise(np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, size), noise.sd), noise.tau)
+
+
+def updated_noise(
+    windows: Windows,
+    moments: Moments,
+    before: Noise,
+    theta: FloatArray,
+    starts: FloatArray,
+    prior: QuadraticPrior,
+    coloured: bool,
+) -> Noise:
+    """Noise that maximises the restricted likelihood of one linearisation.
+
+    Args:
+        windows: the logs.
+        moments: of the linearisation.
+        before: where the search for it begins.
+        theta: (N,), where it was taken.
+        starts: (W, D), likewise.
+        prior: on theta.
+        coloured: whether correlation times are estimated.
+    """
+    start_pull = -windows.start_precision * starts
+    solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
+    context = pulls(windows, prior, theta, starts, solved.gradient)
+    noise = estimated(windows, moments, before, context, coloured)
+    sd = np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, windows.rounding), noise.sd)
+    return Noise(sd, noise.tau)
+
+
+def estimated(windows: Windows, moments: Moments, before: Noise, context: Pulls, coloured: bool) -> Noise:
+    """``likelihood.restricted.estimate_noise`` of windows."""
+    shortest, longest = float(windows.dt.min()), windows.trajectories.longest
+    return estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest)
+
+
+def beyond_rounding(windows: Windows, noise: Noise) -> Noise:
+    """The noise with channels at the least sd, the simulation's rounding, as if they were one sample."""
+    least, counts = windows.rounding * (1 + _SAME_NOISE), windows.observed.sum(axis=(0, 1))
+    least = np.where(np.isnan(windows.fixed_sd), least, 0.0)
+    return Noise(np.where(noise.sd <= least, noise.sd * np.sqrt(np.maximum(counts, 1)), noise.sd), noise.tau)
+
+
+def free_noise(windows: Windows) -> IntArray:
+    """Which of (log sd (C), log tau (C)) are unknown."""
+    free = np.isnan(windows.fixed_sd)
+    return np.flatnonzero(np.concatenate([free, np.full(len(free), windows.settings.noise != "white")]))
+
+
+def same_noise(a: Noise, b: Noise) -> bool:
+    """Whether two are as good as equal."""
+    return bool(np.allclose(a.sd, b.sd, rtol=_SAME_NOISE) and np.allclose(a.tau, b.tau, rtol=3 * _SAME_NOISE))
+
+
+def misfit(windows: Windows, residual: FloatArray) -> float:
+    """Root mean square of residuals (W, L, C), in units of the spread of each channel that has one."""
+    spread = windows.spread
+    moves = spread > _STILL * spread.max()
+    size = np.where(moves, spread, np.inf) if moves.any() else np.ones_like(spread)
+    return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or _TINY
