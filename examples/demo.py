@@ -15,7 +15,8 @@ from PIL import Image
 
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.run import run
-from sipe_bayes.cli.progress import Progress, print_calibration
+from sipe_bayes.cli.app import print_calibration
+from sipe_bayes.cli.progress import Progress
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.diagnostics.result import Calibration
