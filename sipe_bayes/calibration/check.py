@@ -1,9 +1,10 @@
 """Is an estimator calibrated on one's own model, noise and commands? What ``sipe check`` does, also from Python.
 
 Truths are drawn from the prior, the recorded experiment is simulated at each of them with the noise of the recording
-(``sipe_bayes.likelihood.replicas``), the estimator is fitted to each simulated log, and ``diagnostics.calibration`` compares. Each fit has a seed
-of its own: with one seed the errors of sampling would be the same in all. An amortised estimator is trained once, so that its errors are,
-and then conditions on each log. Every fit is one file, so an interrupted check goes on.
+(``sipe_bayes.likelihood.replicas``), the estimator is fitted to each simulated log, and ``diagnostics.coverage``
+compares. Each fit has a seed of its own: with one seed the errors of sampling would be the same in all. An amortised
+estimator is trained once, so that its errors are, and then conditions on each log. Every fit is one file, so an
+interrupted check goes on.
 
 A truth whose simulation diverges is drawn anew: the check is of the prior restricted to what can be simulated.
 """
@@ -15,37 +16,57 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
+from sipe_bayes.calibration.problem import method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import replacing, write_bytes, write_text
+from sipe_bayes.core.files import replacing, to_json, write_bytes, write_text
+from sipe_bayes.core.findings import Finding, Severity
+from sipe_bayes.core.seeding import seed_integer, torch_generator
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
+from sipe_bayes.datasets.demonstrations import demonstrations
 from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draws
+from sipe_bayes.envs.registry import make_task
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator, digest
+from sipe_bayes.inference.log_noise import fitted_noise
 from sipe_bayes.inference.recalibrated import Recalibrated
+from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.report.check_plots import coverage_curve, rank_check
+from sipe_bayes.report.drawing import png
+from sipe_bayes.simulation.simulator import Simulator
 
 Tell = Callable[[str, int, int], None]
 
 FITS, IDENTITY, RESULT = "fits", "check.json", "result.json"
 _VERSION = 2  # of what a fit's file holds: each fit has a seed of its own
-_DRAWS = 999
+_DRAWS = 999  # of each posterior: a rank among them to a thousandth
 _TRIES = 50  # truths drawn until one can be simulated
-_LEVEL = 0.9
+_NOISE_BUDGET = 5000  # rollouts of the fit that finds a configuration's noise
 
 
 @dataclass(frozen=True)
 class Study:
-    """What is checked: ``estimator``, of which only settings count, on the experiment of ``trajectories`` with ``noise`` (O) and process noise
-    of sd ``process`` (D,), none or empty without. name: of the model. refits: those of Recalibrated(estimator), or 0 for the estimator itself."""
+    """What is checked.
+
+    Args:
+        name: of the model.
+        estimator: of which only settings count.
+        trajectories: the experiment, whose commands and starts are simulated.
+        noise: (O,) of the sensors.
+        refits: those of Recalibrated(estimator), or 0 for the estimator itself.
+        seed: of truths, noise and fits.
+        process: (D,) sd of process noise; none or empty without.
+    """
 
     name: str
     estimator: Estimator
@@ -70,7 +91,7 @@ class Study:
             return once, whole_fit - once
         return once, 0 if once else self.estimator.budget
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         """What tells a check from others, as plain data."""
         process = [] if self.process is None else self.process.tolist()
         noise = {"sd": self.noise.sd.tolist(), "tau": self.noise.tau.tolist(), "process": process}
@@ -88,8 +109,16 @@ class Study:
 
 @dataclass(frozen=True)
 class Fit:
-    """One simulation and its posterior: truth (N,), draws (M, N) in theta, rollouts, seconds; error: why there are no draws; warned: what
-    the estimator said of itself. Training once counts with the first."""
+    """One simulation and its posterior; training once counts with the first.
+
+    Args:
+        truth: (N,) in theta.
+        draws: (M, N) in theta.
+        rollouts: of the fit.
+        seconds: of the fit.
+        error: why there are no draws.
+        warned: codes of what the estimator itself noticed, notes aside.
+    """
 
     truth: FloatArray
     draws: FloatArray
@@ -99,6 +128,7 @@ class Fit:
     warned: tuple[str, ...] = ()
 
     def save(self, path: Path) -> None:
+        """Write it as one file, whole or not at all."""
         with replacing(path) as temporary, temporary.open("wb") as file:
             numbers, error = np.array([self.rollouts, self.seconds]), np.array(self.error)
             warned = np.array(self.warned, dtype=str)
@@ -110,17 +140,27 @@ class Fit:
         try:
             with np.load(path, allow_pickle=False) as data:
                 rollouts, seconds = data["numbers"].tolist()
-                said = str(data["error"]), tuple(str(words) for words in data["warned"])
-                return cls(data["truth"], data["draws"], int(rollouts), seconds, *said)
+                error, warned = str(data["error"]), tuple(map(str, data["warned"]))
+                return cls(data["truth"], data["draws"], int(rollouts), seconds, error, warned)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
             return None
 
 
 @dataclass(frozen=True)
-class Finding:
-    """check; contraction (N,): mean of 1 - sd / prior sd; interval_score (N,): mean width of 90 % intervals plus 20 times what the
-    truth lies outside, in theta; failed: logs that could not be fitted; warned: fits of which the estimator itself warned; standard_error: of
-    the pooled coverage, by fit."""
+class CheckResult:
+    """What the fits of a study say together.
+
+    Args:
+        study: what was checked.
+        check: ranks, coverage and TARP.
+        contraction: (N,) mean of 1 - sd / prior sd.
+        interval_score: (N,) mean width of 90 % intervals plus 20 times what the truth lies outside, in theta.
+        standard_error: of the pooled coverage, by fit.
+        failed: logs that could not be fitted.
+        seconds: of all fits.
+        rollouts: of all fits.
+        warned: fits of which the estimator itself warned.
+    """
 
     study: Study
     check: CalibrationCheck
@@ -134,17 +174,17 @@ class Finding:
 
     def sentence(self) -> str:
         """The verdict."""
-        share = float(self.check.coverage(_LEVEL).mean())
+        share = float(self.check.coverage(THRESHOLDS.shown_interval).mean())
         held = (
-            f"{self.study.method} on {self.study.name}: 90 % intervals hold the truth {100 * share:.0f} ± {100 * self.standard_error:.0f} % "
-            f"of the time ({self.check.truths} logs)"
+            f"{self.study.method} on {self.study.name}: {100 * THRESHOLDS.shown_interval:.0f} % intervals hold the truth "
+            f"{100 * share:.0f} ± {100 * self.standard_error:.0f} % of the time ({self.check.truths} logs)"
         )
         lost = f"; {self.failed} more logs could not be fitted" if self.failed else ""
         lost += f"; the estimator itself warned of {self.warned} fits" if self.warned else ""
         if self.check.calibrated:
-            idle = [n for n, c in zip(self.check.names, self.contraction, strict=True) if c < 0.1]
-            said = f", but of {', '.join(idle)} the posterior says no more than the prior" if idle else ""
-            return f"{held}: no cause for alarm{said}{lost}"
+            idle = [n for n, c in zip(self.check.names, self.contraction, strict=True) if c < THRESHOLDS.idle]
+            but = f", but of {', '.join(idle)} the posterior says no more than the prior" if idle else ""
+            return f"{held}: no cause for alarm{but}{lost}"
         remedy = "give it more refits" if self.study.refits else "use sipe.Recalibrated(...)"
         return f"{held}: {self._fault()}; {remedy}{lost}"
 
@@ -158,14 +198,14 @@ class Finding:
         named = [name for name, verdict in wrong.items() if verdict == most]
         return most if len(named) == len(self.check.names) else f"{most} ({', '.join(named)})"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """What ``--json`` prints."""
         by_name = zip(self.check.names, self.contraction.tolist(), self.interval_score.tolist(), strict=True)
         return {
             "model": self.study.name,
             "estimator": self.study.method,
             "verdict": self.sentence(),
-            "coverage_90": float(self.check.coverage(_LEVEL).mean()),
+            "coverage_90": float(self.check.coverage(THRESHOLDS.shown_interval).mean()),
             "standard_error": self.standard_error,
             "sharpness": {name: {"contraction": c, "interval_score": s} for name, c, s in by_name},
             "failed": self.failed,
@@ -176,8 +216,18 @@ class Finding:
         }
 
 
-def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done, of: None) -> Finding:
-    """Fit what is missing in ``folder``, compare, write figures and result. Raises ValueError where it holds another check."""
+def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done, of: None) -> CheckResult:
+    """Fit what is missing in a folder, compare, write figures and result.
+
+    Args:
+        study: what is checked.
+        truths: how many, at least 20.
+        folder: of this check.
+        tell: called with what is being done, how many are done, and of how many.
+
+    Raises:
+        ValueError: where the folder holds another check, or fewer than 20 logs could be fitted.
+    """
     whole("truths", truths, FEWEST)
     _claim(study, folder)
     worker = _Worker(study, folder, tell)
@@ -190,28 +240,36 @@ def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done,
             fit = worker.fit(number)
             fit.save(path)
         fits.append(fit)
-    found = compare(study, fits)
-    _write(found, folder)
-    return found
+    result = compare(study, fits)
+    _write(result, folder)
+    return result
 
 
-def compare(study: Study, fits: list[Fit]) -> Finding:
-    """What the fits say; raises ValueError where fewer than 20 gave a posterior."""
+def compare(study: Study, fits: list[Fit]) -> CheckResult:
+    """What the fits say together.
+
+    Args:
+        study: what is checked.
+        fits: of its logs.
+
+    Raises:
+        ValueError: where fewer than 20 gave a posterior.
+    """
     good = [fit for fit in fits if not fit.error]
     if len(good) < FEWEST:
         why = next((fit.error for fit in fits if fit.error), "")
         raise ValueError(f"truths: {len(good)} of {len(fits)} logs could be fitted, {FEWEST} are the least ({why})")
     truths = np.stack([fit.truth for fit in good])
     check = check_draws(study.estimator.space.names, [fit.draws for fit in good], truths, seed=study.seed)
-    inside = np.stack([u.values <= _LEVEL for u in check.intervals], axis=1)
+    inside = np.stack([u.values <= THRESHOLDS.shown_interval for u in check.intervals], axis=1)
     sd = np.stack([fit.draws.std(0) for fit in good])
     low, high = np.moveaxis(np.stack([np.quantile(fit.draws, [0.05, 0.95], axis=0) for fit in good]), 1, 0)
     outside = np.maximum(low - truths, 0) + np.maximum(truths - high, 0)
-    return Finding(
+    return CheckResult(
         study,
         check,
         np.asarray(1 - (sd / study.estimator.prior.stddev.numpy()).mean(0)),
-        np.asarray((high - low + 2 / (1 - _LEVEL) * outside).mean(0)),
+        np.asarray((high - low + 2 / (1 - THRESHOLDS.shown_interval) * outside).mean(0)),
         float(inside.mean(1).std(ddof=1) / np.sqrt(len(good))),
         len(fits) - len(good),
         sum(fit.seconds for fit in fits),
@@ -227,28 +285,28 @@ class _Worker:
         self.study, self.folder, self.tell = study, folder, tell
         self.replicas = Replicas(study.estimator.simulator, study.trajectories, study.noise, study.process)
         self._trained: Estimator | None = None
-        self._before: tuple[int, frozenset[str]] = (0, frozenset())  # rollouts and warnings of training
+        self._before: tuple[int, frozenset[Finding]] = (0, frozenset())  # rollouts and findings of training
 
     def fit(self, number: int) -> Fit:
+        """The fit of one truth's log."""
         truth, log = self._log(number)
         began, draws, error = time.monotonic(), np.empty((0, len(truth))), ""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             estimator = self._estimator(number)
             try:
-                found = estimator.get_parameter_estimate(log) if estimator is self._trained else estimator.fit(log)
-                generator = torch.Generator().manual_seed(self._seed(3, number))
-                draws = found.sample((_DRAWS,), generator=generator).numpy()
+                posterior = estimator.get_parameter_estimate(log) if estimator is self._trained else estimator.fit(log)
+                draws = posterior.sample((_DRAWS,), generator=self._generator(3, number)).numpy()
             except ValueError as problem:  # LinAlgError is one
                 error = " ".join(str(problem).split()) or type(problem).__name__
         seconds = time.monotonic() - began
-        rollouts, said = self._before if number else (0, frozenset())
-        warned = tuple(words for words in estimator.warnings if words not in said)
+        rollouts, of_training = self._before if number else (0, frozenset())
+        own = (item for item in estimator.findings if item.severity is not Severity.NOTE and item not in of_training)
+        warned = tuple(str(item.code) for item in own)
         return Fit(truth, draws, estimator.rollouts - rollouts, seconds, error, warned)
 
     def _log(self, number: int) -> tuple[FloatArray, Trajectories]:
-        rng, generator = np.random.default_rng([self.study.seed, 1, number]), torch.Generator()
-        generator.manual_seed(self._seed(2, number))
+        rng, generator = np.random.default_rng([self.study.seed, 1, number]), self._generator(2, number)
         for _ in range(_TRIES):
             truth = self.study.estimator.prior.sample((), generator=generator).numpy()
             log = self.replicas.make(truth, rng)
@@ -266,7 +324,7 @@ class _Worker:
             self._trained.progress = self.tell
             self._trained.fit(study.trajectories)
             self._trained.progress = None
-            self._before = self._trained.rollouts, frozenset(self._trained.warnings)
+            self._before = self._trained.rollouts, frozenset(self._trained.findings)
         base = self._trained
         if base is None:
             base = study.estimator.fresh()
@@ -274,17 +332,21 @@ class _Worker:
         return Recalibrated(base, refits=study.refits, seed=self._seed(4, number)) if study.refits else base
 
     def _seed(self, *what: int) -> int:
-        return int(np.random.SeedSequence([self.study.seed, *what]).generate_state(1)[0])
+        return seed_integer([self.study.seed, *what])
+
+    def _generator(self, *what: int) -> torch.Generator:
+        return torch_generator([self.study.seed, *what])
 
 
 def _claim(study: Study, folder: Path) -> None:
     record, mine = folder / IDENTITY, study.identity()
     if record.is_file():
-        found = json.loads(record.read_text(encoding="utf-8"))
-        differing = sorted(key for key in mine if found.get(key) != mine[key])
+        present = json.loads(record.read_text(encoding="utf-8"))
+        differing = sorted(key for key in mine if present.get(key) != mine[key])
         if differing:
             raise ValueError(
-                f"--out {folder}: holds another check (it differs in {', '.join(differing)}); choose another folder or delete it"
+                f"--out {folder}: holds another check (it differs in {', '.join(differing)}); choose another folder or "
+                "delete it"
             )
         return
     if folder.is_dir() and any(folder.iterdir()):
@@ -292,14 +354,10 @@ def _claim(study: Study, folder: Path) -> None:
     write_text(record, json.dumps(mine, indent=2))
 
 
-def _write(found: Finding, folder: Path) -> None:
-    from sipe_bayes.core.files import to_json
-    from sipe_bayes.report.check_plots import coverage_curve, rank_check
-    from sipe_bayes.report.drawing import png
-
-    write_bytes(folder / "ranks.png", png(rank_check(found.check)))
-    write_bytes(folder / "coverage.png", png(coverage_curve(found.check)))
-    write_text(folder / RESULT, to_json(found.to_dict(), indent=2))
+def _write(result: CheckResult, folder: Path) -> None:
+    write_bytes(folder / "ranks.png", png(rank_check(result.check)))
+    write_bytes(folder / "coverage.png", png(coverage_curve(result.check)))
+    write_text(folder / RESULT, to_json(result.to_dict(), indent=2))
 
 
 def study_of_task(
@@ -313,27 +371,33 @@ def study_of_task(
     seed: int,
     threads: int | None,
 ) -> Study:
-    """A benchmark task: one demonstration's commands and start, white noise of ``noise`` times each channel's spread. The methods
-    that search use ``StateSpace``, where the controller has a memory with the recorded start; without noise single control steps of recorded
-    states."""
-    from sipe_bayes.datasets.demonstrations import demonstrations
-    from sipe_bayes.envs.registry import make_task
-    from sipe_bayes.inference.registry import estimator_class
-    from sipe_bayes.likelihood.settings import Segments
-    from sipe_bayes.simulation.simulator import Simulator
+    """A benchmark task: one demonstration's commands and start.
 
+    The methods that search use ``StateSpace``, where the controller has a memory with the recorded start; without noise
+    single control steps of recorded states.
+
+    Args:
+        name: of the task.
+        estimator: of the method.
+        steps: control steps of the log.
+        noise: sd of white noise, as a share of each channel's spread.
+        budget: rollouts of each fit; default the estimator's.
+        refits: of ``Recalibrated``, or 0.
+        seed: of log, truths, noise and fits.
+        threads: native ones; default all cores.
+    """
     simulator = Simulator(make_task(name), threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         log = demonstrations(simulator, count=1, seed=seed, steps=steps)
     sd = noise * log.observations[0].std(0)
-    likelihood: Any = Segments(simulator.dt, noise="white", starts="recorded", noise_sd=tuple(sd.tolist()))
-    if estimator_class(estimator).searches:
-        likelihood = replace(likelihood, noise_sd=None)
-        if noise:
-            from sipe_bayes.likelihood.settings import StateSpace
-
-            likelihood = StateSpace(starts="recorded" if simulator.environment.memory_size else "estimated")
+    searches = estimator_class(estimator).searches
+    likelihood: Segments | StateSpace
+    if searches and noise:
+        likelihood = StateSpace(starts="recorded" if simulator.environment.memory_size else "estimated")
+    else:
+        known = None if searches else tuple(sd.tolist())
+        likelihood = Segments(simulator.dt, noise="white", starts="recorded", noise_sd=known)
     method = get_estimator(simulator, estimator, budget=budget, seed=seed, likelihood=likelihood)
     return Study(name, method, log, Noise(sd, np.zeros(len(sd))), refits, seed)
 
@@ -341,12 +405,19 @@ def study_of_task(
 def study_of_config(
     path: Path, estimator: str, *, budget: int | None, refits: int, seed: int, threads: int | None
 ) -> Study:
-    """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs: autoregressive, or with a
-    ``StateSpace`` white, and process noise."""
-    from sipe_bayes.calibration.problem import method_of, prepare
-    from sipe_bayes.inference.log_noise import fitted_noise
+    """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs.
 
+    That is autoregressive, or with a ``StateSpace`` white, and process noise.
+
+    Args:
+        path: of the TOML file.
+        estimator: of the method.
+        budget: rollouts of each fit; default the configuration's, then the estimator's.
+        refits: of ``Recalibrated``, or 0.
+        seed: of truths, noise and fits.
+        threads: native ones; default all cores.
+    """
     problem = prepare(path, threads)
     method = method_of(problem, estimator, seed, budget)
-    fitted = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=5000)
+    fitted = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=_NOISE_BUDGET)
     return Study(str(path), method, problem.train, fitted.noise, refits, seed, fitted.process)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,14 +15,14 @@ import scipy.stats
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
-_BAND_DRAWS = 64
-_MOSTLY = 0.95  # of an error
+_BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
@@ -45,19 +44,20 @@ def measured_starts(windows: Windows, theta: FloatArray) -> FloatArray:
     return starts
 
 
-def _tangents(model: Any) -> dict[int, int]:
+def _tangents(model: mujoco.MjModel) -> dict[int, int]:
     """Column of the physics state -> column of a start, for hinge and slide joints."""
-    found = {1 + model.nq + dof: model.nv + dof for dof in range(model.nv)}
+    columns = {1 + model.nq + dof: model.nv + dof for dof in range(model.nv)}
     for joint in range(model.njnt):
         if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            found[1 + int(model.jnt_qposadr[joint])] = int(model.jnt_dofadr[joint])
-    return found
+            columns[1 + int(model.jnt_qposadr[joint])] = int(model.jnt_dofadr[joint])
+    return columns
 
 
 def errors(windows: Windows, theta: FloatArray) -> FloatArray:
     """RMSE (B, logs, C) of theta (B, N) over the windows of each log from measured starts.
 
-    Infinite where one of the log's windows diverges, NaN where a channel has no sample."""
+    Infinite where one of the log's windows diverges, NaN where a channel has no sample.
+    """
     square = _squares(windows, theta)
     out = np.full((len(theta), len(windows.trajectories), len(windows.channels)), np.nan)
     for k in range(len(windows.trajectories)):
@@ -76,33 +76,42 @@ def _squares(windows: Windows, theta: FloatArray) -> FloatArray:
 
 
 def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
-    """theta (N,) against the model as given; None where there is nothing finite to compare.
+    """Errors of theta against those of the model as given.
 
-    The mean over logs and channels of log(RMSE as given / RMSE of theta), with the jackknife's standard error over tenths of each
-    log, which takes the errors of both models and all channels out together (a paired t-test on pieces of time). It speaks of these logs,
-    not of others that the machine might give; in a log of few windows the pieces of one share its start, and p is too small.
+    The mean over logs and channels of log(RMSE as given / RMSE of theta), with the jackknife's standard error over
+    tenths of each log, which takes the errors of both models and all channels out together (a paired t-test on pieces of
+    time). It speaks of these logs, not of others that the machine might give; in a log of few windows the pieces of one
+    share its start, and p is too small.
 
-    Where measured starts make nearly all of theta's error (velocities from noisy positions), both models are compared from the starts that
-    each fits best."""
+    Where measured starts make nearly all of theta's error (velocities from noisy positions), both models are compared
+    from the starts that each fits best.
+
+    Args:
+        windows: the logs.
+        theta: (N,).
+
+    Returns:
+        None where there is nothing finite to compare.
+    """
     thetas = np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)])
     square = _squares(windows, thetas)
     fitted = _best_squares(windows, theta)
     share = _share_of_starts(windows, square[0], fitted)
-    if share > _MOSTLY:
+    if share > THRESHOLDS.starts_rule:
         other = _best_squares(windows, thetas[1])
         square, share = (np.stack([fitted, other]), share) if np.isfinite(other).all() else (square, 0.0)
     parts = []  # of each log: sums (2, pieces, C)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
-        rows, there = square[:, mine].reshape(2, -1, square.shape[-1]), windows.owned[mine].ravel()
-        pieces = np.array_split(rows[:, there], _PIECES, axis=1)
+        rows, owned = square[:, mine].reshape(2, -1, square.shape[-1]), windows.owned[mine].ravel()
+        pieces = np.array_split(rows[:, owned], _PIECES, axis=1)
         sums = np.stack([piece.sum(1) for piece in pieces], axis=1)
-        sound = np.isfinite(sums).all((0, 1)) & (np.count_nonzero(sums, axis=1) > 1).all(0)
-        if sound.any():
-            parts.append(sums[:, :, sound])
+        usable = np.isfinite(sums).all((0, 1)) & (np.count_nonzero(sums, axis=1) > 1).all(0)
+        if usable.any():
+            parts.append(sums[:, :, usable])
     if not parts:
         return None
-    return replace(_jackknifed(parts), starts=share if share > _MOSTLY else None)
+    return replace(_jackknifed(parts), starts=share if share > THRESHOLDS.starts_rule else None)
 
 
 def _best_squares(windows: Windows, theta: FloatArray) -> FloatArray:
@@ -115,7 +124,10 @@ def _best_squares(windows: Windows, theta: FloatArray) -> FloatArray:
 
 
 def _share_of_starts(windows: Windows, square: FloatArray, fitted: FloatArray) -> float:
-    """How much smaller squared errors (W, L, C) in units of each channel's spread are from fitted starts; 0 where either is infinite."""
+    """How much smaller squared errors (W, L, C) are from fitted starts; 0 where either is infinite.
+
+    They are in units of each channel's spread.
+    """
     if not (np.isfinite(square).all() and np.isfinite(fitted).all()):
         return 0.0
     spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
@@ -152,12 +164,12 @@ def _unit(windows: Windows, channel: int) -> str:
 
 def channel_scores(windows: Windows, theta: FloatArray) -> list[ChannelScore]:
     """One row for each log and channel, theta (N,) beside the model as given."""
-    found = errors(windows, np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)]))
+    rmse = errors(windows, np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)]))
     return [
-        ChannelScore(log, name, _unit(windows, c), float(found[0, k, c]), float(found[1, k, c]))
+        ChannelScore(log, name, _unit(windows, c), float(rmse[0, k, c]), float(rmse[1, k, c]))
         for k, log in enumerate(windows.trajectories.names)
         for c, name in enumerate(windows.fitted)
-        if not np.isnan(found[0, k, c])
+        if not np.isnan(rmse[0, k, c])
     ]
 
 
@@ -168,7 +180,15 @@ def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
 
 
 def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior, seed: int) -> list[Signal]:
-    """What the report draws of each log and channel."""
+    """What the report draws of each log and channel.
+
+    Args:
+        windows: the logs.
+        use: ``train`` or ``holdout``.
+        theta: (N,) the mode.
+        posterior: whose draws make the band.
+        seed: of the draws.
+    """
     space = windows.simulator.space
     draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
     thetas = np.concatenate([theta[None], np.clip(space.default_theta, 0, 1)[None], draws])
@@ -211,7 +231,14 @@ def white_noise(windows: Windows, theta: FloatArray) -> Noise:
 
 
 def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray) -> list[Residual]:
-    """Residuals at theta (N,) and starts (W, D)."""
+    """Residuals of each log and channel.
+
+    Args:
+        windows: the logs.
+        theta: (N,).
+        noise: (C,) that whitens them.
+        starts: (W, D) of the windows.
+    """
     residual = windows.residuals(theta[None], starts[None])[0][0]
     white = np.full((*residual.shape[:2], residual.shape[2]), np.nan)
     for c, s in enumerate(windows.sequences):

@@ -3,7 +3,8 @@
 From the same starts and under the same random actions, a parameter's value is changed by 10 % while the others stay at
 theta = 0.5; its sensitivity is the root-mean-square change of the observations, each in units of its own spread over the
 undisturbed episodes (at least 0.001 of its unit) and at most 1, so that a channel that hardly varies does not drown the
-others. What random actions never touch, such as an object out of reach, counts as changing nothing. Episodes are short, since a contact-rich simulation multiplies any change in the long run.
+others. What random actions never touch, such as an object out of reach, counts as changing nothing. Episodes are short,
+since a contact-rich simulation multiplies any change in the long run.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
 
 LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta
-DEAD = 1e-3  # of the spread: below it a change moves nothing
 _CHANGE = 0.1  # of the value
 _EPISODES, _STEPS = 8, 25
 _LEAST_SPREAD = 1e-3  # m, rad, m/s, N, ...
@@ -34,21 +35,34 @@ class Sensitivity:
     @property
     def dead(self) -> list[str]:
         """Parameters that change nothing, in words."""
-        return [name for name, column in zip(self.names, self.moved.T, strict=True) if (column < DEAD).all()]
+        return [
+            name
+            for name, column in zip(self.names, self.moved.T, strict=True)
+            if (column < THRESHOLDS.sensitivity).all()
+        ]
 
     @property
     def dead_ranges(self) -> dict[str, list[float]]:
         """For parameters that matter elsewhere: the levels of theta at which they change nothing."""
-        found = {}
+        dead = {}
         for name, column in zip(self.names, self.moved.T, strict=True):
-            if (column < DEAD).any() and not (column < DEAD).all():
-                found[name] = [level for level, moved in zip(LEVELS, column, strict=True) if moved < DEAD]
-        return found
+            if (column < THRESHOLDS.sensitivity).any() and not (column < THRESHOLDS.sensitivity).all():
+                dead[name] = [
+                    level for level, moved in zip(LEVELS, column, strict=True) if moved < THRESHOLDS.sensitivity
+                ]
+        return dead
 
 
 def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
-    """Measure a task's sensitivities by 2 N x 5 x 8 short rollouts; raises ValueError for an environment without
-    starting states."""
+    """Measure a task's sensitivities by 2 N x 5 x 8 short rollouts.
+
+    Args:
+        simulator: of a task.
+        seed: of starts and actions.
+
+    Raises:
+        ValueError: for an environment without starting states.
+    """
     task = simulator.environment
     if not isinstance(task, Task):
         raise ValueError(f"sensitivity: expected a task of `sipe envs`, got {type(task).__name__}")
@@ -59,11 +73,11 @@ def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
 
     def observe(theta: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Observations (L, episodes, steps, O) of theta (L, N) and where they are valid."""
-        lanes = np.repeat(theta, _EPISODES, axis=0)
+        batch = np.repeat(theta, _EPISODES, axis=0)
         tile = len(theta)
         targets = None if goals is None else np.tile(goals, (tile, 1))
         motion = simulator.rollout(
-            lanes, np.tile(actions, (tile, 1, 1)), np.tile(starts, (tile, 1)), goals=targets, allow_outside=True
+            batch, np.tile(actions, (tile, 1, 1)), np.tile(starts, (tile, 1)), goals=targets, allow_outside=True
         )
         shape = (tile, _EPISODES, steps + 1)
         return motion.observations.reshape(*shape, -1)[:, :, 1:], motion.valid.reshape(shape)[:, :, 1:]
