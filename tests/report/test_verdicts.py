@@ -1,0 +1,201 @@
+"""What is thought of a calibration, from codes and numbers, and in which words."""
+
+import dataclasses
+import math
+
+import pytest
+
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
+from sipe_bayes.diagnostics.records import (
+    ChannelScore,
+    Comparison,
+)
+from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
+from sipe_bayes.report import page as report
+from sipe_bayes.report import verdicts as judged
+from sipe_bayes.report.words import significant
+from tests.problems.calibrations import (
+    BETTER,
+    LACKS,
+    Page,
+    make_calibration,
+    noticed,
+    with_chains,
+)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return make_calibration()
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "text"),
+    [
+        (0.69751, 0.00301, "0.6975"),
+        (0.00301, 0.00301, "0.0030"),
+        (123.456, 7.0, "123.5"),
+        (123456.0, 2300.0, "123500"),
+        (-0.0001, 0.5, "0.00"),
+        (3.213e-5, 1.1e-6, "3.21e-5"),
+        (0.0999, 0.0996, "0.10"),
+        (9.80665, 0.0, "9.807"),
+        (math.nan, 1.0, "–"),
+    ],
+)
+def test_significant_digits_follow_the_uncertainty(value: float, sd: float, text: str) -> None:
+    assert significant(value, sd) == text
+
+
+def parameter(contraction: float = 0.9, nuisance: bool = False) -> ParameterSummary:
+    return ParameterSummary("mass", "kg", (), 1, 0.1, 0.9, 1, 1.1, 1, 1, contraction, nuisance)
+
+
+def of_mass(*codes: Code) -> Findings:
+    return Findings(noticed(code, "mass") for code in codes)
+
+
+@pytest.mark.parametrize(
+    ("summary", "codes", "tone", "words"),
+    [
+        (parameter(0.9), (), "good", "determined"),
+        (parameter(0.5), (), "fair", "weakly determined"),
+        (parameter(0.05), (Code.NOT_DETERMINED,), "bad", "not determined"),
+        (parameter(0.99), (Code.MODE_AT_BOUND,), "bad", "at a bound"),
+        (parameter(0.0), (Code.NO_EFFECT, Code.NOT_DETERMINED), "bad", "changes nothing, not determined"),
+        (parameter(0.99), (Code.LOGS_DISAGREE,), "bad", "disagrees between logs"),
+        (parameter(0.99), (Code.LOGS_DISAGREE_UNEXPLAINED,), "bad", "disagrees between logs"),
+        (parameter(0.99), (Code.MISFIT_SHIFTS,), "bad", "model lacks something"),
+        (parameter(0.99), (Code.MODE_AT_BOUND, Code.MISFIT), "bad", "at a bound, model lacks something"),
+        (parameter(0.99), (Code.DEAD_RANGE,), "fair", "part of its range changes nothing"),
+        (dataclasses.replace(parameter(1.0), sd=0.0), (), "fair", "a point without uncertainty"),
+    ],
+)
+def test_verdict_on_a_parameter(summary: ParameterSummary, codes: tuple[Code, ...], tone: str, words: str) -> None:
+    found = judged.parameter_verdict(summary, of_mass(*codes))
+    assert found.tone == tone
+    assert words in found.text
+    other = judged.parameter_verdict(dataclasses.replace(summary, name="other"), of_mass(*codes))
+    assert other == judged.parameter_verdict(summary, Findings())
+
+
+def test_a_member_of_a_ridge_is_determined_only_with_the_others() -> None:
+    def seen(contraction: float, *codes: Code, members: tuple[str, ...] = ("mass", "length")) -> judged.Verdict:
+        findings = [noticed(Code.RIDGE_TO_RESOLVE, *members), *of_mass(*codes)]
+        return judged.parameter_verdict(parameter(contraction), Findings(findings))
+
+    for codes in ((), (Code.NOT_DETERMINED,)):
+        found = seen(0.3, *codes)
+        assert (found.tone, found.text) == ("fair", "only with length")
+    assert seen(0.9).text == "determined"
+    assert seen(0.3, Code.MODE_AT_BOUND).text == "at a bound"
+    assert seen(0.0, Code.NO_EFFECT, Code.NOT_DETERMINED).tone == "bad"
+    assert seen(0.3, Code.NOT_DETERMINED, members=("a", "b")).tone == "bad"
+
+
+def scores(*pairs: tuple[float, float]) -> list[ChannelScore]:
+    return [ChannelScore("log", f"c{i}", "rad", ours, default) for i, (ours, default) in enumerate(pairs)]
+
+
+WORSE = Comparison(1 / 3.1, 1 / 3.7, 1 / 2.6, 1e-6, 10)
+ALIKE = Comparison(1.1, 0.8, 1.5, 0.6, 10)
+
+
+@pytest.mark.parametrize(
+    ("rows", "comparison", "tone", "words"),
+    [
+        (
+            scores((0.1, 0.31)),
+            BETTER,
+            "good",
+            "better than the model you had: its error is 3.1 times smaller (95 % interval 2.6 to",
+        ),
+        (
+            scores((0.31, 0.1)),
+            WORSE,
+            "bad",
+            "WORSE than the model you had: its error is 3.1 times larger (95 % interval 2.6 to 3.7",
+        ),
+        (
+            scores((0.1, 0.11)),
+            ALIKE,
+            "bad",
+            "NOT shown that the calibrated model is better than the model you had: its error is 1.1 times smaller",
+        ),
+        (scores((0.1, 9.0), (0.3, 0.2)), BETTER, "fair", "but it is larger in log (c1)"),
+        (scores((0.1, 0.102)), Comparison(1.02, 1.01, 1.03, 0.01, 10), "fair", "1.02 times smaller"),
+        (scores((0.1, math.nan)), None, "fair", "cannot be compared"),
+        (scores((math.nan, 0.1)), None, "bad", "no finite error in log (c0)"),
+        ([], None, "fair", "No log was held out"),
+    ],
+)
+def test_verdict_on_the_prediction(
+    rows: list[ChannelScore], comparison: Comparison | None, tone: str, words: str
+) -> None:
+    found = judged.prediction(rows, comparison)
+    assert found.tone == tone
+    assert words in found.text
+    assert (comparison is None) == ("t-test" not in found.text)
+
+
+def test_a_calibration_that_does_not_help_says_so_first(calibration: Calibration) -> None:
+    for comparison, first in ((WORSE, "WORSE"), (ALIKE, "NOT shown"), (BETTER, "may be trusted")):
+        found = dataclasses.replace(calibration, comparison=comparison)
+        assert first in judged.verdicts(found)[0].text
+        page = Page(report.render(found, [])).text
+        assert page.index(first) < page.index("90 % interval")
+
+
+def test_what_the_model_lacks_is_among_the_first_sentences(calibration: Calibration) -> None:
+    assert judged.lack(calibration) is None
+    found = judged.lack(dataclasses.replace(calibration, misfit=LACKS))
+    assert found is not None
+    assert found.tone == "bad"
+    assert "drag at hinge (40 % of the residual of angle_0, p = 0.005)" in found.text
+    small = judged.lack(
+        dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, share={"angle_0": 0.04}, shift={}))
+    )
+    assert small is not None
+    assert small.tone == "fair"
+    assert "something small" in small.text
+    assert judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, p=0.2))) is None
+    strange = dataclasses.replace(calibration, outside=[OutsidePrior(0.01, "train_0", "angle_0", 1.0)], misfit=LACKS)
+    assert strange.to_dict()["outside_prior"][0]["log"] == "train_0"
+    assert strange.to_dict()["misfit"]["matters"]
+
+
+def test_headline_counts_without_nuisance_parameters() -> None:
+    good, weak, nuisance = parameter(0.9), parameter(0.5), parameter(0.9, nuisance=True)
+
+    def seen(*values: ParameterSummary) -> judged.Verdict:
+        return judged.headline(values, Findings())
+
+    words = "1 of 2 values may be trusted within their intervals: mass; the table says why not the others."
+    assert seen(good, weak, nuisance).text == words
+    assert seen(good, good).text == "All 2 values may be trusted within their intervals."
+    assert seen(good).tone == "good"
+    assert seen(weak, weak).tone == "bad"
+    assert seen(nuisance).tone == "fair"
+    doubts = Findings(doubt(text) for text in ("the chains have not mixed", "another", "a third"))
+    for values in ([good, weak], [weak]):
+        words = "the chains have not mixed; another; and 1 more, among the warnings"
+        expected = judged.Verdict("bad", f"No value may be trusted within its interval yet: {words}.")
+        assert judged.headline(values, doubts) == expected
+    assert judged.parameter_verdict(good, Findings()).tone == "good"
+    assert judged.parameter_verdict(good, doubts).tone == "fair"
+
+
+def doubt(text: str, code: Code = Code.REMARK) -> Finding:
+    return noticed(code, severity=Severity.BLOCKING, text=text)
+
+
+def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> None:
+    unmixed = doubt("the chains have not mixed", Code.NOT_MIXED)
+    found = dataclasses.replace(with_chains(calibration, 1.4), comparison=BETTER, findings=(unmixed,))
+    texts = [v.text for v in judged.verdicts(found)]
+    assert texts[0].endswith("yet: the chains have not mixed.")
+    assert not any("NOT mixed" in text for text in texts)
+    texts = [v.text for v in judged.verdicts(dataclasses.replace(found, findings=(doubt("another"),)))]
+    assert any("NOT mixed" in text for text in texts)
+    assert "but see the doubt above" in report.render(found, [])
