@@ -26,7 +26,8 @@ from sipe_bayes.calibration.config_fields import nearest
 from sipe_bayes.calibration.config_tables import Command, LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, control_grid, held, sampled
 from sipe_bayes.calibration.log_report import report_of
-from sipe_bayes.calibration.tables import Columns, LogError, read_table
+from sipe_bayes.calibration.readers.base import Columns, LogError
+from sipe_bayes.calibration.tables import read_table
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert

@@ -16,7 +16,8 @@ from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.log_report import count_clipped
 from sipe_bayes.calibration.logs import load_log
-from sipe_bayes.calibration.tables import LogError, read_table
+from sipe_bayes.calibration.readers.base import LogError
+from sipe_bayes.calibration.tables import read_table
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
 

@@ -1,0 +1,65 @@
+"""CSV: separated by comma, semicolon, tab or blanks; the first line names the columns."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Literal
+
+from sipe_bayes.calibration.readers.base import Columns, LogError, frame_columns
+
+
+def read_csv(path: Path) -> Columns:
+    """The columns; a comma is the decimal sign where semicolons separate."""
+    import pandas as pd
+
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        header, first = file.readline().rstrip("\r\n"), file.readline()
+    separator = _separator(header)
+    names = [name.strip() for name in _split(header.lstrip("# "), separator)]
+    if any(_is_number(name) for name in names):
+        raise LogError(f"{path}: the first line must name the columns, got {header[:40]!r}; add a header line")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise LogError(f"{path}: column {twice[0]!r} appears more than once; rename one of them")
+    frame = pd.read_csv(
+        path,
+        sep=separator,
+        names=names,
+        skiprows=1,
+        index_col=False,
+        decimal="," if separator == ";" and "," in first and "." not in first else ".",
+        skipinitialspace=True,
+        encoding="utf-8-sig",
+        float_precision=_float_precision(pd.__version__),
+    )
+    return frame_columns(frame)
+
+
+def _float_precision(version: str) -> Literal["round_trip"] | None:
+    """What makes this pandas read every float exactly; from 3.1 it always does."""
+    major, minor = (int(part) for part in version.split(".")[:2])
+    return None if (major, minor) >= (3, 1) else "round_trip"
+
+
+def _separator(header: str) -> str:
+    for separator in (",", ";", "\t"):
+        if separator in header:
+            return separator
+    return r"\s+"
+
+
+def _split(header: str, separator: str) -> list[str]:
+    return (
+        header.split()
+        if separator == r"\s+"
+        else next(csv.reader([header], delimiter=separator, skipinitialspace=True))
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return text.strip().lower() not in ("nan", "inf", "infinity")
