@@ -39,7 +39,7 @@ class SearchState(Protocol):
 S = TypeVar("S")
 
 
-def save_state(path: Path, state: Any, fingerprint: str) -> None:
+def save_state(path: Path, state: object, fingerprint: str) -> None:
     """Write a state.
 
     Args:

@@ -14,8 +14,10 @@ from typing import Any
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path to write to, which becomes ``path`` at the end and is removed where something fails; missing folders are
-    made."""
+    """A temporary path to write to, which becomes ``path`` at the end and is removed where something fails.
+
+    Missing folders are made.
+    """
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -26,11 +28,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
+    """Write a whole file."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
+    """Write a whole file of UTF-8."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -39,7 +43,7 @@ class OutputError(ValueError):
     """An output folder that cannot be used."""
 
 
-def to_json(data: Any, indent: int | None = None) -> str:
+def to_json(data: object, indent: int | None = None) -> str:
     """JSON as the standard has it: what is not a finite number becomes null."""
     return json.dumps(_finite(data), indent=indent, allow_nan=False)
 

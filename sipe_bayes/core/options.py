@@ -15,20 +15,22 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class Limits:
-    """What an option is and may be. least, most: inclusive; above, below: exclusive; among: the legal values."""
+    """What an option is and may be; see ``option``."""
 
     why: str
     unit: str = ""
@@ -59,7 +61,7 @@ class Limits:
 
 
 def option(
-    default: Any,
+    default: T,
     why: str,
     unit: str = "",
     *,
@@ -68,10 +70,22 @@ def option(
     above: float | None = None,
     below: float | None = None,
     among: Iterable[str] = (),
-) -> Any:
-    """A field of ``Options``: its default, what it does and why it is so, its unit and its limits."""
+) -> T:
+    """A field of ``Options``.
+
+    Args:
+        default: its value where none is given.
+        why: what it does, and why it is so.
+        unit: of the value.
+        least: inclusive lower limit.
+        most: inclusive upper limit.
+        above: exclusive lower limit.
+        below: exclusive upper limit.
+        among: the legal texts.
+    """
     limits = Limits(why, unit, least, most, above, below, tuple(among))
-    return dataclasses.field(default=default, metadata={"limits": limits})
+    field: T = dataclasses.field(default=default, metadata={"limits": limits})
+    return field
 
 
 @dataclass(frozen=True)
@@ -91,7 +105,7 @@ class Options:
             )
 
     @classmethod
-    def of(cls, given: dict[str, Any], method: str) -> Self:
+    def of(cls, given: Mapping[str, object], method: str) -> Self:
         """Options from keyword arguments; raises TypeError for a name that ``method`` does not take."""
         names = [field.name for field in dataclasses.fields(cls)]
         for name in given:
@@ -99,9 +113,10 @@ class Options:
                 raise TypeError(
                     f"{method}: takes no option {name!r}{nearest_name(name, names)}; it takes {', '.join(names)}"
                 )
-        return cls(**given)
+        make: Callable[..., Self] = cls
+        return make(**given)
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> dict[str, object]:
         """Names and values as JSON has them, for fingerprints and records."""
         return {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
 
@@ -133,9 +148,8 @@ def _checked(name: str, value: Any, hint: Any, limits: Limits) -> Any:
     kind = next((c for c in choices if c is not type(None)), object)
     if limits.among:
         if not isinstance(value, str) or value not in limits.among:
-            raise ValueError(
-                f"{name}: expected one of {', '.join(limits.among)}, got {value!r}{nearest_name(str(value), limits.among)}"
-            )
+            hint = nearest_name(str(value), limits.among)
+            raise ValueError(f"{name}: expected one of {', '.join(limits.among)}, got {value!r}{hint}")
         return value
     if kind is bool:
         if not isinstance(value, bool):

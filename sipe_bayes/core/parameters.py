@@ -7,29 +7,54 @@ numbers in physical units. A parameter on a linear scale maps affinely, one on a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Literal, overload
+from typing import Literal, TypedDict, cast, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
+
+from sipe_bayes.core.arrays import FloatArray
 
 Scale = Literal["linear", "log"]
-FloatArray = NDArray[np.float64]
+
+
+class Plain(TypedDict, total=False):
+    """A Parameter as JSON has it."""
+
+    name: str
+    low: float
+    high: float
+    default: float | None
+    unit: str
+    scale: Scale
+    targets: list[str]
+    relative: bool
+    log: str | None
+    prior_mean: float | None
+    prior_sd: float | None
+    description: str
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One unknown of a simulator.
 
-    name: unique within its space. low, high: bounds in ``unit``. default: the model's own value, if it has
-    one within the bounds. scale: how theta in [0, 1] maps to the value. targets: what the value is written
-    to, in the words of the environment. relative: until the environment has filled in the model's own value,
-    the bounds are factors of it; several targets then keep their proportions. log: set when the value holds
-    for that log alone (a nuisance parameter). prior_mean, prior_sd: a normal prior in ``unit`` truncated to
-    the bounds; without them the prior is uniform in theta. On a log scale the normal is one of the logarithm,
-    with relative sd ``prior_sd / prior_mean``.
+    Args:
+        name: unique within its space.
+        low: lower bound in ``unit``.
+        high: upper bound in ``unit``.
+        default: the model's own value, if it has one within the bounds.
+        unit: of bounds, default and prior.
+        scale: how theta in [0, 1] maps to the value.
+        targets: what the value is written to, in the words of the environment.
+        relative: until the environment has filled in the model's own value, the bounds are factors of it; several
+            targets then keep their proportions.
+        log: set when the value holds for that log alone (a nuisance parameter).
+        prior_mean: of a normal prior in ``unit``, truncated to the bounds; without it the prior is uniform in theta.
+        prior_sd: of that prior. On a log scale it is one of the logarithm, with relative sd ``prior_sd / prior_mean``.
+        description: for people.
     """
 
     name: str
@@ -80,13 +105,26 @@ class Parameter:
         if self.scale == "log" and self.prior_mean is not None and self.prior_mean <= 0:
             raise ValueError(f"{where}: prior mean must be positive on a log scale, got {self.prior_mean}")
 
-    def normalise(self, value: Any) -> Any:
+    @overload
+    def normalise(self, value: float) -> float: ...
+
+    @overload
+    def normalise(self, value: FloatArray) -> FloatArray: ...
+
+    def normalise(self, value: float | FloatArray) -> float | FloatArray:
         """Theta of a value in ``unit`` (scalar or array)."""
         if self.scale == "log":
-            return np.log(np.asarray(value) / self.low) / math.log(self.high / self.low)
+            scaled: FloatArray = np.log(np.asarray(value) / self.low) / math.log(self.high / self.low)
+            return scaled
         return (np.asarray(value) - self.low) / (self.high - self.low)
 
-    def value(self, theta: Any) -> Any:
+    @overload
+    def value(self, theta: float) -> float: ...
+
+    @overload
+    def value(self, theta: FloatArray) -> FloatArray: ...
+
+    def value(self, theta: float | FloatArray) -> float | FloatArray:
         """The value in ``unit`` of theta (scalar or array)."""
         if self.scale == "log":
             return self.low * np.exp(np.asarray(theta) * math.log(self.high / self.low))
@@ -113,7 +151,8 @@ class ParameterSpace(Sequence[Parameter]):
         if given is None or not all(isinstance(p, Parameter) for p in given):
             what = f"a {type(parameters).__name__}" + (" of other things" if given is not None else "")
             raise ValueError(
-                f"parameters: expected a list of Parameters, got {what}; ParameterSpace([Parameter(name, low, high), ...])"
+                f"parameters: expected a list of Parameters, got {what}; make ParameterSpace([Parameter(name, low, "
+                "high), ...])"
             )
         self._parameters = given
         names = [p.name for p in self._parameters]
@@ -149,13 +188,15 @@ class ParameterSpace(Sequence[Parameter]):
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Of the parameters, in order."""
         return tuple(p.name for p in self._parameters)
 
     @property
     def units(self) -> tuple[str, ...]:
+        """Of the parameters, in order."""
         return tuple(p.unit for p in self._parameters)
 
-    def index(self, name: str, *_: Any) -> int:
+    def index(self, name: str, *_: object) -> int:
         """Position of the parameter called ``name``."""
         try:
             return self.names.index(name)
@@ -166,32 +207,32 @@ class ParameterSpace(Sequence[Parameter]):
         """The space of some parameters, in the order given."""
         return ParameterSpace(self._parameters[self.index(n)] for n in names)
 
-    def values(self, theta: Any) -> FloatArray:
+    def values(self, theta: ArrayLike) -> FloatArray:
         """Physical values (..., N) of theta (..., N)."""
-        theta = self.check_shape(theta)
-        return np.stack([p.value(theta[..., j]) for j, p in enumerate(self._parameters)], -1)
+        checked = self.check_shape(theta)
+        return np.stack([p.value(checked[..., j]) for j, p in enumerate(self._parameters)], -1)
 
-    def normalise(self, values: Any) -> FloatArray:
+    def normalise(self, values: ArrayLike) -> FloatArray:
         """Theta (..., N) of physical values (..., N)."""
-        values = self.check_shape(values)
-        return np.stack([p.normalise(values[..., j]) for j, p in enumerate(self._parameters)], -1)
+        checked = self.check_shape(values)
+        return np.stack([p.normalise(checked[..., j]) for j, p in enumerate(self._parameters)], -1)
 
     @property
     def default_theta(self) -> FloatArray:
         """Theta (N,) of the model's own values; 0.5 where a parameter has none."""
         return np.array([0.5 if p.default is None else float(p.normalise(p.default)) for p in self._parameters])
 
-    def check_shape(self, array: Any) -> FloatArray:
+    def check_shape(self, array: ArrayLike) -> FloatArray:
         """``array`` as float64 (..., N); raises ValueError when it is not numbers or its last axis is not N."""
         try:
-            array = np.asarray(array, dtype=np.float64)
+            checked = np.asarray(array, dtype=np.float64)
         except (TypeError, ValueError):
             raise ValueError(
                 f"expected numbers, {len(self)} parameters on the last axis, got a {type(array).__name__}"
             ) from None
-        if array.ndim == 0 or array.shape[-1] != len(self):
-            raise ValueError(f"expected {len(self)} parameters on the last axis, got shape {array.shape}")
-        return array
+        if checked.ndim == 0 or checked.shape[-1] != len(self):
+            raise ValueError(f"expected {len(self)} parameters on the last axis, got shape {checked.shape}")
+        return checked
 
     def difference(self, other: ParameterSpace) -> str:
         """In words what makes a theta of this space another one of ``other``, empty where nothing does."""
@@ -203,10 +244,13 @@ class ParameterSpace(Sequence[Parameter]):
                 return f"has {mine.name} {ours}, and {others}"
         return ""
 
-    def to_dict(self) -> list[dict[str, Any]]:
+    def to_dict(self) -> list[Plain]:
         """Plain data, for JSON."""
-        return [{**p.__dict__, "targets": list(p.targets)} for p in self._parameters]
+        return [cast(Plain, {**p.__dict__, "targets": list(p.targets)}) for p in self._parameters]
 
     @classmethod
-    def from_dict(cls, items: list[dict[str, Any]]) -> ParameterSpace:
-        return cls(Parameter(**{**item, "targets": tuple(item.get("targets", ()))}) for item in items)
+    def from_dict(cls, items: Iterable[Plain]) -> ParameterSpace:
+        """What ``to_dict`` made; raises TypeError for anything else."""
+        given: list[dict[str, object]] = [{**item, "targets": tuple(item.get("targets", ()))} for item in items]
+        make: Callable[..., Parameter] = Parameter
+        return cls(make(**item) for item in given)

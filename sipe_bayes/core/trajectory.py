@@ -1,7 +1,7 @@
 """Recorded or simulated motion: one ``Trajectory``, or a padded batch ``Trajectories``.
 
-Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state), rewards (T,); dt in seconds.
-Action t is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``:
+Shapes: observations (T+1, O), actions (T, A), states (T+1, S: MuJoCo's full physics state), rewards (T,); dt in
+seconds. Action t is held from sample t to sample t+1. A sample that is missing from a log is NaN in ``observations``:
 masked, never invented.
 """
 
@@ -14,20 +14,26 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.files import replacing
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """One trajectory of T control steps, ``dt`` seconds apart.
 
-    observations (T+1, O), NaN where there is no measurement; actions (T, A), finite; states (T+1, S) or None;
-    rewards (T,) or None. ``name`` is the log's name; ``channels`` names the O observed quantities.
+    Args:
+        observations: (T+1, O), NaN where there is no measurement.
+        actions: (T, A), finite.
+        dt: seconds between samples.
+        states: (T+1, S), if known.
+        name: of the log.
+        channels: names of the O observed quantities.
+        rewards: (T,), if known.
+
+    Raises:
+        ValueError: for shapes that do not fit together, and for actions that are not finite.
     """
 
     observations: FloatArray
@@ -95,18 +101,25 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Trajectories(Sequence[Trajectory]):
-    """A padded batch: observations (B, T+1, O), actions (B, T, A), states (B, T+1, S) or None, dt (B,),
-    length (B,), rewards (B, T) or None: of simulated tasks, zero where a step was not valid, going on after a task's end.
+    """A padded batch: an integer index gives a Trajectory, a slice or an array of them Trajectories.
 
-    Padding is NaN in observations and states, zero in actions. ``valid`` (B, T+1) is False from the first
-    sample of a diverged simulation on, and on padding; it is all True on recorded samples. An integer index
-    gives a Trajectory, a slice or an array of them Trajectories that keep ``valid``.
+    Args:
+        observations: (B, T+1, O), NaN on padding.
+        actions: (B, T, A), zero on padding.
+        dt: seconds between samples (B,).
+        length: control steps (B,).
+        valid: (B, T+1), False from the first sample of a diverged simulation on, and on padding; all True on recorded
+            samples.
+        states: (B, T+1, S), NaN on padding, if all of them are known.
+        names: of the B logs.
+        channels: names of the O observed quantities.
+        rewards: (B, T), if known: of simulated tasks, zero where a step was not valid, going on after a task's end.
     """
 
     observations: FloatArray
     actions: FloatArray
     dt: FloatArray
-    length: NDArray[np.int64]
+    length: IntArray
     valid: BoolArray
     states: FloatArray | None = None
     names: tuple[str, ...] = ()
@@ -115,8 +128,13 @@ class Trajectories(Sequence[Trajectory]):
 
     @classmethod
     def stack(cls, trajectories: Trajectory | Iterable[Trajectory] | Trajectories) -> Trajectories:
-        """A batch of one or several trajectories, which may differ in length and dt. States and rewards are kept where all
-        of them have them."""
+        """A batch of one or several trajectories, which may differ in length and dt.
+
+        States and rewards are kept where all of them have them.
+
+        Raises:
+            ValueError: for none, or for channels, actions or states of different sizes.
+        """
         if isinstance(trajectories, Trajectories):
             return trajectories
         items = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
@@ -164,10 +182,10 @@ class Trajectories(Sequence[Trajectory]):
     def __getitem__(self, key: int | np.integer) -> Trajectory: ...
 
     @overload
-    def __getitem__(self, key: slice | Sequence[int] | NDArray[np.int64] | BoolArray) -> Trajectories: ...
+    def __getitem__(self, key: slice | Sequence[int] | IntArray | BoolArray) -> Trajectories: ...
 
     def __getitem__(
-        self, key: int | np.integer | slice | Sequence[int] | NDArray[np.int64] | BoolArray
+        self, key: int | np.integer | slice | Sequence[int] | IntArray | BoolArray
     ) -> Trajectory | Trajectories:
         """One trajectory, cut to its own length, or a batch of those that are chosen."""
         if isinstance(key, (slice, Sequence, np.ndarray)):
@@ -180,7 +198,7 @@ class Trajectories(Sequence[Trajectory]):
         rewards = None if self.rewards is None else self.rewards[key, :n]
         return Trajectory(observations, actions, dt, states, name, self.channels, rewards)
 
-    def _subset(self, chosen: NDArray[np.int64]) -> Trajectories:
+    def _subset(self, chosen: IntArray) -> Trajectories:
         if not len(chosen):
             raise ValueError(f"trajectories: expected to choose at least one of {len(self)}, got none")
         length = self.length[chosen]

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from difflib import get_close_matches
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.validation import nearest_name
 
 _TABLE: dict[str, tuple[str, dict[str, float]]] = {
     "time": ("s", {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}),
@@ -58,9 +59,14 @@ def unit_words(dimension: str | None = None) -> list[str]:
 
 
 def find_unit(word: str, dimension: str | None = None) -> Unit:
-    """The unit called ``word``; with ``dimension``, it must be of that kind.
+    """The unit of a word.
 
-    Raises ValueError, in one line, on an unknown word and on a word of another dimension.
+    Args:
+        word: such as ``"deg"``.
+        dimension: that it has to be of, if any.
+
+    Raises:
+        ValueError: for an unknown word, and for a word of another dimension.
     """
     if dimension is not None and dimension not in _TABLE:
         raise ValueError(f"unknown dimension {dimension!r}; use one of {', '.join(DIMENSIONS)}")
@@ -74,22 +80,29 @@ def find_unit(word: str, dimension: str | None = None) -> Unit:
 
 
 def _unknown(word: str, dimension: str | None) -> str:
-    near = get_close_matches(word, unit_words(dimension), n=1) or [
-        w for w in unit_words(dimension) if w.lower() == word.lower()
-    ]
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    legal = ", ".join(repr(w) for w in unit_words(dimension))
-    return f"expected a unit word, got {word!r}; {hint}use one of {legal}"
+    words = unit_words(dimension)
+    same = next((w for w in words if w.lower() == word.lower()), None)
+    hint = nearest_name(word, words) or (f"; did you mean {same!r}?" if same else ";")
+    return f"expected a unit word, got {word!r}{hint} use one of {', '.join(map(repr, words))}"
 
 
 def to_si(unit: str) -> tuple[float, str]:
     """Factor to SI and the SI unit's name: ``to_si("deg") == (pi / 180, "rad")``."""
-    found = find_unit(unit)
-    return found.factor, found.si
+    word = find_unit(unit)
+    return word.factor, word.si
 
 
-def convert(values: Any, unit: str, dimension: str | None = None) -> NDArray[np.float64]:
-    """``values`` given in ``unit``, in SI; raises ValueError when ``unit`` is not of ``dimension``."""
+def convert(values: ArrayLike, unit: str, dimension: str | None = None) -> FloatArray:
+    """Values in SI.
+
+    Args:
+        values: in ``unit``, of any shape.
+        unit: a unit word.
+        dimension: that the unit has to be of.
+
+    Raises:
+        ValueError: for a word that is none, or of another dimension.
+    """
     factor = find_unit(unit, dimension).factor
-    values = np.asarray(values, dtype=np.float64)
-    return values if factor == 1.0 else values * factor
+    array = np.asarray(values, dtype=np.float64)
+    return array if factor == 1.0 else array * factor

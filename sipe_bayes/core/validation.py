@@ -8,48 +8,56 @@ import os
 from collections.abc import Iterable
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
 
 
-def whole(name: str, value: Any, least: int = 1, unit: str = "") -> int:
-    """``value`` as an int of at least ``least``; 1e3 is whole, True and "3" are not."""
-    plain = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
-    if isinstance(value, bool) or not plain:
+def whole(name: str, value: object, least: int = 1, unit: str = "") -> int:
+    """``value`` as a whole number; 1e3 is one, True and "3" are not.
+
+    Args:
+        name: of the argument, for the message.
+        value: what was given.
+        least: that it may be.
+        unit: of it, for the message.
+
+    Raises:
+        ValueError: for anything else, as all checks here do.
+    """
+    if isinstance(value, bool) or not isinstance(value, Real) or not float(value).is_integer():
         raise ValueError(f"{name}: expected a whole number, got {_shown(value)}; give one, such as {max(least, 1)}")
     if value < least:
         raise ValueError(f"{name}: expected at least {least}{unit and ' '}{unit}, got {value}")
-    return int(value)
+    return int(float(value)) if not isinstance(value, Integral) else int(value)
 
 
-def at_least(name: str, value: Any, least: float) -> float:
+def at_least(name: str, value: object, least: float) -> float:
     """``value`` as a finite float of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < math.inf:
         raise ValueError(f"{name}: expected at least {least:g}, got {_shown(value)}")
     return float(value)
 
 
-def positive(name: str, value: Any) -> float:
+def positive(name: str, value: object) -> float:
     """``value`` as a finite float above zero."""
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < math.inf:
         raise ValueError(f"{name}: expected a positive number, got {_shown(value)}")
     return float(value)
 
 
-def share(name: str, value: Any) -> float:
+def share(name: str, value: object) -> float:
     """``value`` as a float above zero and below one."""
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < 1:
         raise ValueError(f"{name}: expected a share above 0 and below 1, got {_shown(value)}")
     return float(value)
 
 
-def flag(name: str, value: Any) -> bool:
+def flag(name: str, value: object) -> bool:
     """``value`` if it is True or False."""
     if not isinstance(value, bool):
         raise ValueError(f"{name}: expected True or False, got {_shown(value)}")
     return value
 
 
-def one_of(name: str, value: Any, known: Iterable[str]) -> str:
+def one_of(name: str, value: object, known: Iterable[str]) -> str:
     """``value`` if it is one of the ``known`` texts."""
     known = tuple(known)
     if not isinstance(value, str) or value not in known:
@@ -57,7 +65,7 @@ def one_of(name: str, value: Any, known: Iterable[str]) -> str:
     return value
 
 
-def path(name: str, value: Any) -> Path | None:
+def path(name: str, value: object) -> Path | None:
     """``value`` as a Path; None stays."""
     if value is None:
         return None
@@ -66,7 +74,7 @@ def path(name: str, value: Any) -> Path | None:
     return Path(value)
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     """Short: a number or text as it is, of anything else the type."""
     return repr(value) if isinstance(value, Real | str | None) else f"a {type(value).__name__}"
 

@@ -7,22 +7,28 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pyro.distributions import TorchDistribution
 from torch import Generator, Tensor
 from torch.distributions import constraints
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import at_least, whole
-from sipe_bayes.posterior.storage import write_pair
+from sipe_bayes.posterior.storage import Header, write_pair
 
-REFERENCE_DRAWS = 20_000
-MARGINAL_DRAWS = 8_000
-_ROUNDING = 1e-6
+if TYPE_CHECKING:
+    import arviz
+
+Numbers = ArrayLike | Tensor
+"""A number or an array of numbers of any kind."""
+REFERENCE_DRAWS = 20_000  # of moments, quantiles and mode, where a family knows no better: 1 % of an sd
+MARGINAL_DRAWS = 8_000  # of marginals and wider ones, which are kept
+_ROUNDING = 1e-6  # theta that far outside the cube was rounded, and is clipped
 _POINT = 1e-12  # range of draws below which they are one point
 
 
@@ -30,14 +36,24 @@ class NoDensityError(RuntimeError):
     """Raised by ``log_prob`` of a posterior that is a set of points and has no density."""
 
 
-def as_float64(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
-    """``value`` as a finite float64 tensor of ``shape`` (None: any length); ValueError names ``name``."""
+def as_float64(name: str, value: Numbers, shape: Sequence[int | None]) -> Tensor:
+    """``value`` as a finite float64 tensor.
+
+    Args:
+        name: of the argument, for the message.
+        value: what was given.
+        shape: that it has to have; None stands for any length.
+
+    Raises:
+        ValueError: for another shape, or for what is not finite numbers.
+    """
     try:
         array = value if isinstance(value, Tensor) else np.asarray(value, dtype=np.float64)
         tensor = torch.as_tensor(array, dtype=torch.float64).detach()
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{name}: expected an array of numbers, got {type(value).__name__} ({error})") from error
-    if tensor.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, tensor.shape)):  # noqa: B905
+    as_wanted = (want in (None, got) for want, got in zip(shape, tensor.shape, strict=False))
+    if tensor.ndim != len(shape) or not all(as_wanted):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{name}: expected shape ({wanted}), got {tuple(tensor.shape)}; reshape it")
     if not torch.isfinite(tensor).all():
@@ -45,7 +61,7 @@ def as_float64(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
     return tensor
 
 
-def as_theta(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
+def as_theta(name: str, value: Numbers, shape: Sequence[int | None]) -> Tensor:
     """``as_float64`` within the unit cube; what rounding (1e-6) put outside is clipped, the rest refused."""
     theta = as_float64(name, value, shape)
     if theta.numel() and (theta.min() < -_ROUNDING or theta.max() > 1 + _ROUNDING):
@@ -56,14 +72,14 @@ def as_theta(name: str, value: Any, shape: Sequence[int | None]) -> Tensor:
     return theta.clamp(0.0, 1.0)
 
 
-def check_bandwidth(bandwidth: Any) -> float:
+def check_bandwidth(bandwidth: object) -> float:
     """``bandwidth`` as a positive float."""
     if isinstance(bandwidth, (int, float)) and 0 < bandwidth < float("inf"):
         return float(bandwidth)
     raise ValueError(f"bandwidth: expected a positive number in theta units, got {bandwidth!r}; try 0.02")
 
 
-def _drawn(name: str, given: Mapping[str, Any] | None, theta: Tensor) -> dict[str, NDArray[Any]]:
+def _drawn(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> dict[str, NDArray[Any]]:
     """Arrays (chain, draw, ...) by name, one for each draw of theta (chain, draw, N)."""
     arrays = {key: np.asarray(x) for key, x in (given or {}).items()}
     for key, x in arrays.items():
@@ -164,8 +180,7 @@ class Posterior(TorchDistribution):
 
     @cached_property
     def _reference(self) -> Tensor:
-        with torch.no_grad():
-            return self._sample(REFERENCE_DRAWS, Generator().manual_seed(0))
+        return self._fixed_draws(REFERENCE_DRAWS)
 
     @cached_property
     def _cached_moments(self) -> tuple[Tensor, Tensor]:
@@ -177,17 +192,30 @@ class Posterior(TorchDistribution):
         with torch.no_grad():
             return self._mode()
 
+    def _fixed_draws(self, n: int) -> Tensor:
+        """Draws (n, N) that are the same each time."""
+        with torch.no_grad():
+            return self._sample(n, Generator().manual_seed(0))
+
     def _expanded(self, value: Tensor) -> Tensor:
         return value.expand(*self.batch_shape, *value.shape)
 
-    def expand(self, batch_shape: Any, _instance: Any = None) -> Self:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> Self:
         """Independent copies in ``batch_shape``, as Pyro's plates ask for."""
         new = copy.copy(self)
         new._batch_shape = torch.broadcast_shapes(self.batch_shape, torch.Size(batch_shape))
         return new
 
-    def sample(self, sample_shape: Any = (), generator: Generator | None = None) -> Tensor:
-        """Exact draws (*sample_shape, *batch_shape, N); without a generator, from torch's global one."""
+    def sample(self, sample_shape: Sequence[int] = (), generator: Generator | None = None) -> Tensor:
+        """Exact draws.
+
+        Args:
+            sample_shape: how many, such as ``(1000,)``.
+            generator: of random numbers, default torch's global one.
+
+        Returns:
+            theta (*sample_shape, *batch_shape, N).
+        """
         try:
             shape = torch.Size(whole("sample_shape", size, 0) for size in sample_shape) + self.batch_shape
         except TypeError:
@@ -195,8 +223,19 @@ class Posterior(TorchDistribution):
         with torch.no_grad():
             return self._sample(shape.numel(), generator).reshape(*shape, len(self.space))
 
-    def log_prob(self, theta: Any) -> Tensor:
-        """Log density (...) of theta (..., N), -inf outside the cube; NoDensityError where there is none."""
+    def log_prob(self, theta: Numbers) -> Tensor:
+        """Log density.
+
+        Args:
+            theta: (..., N).
+
+        Returns:
+            (...), -inf outside the cube.
+
+        Raises:
+            NoDensityError: where there is none.
+            ValueError: for another shape.
+        """
         if not self.has_density:
             raise NoDensityError(f"{type(self).__name__} has no density; use .smoothed(bandwidth), a GaussianMixture")
         theta = torch.as_tensor(theta, dtype=torch.float64)
@@ -236,15 +275,22 @@ class Posterior(TorchDistribution):
         return self._expanded(self._cached_mode)
 
     def gaussian_moments(self) -> tuple[Tensor, Tensor]:
-        """Mean (N,) and covariance (N, N) of the Gaussian which, restricted to the cube, stands for this
-        posterior.
+        """The Gaussian which, restricted to the cube, stands for this posterior where it becomes a prior.
 
-        For an earlier posterior that becomes a prior. Moment-matched unless the family says it is exact.
+        Returns:
+            Mean (N,) and covariance (N, N); moment-matched unless the family says it is exact.
         """
         return self._cached_moments
 
-    def quantile(self, q: Any) -> Tensor:
-        """Quantiles of each parameter's marginal: (N,) for a number q, (Q, N) for a vector (Q,)."""
+    def quantile(self, q: Numbers) -> Tensor:
+        """Quantiles of each parameter's marginal.
+
+        Args:
+            q: a level in [0, 1], or several (Q,).
+
+        Returns:
+            (N,) for one level, (Q, N) for several.
+        """
         try:
             levels = torch.as_tensor(q, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError):
@@ -264,22 +310,28 @@ class Posterior(TorchDistribution):
     def marginal(self, names: Iterable[str]) -> Posterior:
         """The posterior of some parameters, in the order given: here Particles of 8,000 fixed-seed draws."""
         columns, space = self._columns(names)
-        with torch.no_grad():
-            draws = self._sample(MARGINAL_DRAWS, Generator().manual_seed(0))
-        return self.of_draws(draws[:, columns], space)
+        return self.of_draws(self._fixed_draws(MARGINAL_DRAWS)[:, columns], space)
 
     def wider(self, factor: float) -> Posterior:
-        """This posterior spread ``factor`` times as far about its mean, for cautious domain randomisation: Particles of 8,000 fixed-seed
-        draws, reflected where they would leave the cube. Raises ValueError for a factor below 1, and for a point, which has no spread."""
+        """This posterior spread further about its mean, for cautious domain randomisation.
+
+        Args:
+            factor: of the spread, at least 1.
+
+        Returns:
+            Particles of 8,000 fixed-seed draws, reflected where they would leave the cube.
+
+        Raises:
+            ValueError: for a factor below 1, and for a point, which has no spread.
+        """
         factor = at_least("factor", factor, 1.0)
-        with torch.no_grad():
-            draws = self._sample(MARGINAL_DRAWS, Generator().manual_seed(0))
+        draws = self._fixed_draws(MARGINAL_DRAWS)
         if float(np.ptp(draws.numpy(), axis=0).max()) < _POINT:
             raise ValueError("wider: expected a posterior with spread, got a point; take .smoothed(bandwidth)")
         centre = draws.mean(0)
         return self.of_draws(1 - (1 - (centre + factor * (draws - centre)) % 2).abs(), self.space)
 
-    def values(self, n: int, generator: Generator | None = None) -> NDArray[Any]:
+    def values(self, n: int, generator: Generator | None = None) -> FloatArray:
         """Draws (n, N) in physical units."""
         n = whole("n", n, 0)
         with torch.no_grad():
@@ -291,17 +343,23 @@ class Posterior(TorchDistribution):
         generator: Generator | None = None,
         *,
         prior: Posterior | None = None,
-        observed_data: Mapping[str, Any] | None = None,
-        posterior_predictive: Mapping[str, Any] | None = None,
-        log_likelihood: Mapping[str, Any] | None = None,
-    ) -> Any:
-        """ArviZ InferenceData: one (chain, draw) variable per parameter, in physical units, attribute
-        ``units``; and what else is given.
+        observed_data: Mapping[str, ArrayLike] | None = None,
+        posterior_predictive: Mapping[str, ArrayLike] | None = None,
+        log_likelihood: Mapping[str, ArrayLike] | None = None,
+    ) -> arviz.InferenceData:
+        """ArviZ InferenceData: a variable (chain, draw) for each parameter, in physical units, and what else is given.
 
-        Posteriors that came as chains keep all of their draws, with what the sampler knows of each as sample_stats; the others draw
-        ``num_draws`` in one chain. prior: ``num_draws`` draws of it. observed_data: arrays by name; posterior_predictive,
-        log_likelihood: arrays (chain, draw, ...) by name, simulated at ``data.posterior``. Raises ValueError for
-        other shapes.
+        Args:
+            num_draws: in one chain; posteriors that came as chains keep all of their draws, with what the sampler knows
+                of each as sample_stats.
+            generator: of the draws.
+            prior: ``num_draws`` draws of it are added.
+            observed_data: arrays by name.
+            posterior_predictive: arrays (chain, draw, ...) by name, simulated at ``data.posterior``.
+            log_likelihood: arrays (chain, draw, ...) by name, at ``data.posterior``.
+
+        Raises:
+            ValueError: for other shapes, or a prior over other parameters.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # arviz < 1 announces its successor on import
@@ -332,5 +390,4 @@ class Posterior(TorchDistribution):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``<path>.safetensors`` and ``<path>.json``; ``load_posterior(path)`` reads them back."""
         tensors, settings = self._state()
-        header = {"family": type(self).__name__, "space": self.space.to_dict(), "settings": settings}
-        write_pair(path, header, tensors)
+        write_pair(path, Header(family=type(self).__name__, space=self.space.to_dict(), settings=settings), tensors)

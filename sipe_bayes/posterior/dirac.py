@@ -13,7 +13,7 @@ import torch
 from torch import Generator, Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.posterior.base import Posterior, as_theta, check_bandwidth
+from sipe_bayes.posterior.base import Numbers, Posterior, as_theta, check_bandwidth
 from sipe_bayes.posterior.mixture import GaussianMixture
 
 
@@ -22,7 +22,7 @@ class Dirac(Posterior):
 
     has_density: ClassVar[bool] = False
 
-    def __init__(self, theta: Any, space: ParameterSpace) -> None:
+    def __init__(self, theta: Numbers, space: ParameterSpace) -> None:
         super().__init__(space)
         self.theta = as_theta("theta", theta, (len(space),))
 

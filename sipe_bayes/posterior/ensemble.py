@@ -5,8 +5,8 @@ theta = Phi(z), which has no walls and in which the uniform prior is the standar
 
 1. Warm-up by differential evolution (C. J. F. ter Braak, J. A. Vrugt 2008) and stretches.
 2. A defensive mixture q = 0.2 prior + 0.4 N(m, C) + 0.4 kernels on warm-up draws, with m and C the draws' moments, in
-   z. Importance sampling from q gives the normaliser Z and the standard error of log Z; where its weights are even enough
-   they also redraw the walkers and q's centres, so that none stays behind in a far corner.
+   z. Importance sampling from q gives the normaliser Z and the standard error of log Z; where its weights are even
+   enough they also redraw the walkers and q's centres, so that none stays behind in a far corner.
 3. Blocks of moves, half of them independent proposals from q, until the chains have mixed.
 """
 

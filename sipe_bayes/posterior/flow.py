@@ -9,15 +9,16 @@ whose support is exactly the cube: nothing leaks out and no draw is rejected. Un
 the uniform distribution (with m = 0, s = 1), and a posterior cut off by a bound keeps a normal tail, where the logit's
 would be logistic. theta closer than 1e-6 to a bound has the density of the point 1e-6 away from it.
 
-C. Durkan et al. 2019, "Neural Spline Flows" (https://arxiv.org/abs/1906.04032); zuko's implementation. Fully autoregressive
-up to eight parameters; of more, coupling layers, because drawing takes one pass for each parameter otherwise.
+C. Durkan et al. 2019, "Neural Spline Flows" (https://arxiv.org/abs/1906.04032); zuko's implementation. Fully
+autoregressive up to eight parameters; of more, coupling layers, because drawing takes one pass for each parameter
+otherwise.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -25,16 +26,27 @@ from scipy.optimize import minimize
 from torch import Generator, Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.posterior.base import Posterior, as_float64
+from sipe_bayes.posterior.base import Numbers, Posterior, as_float64
 
-MARGIN = 1e-6
+if TYPE_CHECKING:
+    import zuko
+
+MARGIN = 1e-6  # theta closer to a bound has the density of the point that far from it: z stays finite
 _AUTOREGRESSIVE = 8  # parameters up to which every layer is fully autoregressive
-_CHUNK = 2**22  # spline coefficients at once
+_CHUNK = 2**22  # spline coefficients in memory at once
 _MODE_STARTS = 4
 
 
-def spline_flow(features: int, context: int, transforms: int, hidden: int, bins: int) -> Any:
-    """zuko's neural spline flow over u (..., ``features``) given a context (..., ``context``); float32, random weights."""
+def spline_flow(features: int, context: int, transforms: int, hidden: int, bins: int) -> zuko.flows.NSF:
+    """zuko's neural spline flow, float32, with random weights.
+
+    Args:
+        features: of u.
+        context: numbers that it is conditioned on.
+        transforms: one after the other.
+        hidden: units of each of two layers.
+        bins: of the splines.
+    """
     from zuko.flows import NSF
 
     settings: dict[str, Any] = {"transforms": transforms, "hidden_features": (hidden, hidden)}
@@ -54,10 +66,17 @@ def to_cube(z: Tensor) -> Tensor:
 
 
 class Flow(Posterior):
-    """A spline flow with trained ``weights``, given ``context`` (D,) of what was observed.
+    """A trained spline flow, given what was observed. Works inside ``pyro.sample``.
 
-    weights: as ``spline_flow(...).state_dict()``, float32 as trained; the flow computes in float64. mean, sd (N,): of
-    z, standardising it. transforms, hidden, bins: the flow's architecture. Works inside ``pyro.sample``.
+    Args:
+        weights: as ``spline_flow(...).state_dict()``, float32 as trained; the flow computes in float64.
+        context: of what was observed (D,).
+        mean: of z (N,), which standardises it.
+        sd: of z (N,).
+        space: of the parameters.
+        transforms: of the flow, as are ``hidden`` and ``bins``; see ``spline_flow``.
+        hidden: units of each of two layers.
+        bins: of the splines.
     """
 
     has_density: ClassVar[bool] = True
@@ -65,9 +84,9 @@ class Flow(Posterior):
     def __init__(
         self,
         weights: Mapping[str, Tensor],
-        context: Any,
-        mean: Any,
-        sd: Any,
+        context: Numbers,
+        mean: Numbers,
+        sd: Numbers,
         space: ParameterSpace,
         *,
         transforms: int,

@@ -1,5 +1,4 @@
-"""Independent parameters, each uniform or normal, restricted to [0, 1]: what is believed before any log is
-seen.
+"""Independent parameters, each uniform or normal, restricted to [0, 1]: what is believed before any log is seen.
 
 p(theta) = prod_j N(theta_j; m_j, s_j^2) / [Phi((1 - m_j) / s_j) - Phi(-m_j / s_j)]; s_j = inf is the uniform
 density 1.
@@ -17,10 +16,10 @@ import torch
 from torch import Generator, Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.posterior.base import Posterior, as_float64
+from sipe_bayes.posterior.base import Numbers, Posterior, as_float64
 from sipe_bayes.posterior.truncated_normal import interval_moments, interval_quantile, log_interval
 
-FLAT_SD = 1e3
+_FLAT_SD = 1e3  # of the normal that stands for a uniform density: flat within the cube to 1e-7
 
 
 class IndependentPrior(Posterior):
@@ -28,7 +27,7 @@ class IndependentPrior(Posterior):
 
     has_density: ClassVar[bool] = True
 
-    def __init__(self, mean: Any, sd: Any, space: ParameterSpace) -> None:
+    def __init__(self, mean: Numbers, sd: Numbers, space: ParameterSpace) -> None:
         super().__init__(space)
         self.normal_mean = as_float64("mean", mean, (len(space),))
         sd = torch.as_tensor(sd, dtype=torch.float64)
@@ -72,7 +71,7 @@ class IndependentPrior(Posterior):
 
     def gaussian_moments(self) -> tuple[Tensor, Tensor]:
         """The normals before truncation, exact once restricted to the cube; uniform as sd 1000 (1e-7)."""
-        return self.normal_mean, torch.diag(self.normal_sd.clamp_max(FLAT_SD) ** 2)
+        return self.normal_mean, torch.diag(self.normal_sd.clamp_max(_FLAT_SD) ** 2)
 
     def _mode(self) -> Tensor:
         """Clipped mean; the centre where every value is equally probable."""

@@ -35,27 +35,32 @@ from scipy.special import ndtr
 from torch import Generator, Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.posterior.base import Posterior, as_float64
+from sipe_bayes.posterior.base import Numbers, Posterior, as_float64
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal, log_interval
 
 _LOG_2PI = float(np.log(2 * np.pi))
-_CHUNK = 10_000_000
-_MODE_STARTS, _MODE_STEPS = 8, 100
-_MARGINAL_ERROR = 1e-9
+_CHUNK = 10_000_000  # numbers in memory at once
+_MODE_STARTS, _MODE_STEPS = 8, 100  # components that are climbed from, and steps after which the density stands still
+_MARGINAL_ERROR = 1e-9  # mass that a closed form may leave out
 
 
 class GaussianMixture(Posterior):
     """sum_k w_k N(means_k, covariances_k), restricted to the cube and divided by its mass there.
 
-    log_weights (K,), normalised or not; means (K, N), inside the cube or not; covariances (K, N, N), positive
-    definite. Components of weight zero are dropped. ``mean``, ``covariance`` and ``quantile`` are closed-form
-    where every covariance is diagonal (or no component is truncated); otherwise the moments come from at
-    least 16,384 fixed-seed quasi-random points per component and the quantiles from 20,000 fixed-seed draws.
+    ``mean``, ``covariance`` and ``quantile`` are closed-form where every covariance is diagonal (or no component is
+    truncated); otherwise the moments come from at least 16,384 fixed-seed quasi-random points per component and the
+    quantiles from 20,000 fixed-seed draws.
+
+    Args:
+        log_weights: (K,), normalised or not; components of weight zero are dropped.
+        means: (K, N), inside the cube or not.
+        covariances: (K, N, N), positive definite.
+        space: of the N parameters.
     """
 
     has_density: ClassVar[bool] = True
 
-    def __init__(self, log_weights: Any, means: Any, covariances: Any, space: ParameterSpace) -> None:
+    def __init__(self, log_weights: Numbers, means: Numbers, covariances: Numbers, space: ParameterSpace) -> None:
         super().__init__(space)
         n = len(space)
         self.means = as_float64("means", means, (None, n))
@@ -211,7 +216,7 @@ class GaussianMixture(Posterior):
         return new
 
 
-def _log_weights(log_weights: Any, k: int) -> Tensor:
+def _log_weights(log_weights: Numbers, k: int) -> Tensor:
     tensor = torch.as_tensor(log_weights, dtype=torch.float64).detach()
     if tensor.shape != (k,):
         raise ValueError(

@@ -18,32 +18,37 @@ import torch
 from torch import Generator, Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.posterior.base import Posterior, as_float64, as_theta, check_bandwidth
+from sipe_bayes.posterior.base import Numbers, Posterior, as_float64, as_theta, check_bandwidth
 from sipe_bayes.posterior.mixture import GaussianMixture
 
-MAX_KERNELS = 500
+MAX_KERNELS = 500  # of a smoothed set of points: a density of more takes seconds
 _STATS = "sample_stats."
 
 
 class Particles(Posterior):
-    """Points ``theta`` (M, N) with ``weights`` (M,), equal if not given. No density: ``log_prob`` raises.
+    """Weighted points. No density: ``log_prob`` raises.
 
-    chains: the rows are this many equal consecutive Markov chains (their weights must be equal).
-    best: (N,) the point of highest density that the method found, which is then the ``mode``. Without it, ``mode`` is
-    the row closest to the weighted mean in the metric of the covariance. sample_stats: what the sampler knows of each row, (M,) by
-    ArviZ's names (``lp``, ``acceptance_rate``), for ``to_inference_data``; with chains only.
+    Args:
+        theta: (M, N).
+        space: of the N parameters.
+        weights: (M,), equal if not given.
+        chains: the rows are this many equal consecutive Markov chains; their weights must be equal.
+        best: (N,), the point of highest density that the method found, which is then the ``mode``. Without it, ``mode``
+            is the row closest to the weighted mean in the metric of the covariance.
+        sample_stats: what the sampler knows of each row, (M,) by ArviZ's names (``lp``, ``acceptance_rate``), for
+            ``to_inference_data``; with chains only.
     """
 
     has_density: ClassVar[bool] = False
 
     def __init__(
         self,
-        theta: Any,
+        theta: Numbers,
         space: ParameterSpace,
-        weights: Any = None,
+        weights: Numbers | None = None,
         chains: int | None = None,
-        best: Any = None,
-        sample_stats: Mapping[str, Any] | None = None,
+        best: Numbers | None = None,
+        sample_stats: Mapping[str, Numbers] | None = None,
     ) -> None:
         super().__init__(space)
         self.theta = as_theta("theta", theta, (None, len(space)))
@@ -69,11 +74,13 @@ class Particles(Posterior):
         return float(1 / (self.weights**2).sum())
 
     def smoothed(self, bandwidth: float | str = "scott") -> GaussianMixture:
-        """A Gaussian mixture on the points; of more than 500, on 500 picked evenly along the cumulative
-        weight.
+        """A Gaussian mixture on the points; of more than 500, on 500 picked evenly along the cumulative weight.
 
-        bandwidth: kernel sd in theta units, or "scott". Raises ValueError when "scott" meets a constant
-        column.
+        Args:
+            bandwidth: kernel sd in theta units, or "scott".
+
+        Raises:
+            ValueError: when "scott" meets a constant column.
         """
         if bandwidth == "scott":
             sd = self.stddev * self.effective_size ** (-1 / (len(self.space) + 4))
@@ -148,7 +155,7 @@ class Particles(Posterior):
 Posterior.of_draws = Particles
 
 
-def _normalised(weights: Any, rows: int) -> Tensor:
+def _normalised(weights: Numbers | None, rows: int) -> Tensor:
     if weights is None:
         return torch.full((rows,), 1 / rows, dtype=torch.float64)
     weights = as_float64("weights", weights, (rows,))

@@ -10,16 +10,25 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, cast
 
 import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
 from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.parameters import Plain
 
 FORMAT = "sipe_bayes.posterior/1"
 _SAVE_AGAIN = "save it again with posterior.save(path)"
+
+
+class Header(TypedDict):
+    """What the JSON holds besides format and checksum."""
+
+    family: str
+    space: list[Plain]
+    settings: dict[str, Any]
 
 
 def pair_paths(path: str | os.PathLike[str]) -> tuple[Path, Path]:
@@ -30,18 +39,32 @@ def pair_paths(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     return stem.with_name(stem.name + ".safetensors"), stem.with_name(stem.name + ".json")
 
 
-def write_pair(path: str | os.PathLike[str], header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Write header and tensors; missing parent directories are made."""
+def write_pair(path: str | os.PathLike[str], header: Header, tensors: dict[str, Tensor]) -> None:
+    """Write header and tensors of a posterior; missing folders are made.
+
+    Args:
+        path: with or without a suffix.
+        header: what the JSON holds.
+        tensors: by name.
+    """
     tensor_path, header_path = pair_paths(path)
     content = safetensors.torch.save({k: v.detach().clone().contiguous() for k, v in tensors.items()})
-    header = {"format": FORMAT, **header, "sha256": hashlib.sha256(content).hexdigest()}
-    text = json.dumps(header, indent=1, default=float)
+    stored = {"format": FORMAT, **header, "sha256": hashlib.sha256(content).hexdigest()}
+    text = json.dumps(stored, indent=1, default=float)
     write_bytes(tensor_path, content)
     write_bytes(header_path, text.encode())
 
 
-def read_pair(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Header and tensors; raises FileNotFoundError or ValueError, each naming the file and what to do."""
+def read_pair(path: str | os.PathLike[str]) -> tuple[Header, dict[str, Tensor]]:
+    """Header and tensors of a saved posterior.
+
+    Args:
+        path: with or without a suffix.
+
+    Raises:
+        FileNotFoundError: for a missing file.
+        ValueError: for one that cannot be read.
+    """
     tensor_path, header_path = pair_paths(path)
     for file in (header_path, tensor_path):
         if not file.is_file():
@@ -58,6 +81,6 @@ def read_pair(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, T
     if header.get("sha256") != hashlib.sha256(content).hexdigest():
         raise ValueError(f"{tensor_path}: does not match the checksum in {header_path.name}; {_SAVE_AGAIN}")
     try:
-        return header, safetensors.torch.load(content)
+        return cast(Header, header), safetensors.torch.load(content)
     except SafetensorError as error:
         raise ValueError(f"{tensor_path}: not a safetensors file ({error}); {_SAVE_AGAIN}") from error

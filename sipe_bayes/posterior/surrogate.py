@@ -27,13 +27,12 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Generator, Tensor
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.models.gaussian_process import GaussianProcess
-from sipe_bayes.posterior.base import Posterior, as_theta
+from sipe_bayes.posterior.base import Numbers, Posterior, as_theta
 from sipe_bayes.posterior.ensemble import (
     EnsembleOptions,
     draws_on_line,
@@ -70,7 +69,7 @@ class SurrogatePosterior(Posterior):
         process: GaussianProcess,
         epsilon: float,
         prior: Posterior,
-        draws: ArrayLike | Tensor,
+        draws: Numbers,
         chains: int,
         log_normaliser: float,
         normaliser_error: float,

@@ -28,29 +28,32 @@ the standard error. The moments are weighted averages over the same points.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import erf, erfcx, log_ndtr, logsumexp, ndtr, ndtri_exp
 from scipy.stats import qmc
 from torch import Generator
 
-Array = NDArray[np.float64]
+from sipe_bayes.core.arrays import FloatArray, IntArray
 
-RELATIVE_ERROR = 1e-4
-UNTRUNCATED = 1e-12
-_SCRAMBLES = 8
-_FIRST_POINTS, _MOST_POINTS = 2**11, 2**13
-_REJECTION_MASS = 0.05
-_LEAST_ACCEPTANCE = 1e-6
+Bounds = FloatArray | float
+Draw = Callable[[int, Generator | None], FloatArray]
+"""Tries (n,), some of which are accepted (m, N)."""
+RELATIVE_ERROR = 1e-4  # aimed at, of a mass
+_UNTRUNCATED = 1e-12  # mass outside the cube below which nothing is cut off
+_SCRAMBLES = 8  # Sobol sequences, whose spread is the error
+_FIRST_POINTS, _MOST_POINTS = 2**11, 2**13  # of each sequence
+_REJECTION_MASS = 0.05  # above it plain draws are thrown away until enough are inside
+_LEAST_ACCEPTANCE = 1e-6  # of tilted draws, below which drawing would take forever
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-def log_interval(a: Any, b: Any) -> Array:
+def log_interval(a: Bounds, b: Bounds) -> FloatArray:
     """log(Phi(b) - Phi(a)) for a <= b, elementwise, to nearly full precision in both tails."""
     flip = a + b > 0
     a, b = np.where(flip, -b, a), np.where(flip, -a, b)
@@ -62,7 +65,7 @@ def log_interval(a: Any, b: Any) -> Array:
     return np.where(b > 0, centre, tail)
 
 
-def interval_quantile(a: Any, b: Any, u: Any) -> Array:
+def interval_quantile(a: Bounds, b: Bounds, u: Bounds) -> FloatArray:
     """The u-quantile of the standard normal truncated to [a, b], elementwise."""
     flip = a + b > 0
     a, b, u = np.where(flip, -b, a), np.where(flip, -a, b), np.where(flip, 1 - u, u)
@@ -73,11 +76,17 @@ def interval_quantile(a: Any, b: Any, u: Any) -> Array:
     return np.where(flip, -x, x)
 
 
-def interval_moments(low: Any, high: Any, location: Any, scale: Any) -> tuple[Array, Array]:
-    """Mean and variance of N(location, scale^2) truncated to [low, high], elementwise; scale may be infinite.
+def interval_moments(low: Bounds, high: Bounds, location: Bounds, scale: Bounds) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of a truncated normal, elementwise.
 
     64-point Gauss-Legendre quadrature from the density's maximum to where it has fallen by exp(-40): the
     textbook formulas subtract nearly equal numbers in the tails and in narrow intervals, this does not.
+
+    Args:
+        low: bound.
+        high: bound.
+        location: mean before truncation.
+        scale: sd before truncation, which may be infinite.
     """
     low, high, location, scale = (np.asarray(x, dtype=np.float64) for x in (low, high, location, scale))
     start = np.asarray(np.clip(location, low, high))
@@ -96,12 +105,12 @@ def interval_moments(low: Any, high: Any, location: Any, scale: Any) -> tuple[Ar
 class Tilting(NamedTuple):
     """The proposal of the full-covariance case: the ordered, scaled problem and its saddle point."""
 
-    order: NDArray[np.intp]
-    diagonal: Array
-    lower: Array  # A, strictly lower triangular
-    low: Array
-    high: Array
-    mu: Array
+    order: IntArray
+    diagonal: FloatArray
+    lower: FloatArray  # A, strictly lower triangular
+    low: FloatArray
+    high: FloatArray
+    mu: FloatArray
     log_bound: float
 
 
@@ -110,11 +119,11 @@ class Estimate(NamedTuple):
 
     log_mass: float
     error: float
-    mean: Array
-    covariance: Array
+    mean: FloatArray
+    covariance: FloatArray
 
 
-def ordered_cholesky(mean: Array, covariance: Array) -> tuple[NDArray[np.intp], Array]:
+def ordered_cholesky(mean: FloatArray, covariance: FloatArray) -> tuple[IntArray, FloatArray]:
     """An order of the variables, least probable interval first, and the Cholesky factor in that order.
 
     The greedy order of G. J. Gibson, C. A. Glasbey, D. A. Elston, "Monte Carlo evaluation of multivariate
@@ -143,12 +152,14 @@ def ordered_cholesky(mean: Array, covariance: Array) -> tuple[NDArray[np.intp], 
     return order, factor
 
 
-def _psi(z: Array, mu: Array, lower: Array, low: Array, high: Array) -> float:
+def _psi(z: FloatArray, mu: FloatArray, lower: FloatArray, low: FloatArray, high: FloatArray) -> float:
     shift = lower @ z + mu
     return float((mu**2 / 2 - mu * z + log_interval(low - shift, high - shift)).sum())
 
 
-def _saddle_equations(point: Array, lower: Array, low: Array, high: Array) -> tuple[Array, Array]:
+def _saddle_equations(
+    point: FloatArray, lower: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Gradient of psi in (z, mu), the last of each left out (they are zero), and its Jacobian."""
     n = len(low) - 1
     z, mu = np.append(point[:n], 0.0), np.append(point[n:], 0.0)
@@ -161,7 +172,7 @@ def _saddle_equations(point: Array, lower: Array, low: Array, high: Array) -> tu
     return gradient, jacobian
 
 
-def saddle_point(lower: Array, low: Array, high: Array) -> tuple[Array, float]:
+def saddle_point(lower: FloatArray, low: FloatArray, high: FloatArray) -> tuple[FloatArray, float]:
     """The tilting mu (N,) and the bound psi*; (0, 0), always valid, if Newton's method should fail."""
     n = len(low) - 1
     z = np.zeros(n + 1)
@@ -193,12 +204,12 @@ class TruncatedNormal:
     log_mass: given when it is known already, so that it is not estimated again.
     """
 
-    def __init__(self, mean: Array, covariance: Array, log_mass: tuple[float, float] | None = None) -> None:
+    def __init__(self, mean: FloatArray, covariance: FloatArray, log_mass: tuple[float, float] | None = None) -> None:
         self.mean, self.covariance = mean, covariance
         self.sd = np.sqrt(np.diag(covariance))
         self.diagonal = not np.any(covariance - np.diag(np.diag(covariance)))
         outside = float((ndtr(-mean / self.sd) + ndtr((mean - 1) / self.sd)).sum())
-        self.untruncated = outside < UNTRUNCATED
+        self.untruncated = outside < _UNTRUNCATED
         if log_mass is not None:
             self.__dict__["_mass"] = log_mass
 
@@ -244,7 +255,7 @@ class TruncatedNormal:
         low, high = -self.mean[order] / diagonal, (1 - self.mean[order]) / diagonal
         return Tilting(order, diagonal, lower, low, high, *saddle_point(lower, low, high))
 
-    def _propose(self, uniforms: Array) -> tuple[Array, Array]:
+    def _propose(self, uniforms: FloatArray) -> tuple[FloatArray, FloatArray]:
         """theta (n, N) and log likelihood ratios psi (n,) of uniform numbers (n, N)."""
         tilting = self._tilting
         z, psi = np.zeros_like(uniforms), np.zeros(len(uniforms))
@@ -257,7 +268,7 @@ class TruncatedNormal:
         theta[:, tilting.order] = tilting.diagonal * (z + z @ tilting.lower.T)
         return np.clip(theta + self.mean, 0.0, 1.0), psi
 
-    def _points(self) -> tuple[Array, Array]:
+    def _points(self) -> tuple[FloatArray, FloatArray]:
         """theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences, n doubled until precise."""
         engines = [qmc.Sobol(len(self.mean), scramble=True, seed=seed) for seed in range(_SCRAMBLES)]
         uniforms = np.stack([engine.random(_FIRST_POINTS) for engine in engines])
@@ -270,11 +281,11 @@ class TruncatedNormal:
             theta, psi = np.concatenate([theta, more[0]], 1), np.concatenate([psi, more[1]], 1)
         return theta, psi
 
-    def _propose_batch(self, uniforms: Array) -> tuple[Array, Array]:
+    def _propose_batch(self, uniforms: FloatArray) -> tuple[FloatArray, FloatArray]:
         theta, psi = self._propose(uniforms.reshape(-1, uniforms.shape[-1]))
         return theta.reshape(uniforms.shape), psi.reshape(uniforms.shape[:-1])
 
-    def moments(self) -> tuple[Array, Array]:
+    def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (N,) and covariance (N, N) of the truncated distribution."""
         if self.untruncated:
             return self.mean, self.covariance
@@ -283,7 +294,7 @@ class TruncatedNormal:
             return mean, np.diag(variance)
         return self._estimate.mean, self._estimate.covariance
 
-    def sample(self, n: int, generator: Generator | None) -> Array:
+    def sample(self, n: int, generator: Generator | None) -> FloatArray:
         """Exact draws (n, N)."""
         if self.diagonal:
             uniforms = torch.rand(n, len(self.mean), dtype=torch.float64, generator=generator).numpy()
@@ -299,30 +310,30 @@ class TruncatedNormal:
             )
         return self._accepted(n, rate, self._tilted_draws, generator)
 
-    def _accepted(self, n: int, rate: float, draw: Any, generator: Generator | None) -> Array:
-        found: list[Array] = [np.empty((0, len(self.mean)))]
+    def _accepted(self, n: int, rate: float, draw: Draw, generator: Generator | None) -> FloatArray:
+        accepted: list[FloatArray] = [np.empty((0, len(self.mean)))]
         missing = n
         while missing > 0:
-            found.append(draw(min(int(1.1 * missing / rate) + 16, 2**16), generator)[:missing])
-            missing -= len(found[-1])
-        return np.concatenate(found)
+            accepted.append(draw(min(int(1.1 * missing / rate) + 16, 2**16), generator)[:missing])
+            missing -= len(accepted[-1])
+        return np.concatenate(accepted)
 
-    def _plain_draws(self, n: int, generator: Generator | None) -> Array:
+    def _plain_draws(self, n: int, generator: Generator | None) -> FloatArray:
         normals = torch.randn(n, len(self.mean), dtype=torch.float64, generator=generator).numpy()
         theta = self.mean + normals @ self._factor.T
         return theta[((theta >= 0) & (theta <= 1)).all(1)]
 
-    def _tilted_draws(self, n: int, generator: Generator | None) -> Array:
+    def _tilted_draws(self, n: int, generator: Generator | None) -> FloatArray:
         uniforms = torch.rand(n, len(self.mean) + 1, dtype=torch.float64, generator=generator).numpy()
         theta, psi = self._propose(uniforms[:, :-1])
         return theta[np.log1p(-uniforms[:, -1]) <= psi - self._tilting.log_bound]
 
     @cached_property
-    def _factor(self) -> Array:
+    def _factor(self) -> FloatArray:
         return np.asarray(np.linalg.cholesky(self.covariance), dtype=np.float64)
 
     @cached_property
-    def whitening(self) -> Array:
+    def whitening(self) -> FloatArray:
         """W (N, N) with W C W^T = I."""
-        inverse: Array = solve_triangular(self._factor, np.eye(len(self.mean)), lower=True)
+        inverse: FloatArray = solve_triangular(self._factor, np.eye(len(self.mean)), lower=True)
         return inverse
