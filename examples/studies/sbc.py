@@ -22,7 +22,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.calibration.check import RESULT, run, study_of_task
+from sipe_bayes.calibration.check import RESULT, run
+from sipe_bayes.calibration.study import study_of_task
 from sipe_bayes.core.files import to_json, write_text
 
 HERE = Path(__file__).parent

@@ -26,9 +26,9 @@ from sipe_bayes.diagnostics.evaluate import (
     white_noise,
 )
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
-from sipe_bayes.diagnostics.misspecification import Misfit, misfit
+from sipe_bayes.diagnostics.misspecification import misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator, Progress
 from sipe_bayes.likelihood.binding import bind

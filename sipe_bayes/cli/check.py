@@ -33,6 +33,7 @@ def check(
     Exit code 1 where they do not."""
     with refusing("; the same command goes on"):
         from sipe_bayes.calibration import check as checks
+        from sipe_bayes.calibration import study as studies
         from sipe_bayes.core.files import to_json
         from sipe_bayes.diagnostics.coverage import FEWEST
 
@@ -45,11 +46,11 @@ def check(
             whole(option, value, least)
         at_least("--noise", noise, 0)
         if target.endswith(".toml"):
-            study = checks.study_of_config(
+            study = studies.study_of_config(
                 Path(target), estimator, budget=budget, refits=refits, seed=seed, threads=threads
             )
         else:
-            study = checks.study_of_task(
+            study = studies.study_of_task(
                 target, estimator, steps=steps, noise=noise, budget=budget, refits=refits, seed=seed, threads=threads
             )
         path = Path(target)

@@ -81,15 +81,15 @@ def suggest(
             seed=seed,
         )
         _write(problem, found[0].plan, out)
-    plain = suggestions.to_dict(found, problem.simulator, parameter or ())
     if as_json:
-        print(to_json({**plain, "out": str(out)}))
+        print(to_json({**suggestions.to_dict(found, problem.simulator, parameter or ()), "out": str(out)}))
         return
-    for row in plain["candidates"][:_SHOWN]:
-        each = ", ".join(f"{name} {row['contraction'][name]:.2f}" for name in plain["parameters"])
-        reach = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, (a, b) in row["reach"].items())
-        lost = f"; diverges at {row['diverged']} of {draws} draws" if row["diverged"] else ""
-        print(f"{row['score']:.3f}  {row['name']}: expected contraction {each}; reaches {reach}{lost}")
+    space, channels = problem.simulator.space, problem.simulator.environment.channels
+    for one in found[:_SHOWN]:
+        each = ", ".join(f"{name} {one.contraction[space.index(name)]:.2f}" for name in parameter or space.names)
+        reach = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, (a, b) in zip(channels, one.reach, strict=True))
+        lost = f"; diverges at {one.diverged} of {draws} draws" if one.diverged else ""
+        print(f"{one.score:.3f}  {one.plan.name}: expected contraction {each}; reaches {reach}{lost}")
     print(f"the first one is in {out}; check what it reaches before it runs on the machine")
 
 

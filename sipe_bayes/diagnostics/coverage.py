@@ -9,10 +9,11 @@ uniform in one way.
   level is the coverage of that level. They see width.
 - TARP: the posterior's mass nearer to a random reference point than the truth is (P. Lemos, A. Coogan, Y. Hezaveh, L.
   Perreault-Levasseur 2023, "Sampling-Based Accuracy Testing of Posterior Estimators for General Inference",
-  https://arxiv.org/abs/2302.03026). It sees the parameters jointly: correlations, and nested boxes that the others miss.
+  https://arxiv.org/abs/2302.03026). It sees the parameters jointly: correlations, and nested boxes that the others
+  miss.
 
-Compared with uniform by the largest deviation of the empirical distribution, on 99 levels, in terms of the binomial tail
-probability there, calibrated by simulation; its simultaneous band is that of T. Sailynoja, P.-C. Burkner, A. Vehtari
+Compared with uniform by the largest deviation of the empirical distribution, on 99 levels, in terms of the binomial
+tail probability there, calibrated by simulation; its simultaneous band is that of T. Sailynoja, P.-C. Burkner, A. Vehtari
 2022, "Graphical test for discrete uniformity", https://arxiv.org/abs/2103.10522.
 
 sbi has these checks too (``sbi.diagnostics``) and is not called, because it would lose what is said here. Its
@@ -138,12 +139,13 @@ class CalibrationCheck:
         above = float(np.mean(worst.values > 0.5))
         also = f", and for {len(wrong) - 1} more" if len(wrong) > 1 else ""
         return (
-            f"ranks: not uniform for {name} (p = {worst.p:.1g}){also}: the truth lies above the median {_percent(above)} "
-            f"of the time, {_tails(worst)}"
+            f"ranks: not uniform for {name} (p = {worst.p:.1g}){also}: the truth lies above the median "
+            f"{_percent(above)} of the time, {_tails(worst)}"
         )
 
     def _coverage_sentence(self) -> str:
-        held = f"{_percent(THRESHOLDS.shown_interval)} intervals hold the truth {_percent(self.coverage(THRESHOLDS.shown_interval).mean())} of the time"
+        level = THRESHOLDS.shown_interval
+        held = f"{_percent(level)} intervals hold the truth {_percent(self.coverage(level).mean())} of the time"
         wrong = [(name, u) for name, u in zip(self.names, self.intervals, strict=True) if u.p < self._alarm]
         if not wrong:
             return f"coverage: {held}: as they should (smallest p = {min(u.p for u in self.intervals):.2g})"

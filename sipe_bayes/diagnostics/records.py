@@ -164,6 +164,75 @@ class Ridge:
 
 
 @dataclass(frozen=True)
+class Misfit:
+    """What the residuals look like.
+
+    Args:
+        p: of residuals as odd as these under a right model with autoregressive noise.
+        cause: what fits them best, in words.
+        remedy: what to do about it.
+        log: where it shows most.
+        channel: where it shows most.
+        start: s, from where it shows most.
+        stop: s, to where.
+        share: for each channel the share of the residual's variance that the cause explains. Where samples follow one
+            another, of the whitened residual's that those before foretell; where noise is larger for a while, of its
+            squares what that tenth of the time has too many.
+        shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
+            where that cannot be told.
+    """
+
+    p: float
+    cause: str
+    remedy: str
+    log: str
+    channel: str
+    start: float
+    stop: float
+    share: dict[str, float] = field(default_factory=dict)
+    shift: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def alarm(self) -> bool:
+        """Whether the residuals are not noise."""
+        return self.p <= THRESHOLDS.misfit
+
+    @property
+    def moved(self) -> list[str]:
+        """The parameters that would move far."""
+        return [name for name, sds in self.shift.items() if abs(sds) > THRESHOLDS.far_shift]
+
+    @property
+    def matters(self) -> bool:
+        """Whether there is an alarm and its cause is not small."""
+        return self.alarm and (max(self.share.values()) >= THRESHOLDS.small_misfit or bool(self.moved))
+
+    @property
+    def finding(self) -> Finding:
+        """It as a finding: about the parameters that move, or about all where that cannot be told."""
+        code = Code.MISFIT_SHIFTS if self.moved else Code.MISFIT if self.matters else Code.SMALL_MISFIT
+        return finding(
+            code if self.alarm else Code.NO_MISFIT,
+            parameters=self.moved if self.matters else (),
+            log=self.log,
+            p=self.p,
+            cause=self.cause,
+            percent=100 * self.share[self.channel],
+            channel=self.channel,
+            start=self.start,
+            stop=self.stop,
+            moved=", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved),
+            remedy=self.remedy,
+            far=THRESHOLDS.far_shift,
+        )
+
+    @property
+    def text(self) -> str:
+        """In a sentence."""
+        return self.finding.text
+
+
+@dataclass(frozen=True)
 class ChannelNoise:
     """Sensor noise of one channel: its sd in ``unit``, its correlation time ``tau`` in s (0: white)."""
 

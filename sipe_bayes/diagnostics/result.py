@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
 from sipe_bayes.core.findings import Code, Finding, Findings
-from sipe_bayes.diagnostics.misspecification import Misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
     ChannelNoise,
     ChannelScore,
     Comparison,
     LogReport,
+    Misfit,
     Mixing,
     Residual,
     Ridge,

@@ -1,23 +1,23 @@
-"""Which experiment next? Candidate command sequences ranked by what they are expected to tell of the parameters asked for.
+"""Which experiment next? Command sequences ranked by what they are expected to tell of the parameters asked for.
 
-For each candidate, the contraction of each parameter's sd that its Fisher information promises (``diagnostics.expected``), averaged
-over draws of what is known now and over the parameters asked for. Candidates are given, or generated within each actuator's limits:
+For each candidate, the contraction of each parameter's sd that its Fisher information promises
+(``diagnostics.expected``), averaged over draws of what is known now and over the parameters asked for. Candidates are
+given, or generated within each actuator's limits:
 
 - chirps: the frequency goes from one end of the band to the other, up or down, by equal factors in equal times;
 - band-limited noise: white noise through a Butterworth band-pass filter of second order, scaled to its largest value;
-- sums of sines of random phases, as many as the band holds multiples of 1 / duration, at most ten (M. Schroeder 1970, "Synthesis of
-  low-peak-factor signals", https://doi.org/10.1109/TIT.1970.1054411, chooses phases; here they are drawn).
+- sums of sines of random phases, as many as the band holds multiples of 1 / duration, at most ten (M. Schroeder 1970,
+  "Synthesis of low-peak-factor signals", https://doi.org/10.1109/TIT.1970.1054411, chooses phases; here they are drawn).
 
-A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at a draw counts
-there as telling nothing. What each candidate makes the measured quantities reach is stated, for whether the machine may go there is not
-known here.
+A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at
+a draw counts there as telling nothing. What each candidate makes the measured quantities reach is stated, for whether
+the machine may go there is not known here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.signal
@@ -38,8 +38,15 @@ _EDGE = 0.05  # of the duration, at either end
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A plan and its worth: score, the mean over the parameters asked for of contraction (N,); reach: lowest and highest value of
-    each channel over the draws (C, 2); diverged: at how many of the draws."""
+    """A plan and its worth.
+
+    Args:
+        plan: the experiment.
+        score: mean contraction of the parameters asked for.
+        contraction: (N,) expected of each parameter's sd.
+        reach: (C, 2) lowest and highest value of each channel over the draws.
+        diverged: at how many of the draws.
+    """
 
     plan: Plan
     score: float
@@ -60,8 +67,22 @@ def rank(
     seed: int = 0,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Suggestion]:
-    """Plans, the most telling first, of the parameters ``names``, default all that are not of one log. noise: of the fitted channels; known: the prior, or the
-    posterior so far, of which ``draws`` are drawn. Raises ValueError for unknown names, and for those of one log."""
+    """Plans, the most telling first.
+
+    Args:
+        simulator: of the model.
+        likelihood: that the log would be fitted with.
+        plans: the candidates.
+        noise: (C,) of the fitted channels.
+        known: the prior, or the posterior so far.
+        names: of the parameters that count; default all that are not of one log.
+        draws: of ``known``, over which the gain is averaged.
+        seed: of the draws.
+        tell: called with how many plans are done, and of how many.
+
+    Raises:
+        ValueError: for unknown names, and for those of one log.
+    """
     space = known.space
     unknown = [name for name in names if name not in space.names]
     if unknown:
@@ -71,15 +92,15 @@ def rank(
         raise ValueError(f"names: {old[0]!r} is of a log that is there already; a new one tells nothing of it")
     wanted = [j for j, p in enumerate(space) if (p.name in names if names else p.log is None)]
     thetas = known.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
-    precision, found = knowledge(known), []
+    precision, ranked = knowledge(known), []
     nothing = np.zeros((len(space), len(space)))
     for number, plan in enumerate(plans):
         tell(number, len(plans))
-        told = informations(simulator, likelihood, plan, noise, thetas)
-        lost = draws - len(told)
-        gain = contraction(precision, told + [nothing] * lost)
-        found.append(Suggestion(plan, float(gain[wanted].mean()), gain, _reach(simulator, plan, thetas), lost))
-    return sorted(found, key=lambda one: -one.score)
+        gains = informations(simulator, likelihood, plan, noise, thetas)
+        lost = draws - len(gains)
+        gain = contraction(precision, gains + [nothing] * lost)
+        ranked.append(Suggestion(plan, float(gain[wanted].mean()), gain, _reach(simulator, plan, thetas), lost))
+    return sorted(ranked, key=lambda one: -one.score)
 
 
 def _reach(simulator: Simulator, plan: Plan, thetas: FloatArray) -> FloatArray:
@@ -90,35 +111,56 @@ def _reach(simulator: Simulator, plan: Plan, thetas: FloatArray) -> FloatArray:
 
 
 def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArray:
-    """Lowest and highest command (A, 2): the model's control ranges, else of what was commanded before, (T, A); raises ValueError where
-    neither tells."""
+    """Lowest and highest command of each actuator.
+
+    Args:
+        simulator: of the model, whose control ranges come first.
+        recorded: (T, A) what was commanded before.
+
+    Returns:
+        (A, 2).
+
+    Raises:
+        ValueError: where neither tells.
+    """
     environment, model = simulator.environment, simulator.model
-    found = np.full((environment.num_actions, 2), np.nan)
+    ranges = np.full((environment.num_actions, 2), np.nan)
     names = getattr(environment, "actuators", None)
     for j in range(environment.num_actions):
         actuator = model.actuator(names[j]).id if names is not None else None
         if actuator is not None and model.actuator_ctrllimited[actuator]:
-            found[j] = model.actuator_ctrlrange[actuator]
+            ranges[j] = model.actuator_ctrlrange[actuator]
         elif recorded is not None:
-            found[j] = recorded[:, j].min(), recorded[:, j].max()
-    if not (found[:, 0] < found[:, 1]).all():
+            ranges[j] = recorded[:, j].min(), recorded[:, j].max()
+    if not (ranges[:, 0] < ranges[:, 1]).all():
         raise ValueError(
             "limits: the model states no control range and in no log the command changes; give the actuators ctrlrange"
         )
-    return found
+    return ranges
 
 
 def generate(
     count: int, duration: float, dt: float, bounds: FloatArray, band: tuple[float, float], seed: int = 0
 ) -> list[Plan]:
-    """``count`` plans of ``duration`` seconds, dt apart, within bounds (A, 2), of frequencies in ``band`` (Hz): the kinds in turn, sizes
-    in turn. Raises ValueError for a band that the duration or dt cannot hold."""
+    """Plans of all kinds in turn, of all sizes in turn.
+
+    Args:
+        count: how many.
+        duration: s.
+        dt: s that a command is held.
+        bounds: (A, 2) lowest and highest command.
+        band: lowest and highest frequency, Hz.
+        seed: of noise and phases.
+
+    Raises:
+        ValueError: for a band that the duration or dt cannot hold.
+    """
     low, high = band
     steps = round(duration / dt)
     if not 1 / duration <= low < high < 0.5 / dt:
         raise ValueError(
-            f"band: expected {1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s steps, got {low:g} "
-            f"and {high:g}"
+            f"band: expected {1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s steps, "
+            f"got {low:g} and {high:g}"
         )
     rng = np.random.default_rng(seed)
     time = np.asarray(np.arange(steps) * dt, np.float64)
@@ -155,8 +197,14 @@ def _wave(kind: str, time: FloatArray, low: float, high: float, rng: np.random.G
     return np.asarray(wave / np.abs(wave).max())
 
 
-def to_dict(found: Sequence[Suggestion], simulator: Simulator, names: Sequence[str]) -> dict[str, Any]:
-    """Plain data, the best first."""
+def to_dict(suggestions: Sequence[Suggestion], simulator: Simulator, names: Sequence[str]) -> dict[str, object]:
+    """As JSON has it, the best first.
+
+    Args:
+        suggestions: as of ``rank``.
+        simulator: of the model.
+        names: of the parameters that count; default all.
+    """
     space, channels = simulator.space, simulator.environment.channels
     return {
         "parameters": list(names or space.names),
@@ -168,6 +216,6 @@ def to_dict(found: Sequence[Suggestion], simulator: Simulator, names: Sequence[s
                 "reach": dict(zip(channels, one.reach.tolist(), strict=True)),
                 "diverged": one.diverged,
             }
-            for one in found
+            for one in suggestions
         ],
     }

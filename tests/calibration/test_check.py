@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sipe_bayes.calibration import check as checks
+from sipe_bayes.calibration.study import study_of_task
 from sipe_bayes.cli.app import app
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import StateSpace
@@ -116,10 +117,10 @@ def test_fetch_is_checked_from_its_recorded_start() -> None:
     """Its controller has a memory, which StateSpace does not look for in measurements."""
     given = {"steps": 4, "noise": 0.01, "budget": 300, "refits": 0, "seed": 0, "threads": 1}
     for task, starts in (("FetchPush", "recorded"), ("Pendulum", "estimated")):
-        study = checks.study_of_task(task, "laplace", **given)  # type: ignore[arg-type]
+        study = study_of_task(task, "laplace", **given)  # type: ignore[arg-type]
         assert isinstance(study.estimator.likelihood, StateSpace)
         assert study.estimator.likelihood.starts == starts
-    study = checks.study_of_task("FetchPush", "laplace", **given)  # type: ignore[arg-type]
+    study = study_of_task("FetchPush", "laplace", **given)  # type: ignore[arg-type]
     fitted = checks._Worker(study, Path(), lambda *what: None).fit(0)
     assert fitted.error == ""
     assert len(fitted.draws)

@@ -8,12 +8,12 @@ import torch
 
 from sipe_bayes.core.findings import Code, Finding, Severity
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.diagnostics.misspecification import Misfit
 from sipe_bayes.diagnostics.records import (
     ChannelNoise,
     ChannelScore,
     Comparison,
     LogReport,
+    Misfit,
     Mixing,
     Residual,
     Ridge,
