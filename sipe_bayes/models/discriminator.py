@@ -1,7 +1,7 @@
 """A network that tells recorded control steps from simulated ones, with its training state as flat arrays.
 
-I. Goodfellow et al. 2014, "Generative Adversarial Networks", https://arxiv.org/abs/1406.2661: with D the probability that
-x is recorded, binary cross-entropy
+I. Goodfellow et al. 2014, "Generative Adversarial Networks", https://arxiv.org/abs/1406.2661: with D the probability
+that x is recorded, binary cross-entropy
 
     -E_recorded log D(x) - E_simulated log(1 - D(x))
 
@@ -20,11 +20,17 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from sipe_bayes.core.arrays import Float32Array
 from sipe_bayes.models.transitions import Standardise
 
-HIDDEN = 128
+HIDDEN = 128  # units of each layer by default
 
 
 class Discriminator(nn.Module):
-    """Logit of "recorded" for features (..., F): two layers of ``hidden`` tanh units, features standardised."""
+    """Logit of "recorded": two layers of tanh units on standardised features.
+
+    Args:
+        features: F.
+        seed: of the first weights.
+        hidden: units of each layer.
+    """
 
     def __init__(self, features: int, seed: int = 0, hidden: int = HIDDEN) -> None:
         super().__init__()
@@ -39,6 +45,7 @@ class Discriminator(nn.Module):
                 nn.init.zeros_(layer.bias)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Logits (...,) of features (..., F)."""
         out: Tensor = self.layers(self.standardise(x))[..., 0]
         return out
 

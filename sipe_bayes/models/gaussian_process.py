@@ -10,11 +10,13 @@ variance v, K = k(X, X) + v I = L L' and at theta
 equations 2.25, 2.26, 4.17). s is the sd of the smooth function, without the noise.
 
 Hyper-parameters maximise the marginal likelihood times their priors. Lengthscales have the prior that grows with the
-dimension, log-normal(sqrt(2) + log(N) / 2, sqrt(3)), which makes high dimensions work (C. Hvarfner, E. O. Hellsten, L. Nardi 2024,
-"Vanilla Bayesian Optimization Performs Great in High Dimensions", https://arxiv.org/abs/2402.02229).
+dimension, log-normal(sqrt(2) + log(N) / 2, sqrt(3)), which makes high dimensions work (C. Hvarfner, E. O. Hellsten,
+L. Nardi 2024, "Vanilla Bayesian Optimization Performs Great in High Dimensions", https://arxiv.org/abs/2402.02229).
 
-Deviation from it: the noise's prior is log-normal(-7, 2), for simulators that are deterministic but rough, and beyond
-``MOST_FITTED`` points the hyper-parameters are fitted to a subset: the best half of it by value, the rest at random.
+Deviations:
+
+- The noise's prior is log-normal(-7, 2), for simulators that are deterministic but rough.
+- Beyond ``most`` points the hyper-parameters are fitted to a subset: the best half of it by value, the rest at random.
 """
 
 from __future__ import annotations
@@ -28,17 +30,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-MOST_FITTED = 300  # points to which hyper-parameters are fitted
-_ITERATIONS = 60  # of L-BFGS, for one fit
 _CHUNK = 20_000_000  # numbers in memory while predicting
-_LEAST_NOISE = 1e-6  # variance, of standardised values
+_LEAST_NOISE = 1e-6  # variance, of standardised values: what keeps the Cholesky factor well conditioned
 _SQRT5 = math.sqrt(5.0)
 
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """Data x (n, N), y (n,) and hyper-parameters: lengthscale (N,) and, of the standardised values, noise (variance) and
-    level (mean); location and scale standardise. All float64."""
+    """Data and hyper-parameters, all float64.
+
+    Args:
+        x: points (n, N).
+        y: values (n,).
+        lengthscale: (N,).
+        noise: variance, of the standardised values.
+        level: mean, of the standardised values.
+        location, scale: of the values, standardising them.
+    """
 
     x: Tensor
     y: Tensor
@@ -89,7 +97,14 @@ class GaussianProcess:
         return mean, self.scale * (1 - (white**2).sum(0)).clamp_min(1e-12).sqrt()
 
     def slopes(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What ``predict`` gives at theta (B, N), and the gradients (B, N) of both: by hand, at a fraction of autograd's time."""
+        """Mean and sd as of ``predict``, and their gradients, written out at a fraction of autograd's time.
+
+        Args:
+            theta: (B, N).
+
+        Returns:
+            Mean (B,), sd (B,), and the gradients (B, N) of both.
+        """
         r = self._distance(self.x, theta)
         decay = torch.exp(-r)
         correlation, along = (1 + r + r**2 / 3) * decay, (1 + r) * decay * (-5 / 3)
@@ -124,23 +139,36 @@ class GaussianProcess:
 
 
 def fit_gaussian_process(
-    x: Tensor, y: Tensor, seed: int = 0, previous: GaussianProcess | None = None, iterations: int = _ITERATIONS
+    x: Tensor,
+    y: Tensor,
+    seed: int = 0,
+    previous: GaussianProcess | None = None,
+    iterations: int = 60,
+    most: int = 300,
 ) -> GaussianProcess:
-    """The Gaussian process of x (n, N) in the unit cube and finite y (n,), its hyper-parameters fitted from ``previous``
-    ones on; of more than ``MOST_FITTED`` points, to a subset picked by ``seed``."""
+    """The Gaussian process of some points, its hyper-parameters fitted.
+
+    Args:
+        x: (n, N), in the unit cube.
+        y: (n,), finite.
+        seed: of the subset that is fitted to.
+        previous: whose hyper-parameters the fit begins with.
+        iterations: of L-BFGS at most.
+        most: points that hyper-parameters are fitted to: the time of each iteration goes as their third power.
+    """
     scale = float(y.std(correction=0))
     location, scale = float(y.mean()), scale if scale > 0 else 1.0
-    rows = _subset(y, seed)
+    rows = _subset(y, seed, most)
     lengthscale, noise, level = _hyper_parameters(x[rows], (y[rows] - location) / scale, previous, iterations)
     return GaussianProcess(x, y, lengthscale, noise, level, location, scale)
 
 
-def _subset(y: Tensor, seed: int) -> Tensor:
-    if len(y) <= MOST_FITTED:
+def _subset(y: Tensor, seed: int, most: int) -> Tensor:
+    if len(y) <= most:
         return torch.arange(len(y))
     order = np.argsort(y.numpy(), kind="stable")
-    half = MOST_FITTED // 2
-    others = np.random.default_rng([seed, len(y)]).choice(order[half:], MOST_FITTED - half, replace=False)
+    half = most // 2
+    others = np.random.default_rng([seed, len(y)]).choice(order[half:], most - half, replace=False)
     return torch.from_numpy(np.sort(np.concatenate([order[:half], others])))
 
 
@@ -158,9 +186,8 @@ def _hyper_parameters(
         noise_constraint=gpytorch.constraints.GreaterThan(_LEAST_NOISE, transform=None, initial_value=1e-3),
     )
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # values are standardised over all points, not over the subset; iterations are few
+        # values are standardised over all points, not over the subset; iterations are few
+        warnings.simplefilter("ignore")
         model = SingleTaskGP(x, z[:, None], likelihood=likelihood, covar_module=kernel, outcome_transform=None)
         if previous is not None:
             kernel.lengthscale, likelihood.noise = previous.lengthscale, max(previous.noise, 2 * _LEAST_NOISE)

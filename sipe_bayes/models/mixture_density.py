@@ -1,7 +1,7 @@
 """A mixture density network: inputs to a Gaussian mixture over theta with full covariances (BayesSim's).
 
-C. M. Bishop 1994, "Mixture Density Networks". Each component is written by its whitening matrix W_k, lower triangular with a
-positive diagonal, W_k^T W_k = C_k^-1, so that
+C. M. Bishop 1994, "Mixture Density Networks". Each component is written by its whitening matrix W_k, lower triangular
+with a positive diagonal, W_k^T W_k = C_k^-1, so that
 
     log N(theta; m_k, C_k) = sum_i log W_k,ii - |W_k (theta - m_k)|^2 / 2 - N / 2 log(2 pi)
 
@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 import scipy.stats
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.models.transitions import Standardise
 
 _LOG_2PI = math.log(2 * math.pi)
-_WIDEST, _NARROWEST = 3.0, 1e-4  # sd of a component along its axes, of the unit cube
+_WIDEST, _NARROWEST = 3.0, 1e-4  # sd of a component along its axes, of the unit cube: flat, and a point
 
 Features = Literal["mlp", "random_fourier"]
 
@@ -30,9 +30,14 @@ Features = Literal["mlp", "random_fourier"]
 class RandomFourier(nn.Module):
     """Quasi-Monte Carlo random features of a Matern-5/2 kernel: [cos(V x), sin(V x)] / sqrt(D), D = features / 2.
 
-    A. Rahimi, B. Recht 2007, "Random Features for Large-Scale Kernel Machines". The kernel's spectral density is a multivariate t
-    with 5 degrees of freedom; V are its quantiles at a scrambled Sobol sequence (BayesSim, Ramos et al. 2019, section IV.C),
-    divided by the median distance of the inputs that it is fitted to.
+    A. Rahimi, B. Recht 2007, "Random Features for Large-Scale Kernel Machines". The kernel's spectral density is a
+    multivariate t with 5 degrees of freedom; V are its quantiles at a scrambled Sobol sequence (BayesSim, Ramos et al.
+    2019, section IV.C), divided by the median distance of the inputs that it is fitted to.
+
+    Args:
+        inputs: I, numbers of an input.
+        features: 2 D, rounded down to an even number.
+        seed: of the scrambling.
     """
 
     directions: Tensor
@@ -54,6 +59,7 @@ class RandomFourier(nn.Module):
         self.length.copy_(distance.median().clamp_min(1e-6))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features (n, 2 D) of inputs (n, I)."""
         phase = x @ self.directions.T / self.length
         return torch.cat([phase.cos(), phase.sin()], -1) / math.sqrt(len(self.directions))
 
@@ -61,7 +67,13 @@ class RandomFourier(nn.Module):
 class MixtureDensity(nn.Module):
     """Inputs (n, I) to mixtures of K components over theta (N,).
 
-    features: "mlp", two hidden layers of ``hidden`` tanh units, or "random_fourier", ``hidden`` of them; a linear layer follows.
+    Args:
+        inputs: I.
+        n: N.
+        components: K.
+        features: "mlp", two hidden layers of tanh units, or "random_fourier"; a linear layer follows.
+        hidden: units of each of those layers, or number of those features.
+        seed: of the random features; weights come from torch's global generator.
     """
 
     pick: Tensor
@@ -102,8 +114,12 @@ class MixtureDensity(nn.Module):
         self.head.bias.copy_(bias)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Log weights (n, K), means (n, K, N), and the whitening matrix's log diagonal (n, K, N) and entries below it in
-        units of their row's diagonal (n, K, N (N - 1) / 2)."""
+        """The mixtures of inputs (n, I).
+
+        Returns:
+            Log weights (n, K), means (n, K, N), and of the whitening matrices the log diagonal (n, K, N) and the
+            entries below it in units of their row's diagonal (n, K, N (N - 1) / 2).
+        """
         k, n, batch = self.components, self.n, len(inputs)
         out = self.head(self.features(self.standardise(inputs)))
         weights, means, diagonal, below = out.split([k, k * n, k * n, k * (n * (n - 1) // 2)], dim=-1)
@@ -119,7 +135,7 @@ class MixtureDensity(nn.Module):
         return terms.logsumexp(-1) - self.n / 2 * _LOG_2PI
 
     @torch.no_grad()
-    def mixture(self, inputs: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def mixture(self, inputs: Tensor) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Log weights (K,), means (K, N) and covariances (K, N, N) for one input (I,)."""
         log_weights, means, diagonal, below = (x[0].double().numpy() for x in self(inputs[None]))
         whitening = np.tile(np.eye(self.n), (self.components, 1, 1))

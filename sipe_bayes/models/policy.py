@@ -19,17 +19,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.core.files import write_bytes
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 Controller = Callable[[FloatArray], FloatArray]
 """Actions (B, A) of observations (B, O)."""
 
@@ -42,12 +39,16 @@ class PolicyError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A deterministic actor for observations (B, O) of ``task``.
+    """A deterministic actor.
 
-    layers: ((out, in), (out,)) of each layer in float32, the last one's out being A. action_low, action_high: the bounds
-    of every action. mean, scale: (O,) of the observations, or None where they are taken as they come. clip: bound of a
-    normalised observation. goal_size: how many numbers at an observation's end are the desired goal; as many before them
-    are the achieved one; 0 without goals.
+    Args:
+        task: the name of the task whose observations (B, O) it acts on.
+        layers: weight (out, in) and bias (out,) of each layer in float32, the last one's out being A.
+        action_low, action_high: bounds of every action.
+        mean, scale: (O,) of the observations, or None where they are taken as they come.
+        clip: bound of a normalised observation.
+        goal_size: numbers at an observation's end that are the desired goal; as many before them are the achieved one;
+            0 without goals.
     """
 
     task: str
@@ -110,10 +111,15 @@ class Policy:
 
 
 def load_policy(path: str | os.PathLike[str], task: str | None = None) -> Policy:
-    """Read what ``Policy.save`` wrote. task: the name of the task that it must be for, or None.
+    """Read what ``Policy.save`` wrote.
 
-    Raises FileNotFoundError, or PolicyError for a file that is cut short, altered, of other shapes than it says, or for
-    another task.
+    Args:
+        path: the file.
+        task: the name of the task that it must be for, or None.
+
+    Raises:
+        FileNotFoundError: where there is none.
+        PolicyError: for a file that is cut short, altered, of other shapes than it says, or for another task.
     """
     file = Path(path)
     if not file.is_file():
@@ -135,7 +141,7 @@ def load_policy(path: str | os.PathLike[str], task: str | None = None) -> Policy
     return Policy(name, layers, mean=mean, scale=scale, goal_size=goal_size, **settings)
 
 
-def _read(file: Path) -> tuple[dict[str, Any], dict[str, Float32Array]]:
+def _read(file: Path) -> tuple[dict[str, object], dict[str, Float32Array]]:
     try:
         with safe_open(file, framework="numpy") as content:
             metadata = content.metadata() or {}

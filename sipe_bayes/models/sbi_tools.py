@@ -1,5 +1,8 @@
-"""sbi without its side effects, for ``npe`` and ``abc``: `import sbi` switches off torch.distributions' argument validation
-for the whole process, and some of its functions seed every global random generator."""
+"""The package sbi without its side effects, for ``npe`` and ``abc``.
+
+Importing sbi switches off torch.distributions' argument validation for the whole process, and some of its functions
+seed every global random generator.
+"""
 
 from __future__ import annotations
 
@@ -39,16 +42,21 @@ def seeded(seed: int) -> Iterator[None]:
 
 
 class NoTracker:
-    """Keeps sbi from writing TensorBoard logs into the working directory."""
+    """Keeps sbi from writing TensorBoard logs into the working directory: whatever it tells is dropped."""
 
     log_dir = None
 
-    def log_metric(self, name: str, value: float, step: int | None = None) -> None: ...
+    def log_metric(self, name: str, value: float, step: int | None = None) -> None:
+        """Nothing."""
 
-    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None: ...
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """Nothing."""
 
-    def log_params(self, params: dict[str, Any]) -> None: ...
+    def log_params(self, params: dict[str, object]) -> None:
+        """Nothing."""
 
-    def add_figure(self, name: str, figure: Any, step: int | None = None) -> None: ...
+    def add_figure(self, name: str, figure: object, step: int | None = None) -> None:
+        """Nothing."""
 
-    def flush(self) -> None: ...
+    def flush(self) -> None:
+        """Nothing."""

@@ -1,6 +1,7 @@
 """Trajectories as sets of control steps (s, a, s' - s), for networks that take trajectories of any length.
 
-Control steps are what the dynamics are written in: a set of them tells the parameters even where the open loop is chaotic.
+Control steps are what the dynamics are written in: a set of them tells the parameters even where the open loop is
+chaotic.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-FloatArray = NDArray[np.float64]
+from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
 
 SMALLEST = 1e-12  # sd: what the rounding of numbers of order one leaves of channels that do not move
 _ROUNDING = 1e-7  # of a column's largest number
@@ -20,11 +21,20 @@ MOST_STEPS = 200  # of a simulation that are looked at, spread evenly
 def control_steps(
     observations: NDArray[np.floating],
     actions: FloatArray,
-    length: NDArray[np.int64],
+    length: IntArray,
     most: int | None = MOST_STEPS,
-) -> NDArray[np.float32]:
-    """(n, M, 2 O + A) of observations (n, R, T+1, O) under actions (R, T, A) with lengths (R,): at most ``most`` steps of all
-    R trajectories together, evenly spread, or all; a step with a missing sample is NaN throughout."""
+) -> Float32Array:
+    """Control steps of n simulations, or of a log.
+
+    Args:
+        observations: (n, R, T+1, O).
+        actions: (R, T, A).
+        length: (R,), control steps of each trajectory.
+        most: of all R trajectories together, spread evenly; None for all.
+
+    Returns:
+        (n, M, 2 O + A); a step with a missing sample is NaN throughout.
+    """
     trajectory, step = np.nonzero(np.arange(actions.shape[1]) < length[:, None])
     if most is not None and len(step) > most:
         kept = np.linspace(0, len(step) - 1, most).round().astype(int)
@@ -38,8 +48,13 @@ def control_steps(
 
 
 class Standardise(nn.Module):
-    """(x - mean) / sd of the last axis, with the finite rows' mean and sd, in whatever unit; columns that change by no more than
-    rounding, ``_ROUNDING`` of their size or ``SMALLEST``, become zero."""
+    """(x - mean) / sd of the last axis, with the finite rows' mean and sd, in whatever unit.
+
+    Columns that change by no more than rounding, ``_ROUNDING`` of their size or ``SMALLEST``, become zero.
+
+    Args:
+        features: F, the size of that axis.
+    """
 
     mean: Tensor
     sd: Tensor
@@ -65,12 +80,20 @@ class Standardise(nn.Module):
         self.sd.copy_(torch.where(still, torch.full_like(sd, torch.inf), sd * unit))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Standardised x (..., F)."""
         return (x - self.mean) / self.sd
 
 
 class StepEmbedding(nn.Module):
-    """A set of control steps (n, M, F) to features (n, D): a network on each step, averaged over the finite ones
-    (M. Zaheer et al. 2017, "Deep Sets", https://arxiv.org/abs/1703.06114)."""
+    """A set of control steps to features: a network on each step, averaged over the finite ones.
+
+    M. Zaheer et al. 2017, "Deep Sets" (https://arxiv.org/abs/1703.06114).
+
+    Args:
+        step_features: F, numbers of a step.
+        features: D, numbers that come out.
+        hidden: units of each layer.
+    """
 
     def __init__(self, step_features: int, features: int, hidden: int = 64) -> None:
         super().__init__()
@@ -79,6 +102,7 @@ class StepEmbedding(nn.Module):
         self.all = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, features))
 
     def forward(self, steps: Tensor) -> Tensor:
+        """Features (n, D) of sets of control steps (n, M, F)."""
         good = steps.isfinite().all(-1, keepdim=True)
         each = self.each(torch.where(good, self.standardise(steps), steps.new_zeros(())))
         return self.all((each * good).sum(-2) / good.sum(-2).clamp_min(1))

@@ -1,0 +1,1 @@
+"""Estimators that learn from simulations of the prior, and keep what they learned."""

@@ -122,7 +122,12 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Looks:
-    """What tells a log from simulations: of n of them, statistics (n, F) and some of their samples as they are (n, K)."""
+    """What tells a log from n simulations.
+
+    Attributes:
+        statistics: (n, F).
+        samples: (n, K), some of theirs as they are.
+    """
 
     statistics: FloatArray
     samples: FloatArray

@@ -170,7 +170,7 @@ class MAML(PriorSampling[MAMLState, TrainedNetwork]):
         return trained
 
     def _meta_loss(self, network: Regressor, inputs: Tensor, theta: Tensor, good: Tensor) -> TaskLoss:
-        """Query losses (t,) after the inner step, of tasks (t,), the rows that neighbours come from, and a generator."""
+        """Query losses (t,) after the inner step, of tasks (t,), the rows of their neighbours, and a generator."""
         options = self.options
 
         def inner(weights: Tensors, steps: Tensor, target: Tensor, weight: Tensor) -> Tensor:
@@ -284,7 +284,7 @@ class Regressor(nn.Module):
             last.bias.copy_(theta)  # type: ignore[operator]
 
     def forward(self, steps: Tensor) -> Tensor:
-        """theta (..., N) of steps (..., F)."""
+        """What theta (..., N) steps (..., F) tell."""
         out: Tensor = self.layers(steps)
         return out
 

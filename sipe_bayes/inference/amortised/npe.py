@@ -1,4 +1,4 @@
-"""Neural posterior estimation: a normalising flow, conditioned on what was observed, trained on simulations of the prior.
+"""Neural posterior estimation: a normalising flow, given what was observed, trained on simulations of the prior.
 
 D. Greenberg, M. Nonnenmacher, J. Macke 2019, "Automatic Posterior Transformation for Likelihood-Free Inference"
 (https://arxiv.org/abs/1905.07488); A. Tejero-Cantero et al. 2020, "sbi" (https://doi.org/10.21105/joss.02505), whose
@@ -175,7 +175,7 @@ class NPE(Rounds[TrainedFlow]):
         return StepEmbedding(features, self.options.embedding_features)
 
     def _optimise(self, u: Tensor, x: Tensor) -> tuple[Any, dict[str, Any]]:
-        """sbi's trained density estimator, on the CPU, and its summary of the training."""
+        """The density estimator that sbi has trained, on the CPU, and its summary of the training."""
         estimators, options = import_sbi("neural_nets.estimators"), self.options
 
         def build(theta: Tensor, x: Tensor) -> Any:

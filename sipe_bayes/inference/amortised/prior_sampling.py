@@ -116,7 +116,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
     trajectories with recorded states, which come from a simulator, and for a measured log what smoothing takes away.
 
     A subclass writes ``train``, of the valid simulations with noise added, and ``infer``; both without simulating. Its
-    ``state_type`` is ``PriorSamplingState[what train returns]``, or a subclass of it whose further fields have defaults.
+    ``state_type`` is ``PriorSamplingState`` of what ``train`` returns, or a subclass further fields with defaults.
     """
 
     amortised: ClassVar[bool] = True
@@ -218,7 +218,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         return last
 
     def _recalled(self, last: Snapshot[S], trajectories: Trajectories) -> Snapshot[S] | None:
-        """Where a fit begins for which enough was learned before; None where it was not, with a note that says why."""
+        """Where a fit begins for which enough was learned before; None where it was not, and a note says why."""
         if last.state.learned is None:
             return None
         noise = noise_level(trajectories, self.likelihood)

@@ -1,8 +1,8 @@
 """Linear regression of theta on single control steps, by stochastic gradient: the SiPE paper's baseline.
 
-B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", section 2.3 and appendix:
-a single layer maps each concatenated (s, a, s') to theta; mean squared error, plain stochastic gradient, learning rate
-0.001, batch 320. The estimate is the average over the recorded control steps: a Dirac.
+B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", section 2.3 and
+appendix: a single layer maps each concatenated (s, a, s') to theta; mean squared error, plain stochastic gradient,
+learning rate 0.001, batch 320. The estimate is the average over the recorded control steps: a Dirac.
 
 Deviations:
 
@@ -143,7 +143,7 @@ class LinearMap(nn.Module):
         self.bias.data.add_(slope.sum(0))
 
     def map(self, inputs: Tensor) -> Tensor:
-        """theta (..., N) of inputs (..., F)."""
+        """What theta (..., N) inputs (..., F) tell."""
         return inputs @ self.slope + self.bias
 
 

@@ -95,7 +95,7 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
         return replace(super().start(trajectories), before=before)
 
     def step(self, state: RoundsState[L], trajectories: Trajectories) -> RoundsState[L]:
-        """A block of simulations, or a training at the end of a round; with other trajectories, the first block of all."""
+        """A block of simulations, or a training at the end of a round; other trajectories begin anew."""
         rounds = self.options.rounds
         if rounds == 1:
             return super().step(state, trajectories)
@@ -139,7 +139,7 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
         return Simulations.joined((self._usable(first, trajectories), state.later.usable()))
 
     def _propose(self, posterior: Posterior, number: int, count: int) -> FloatArray:
-        """theta (count, N) of the prior where the posterior after round ``number`` has all but 1e-4 of its mass."""
+        """Theta (count, N) of the prior where the posterior after round ``number`` has all but 1e-4 of its mass."""
         generator = torch_generator([self.seed, 3, number])
         own = posterior.sample((_DENSITY_DRAWS,), generator=generator)
         threshold = posterior.log_prob(own).quantile(self.options.truncated)
