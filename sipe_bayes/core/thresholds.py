@@ -129,5 +129,31 @@ class Thresholds(Options):
         0.01, "false alarms of estimates that scatter normally about a line", "p-value", above=0, below=1
     )
 
+    # amortised methods
+    few_valid: int = option(10, "of fewer valid simulations nothing is learned", "simulations", least=2)
+    few_accepted: int = option(30, "the spread of fewer accepted draws says little", "draws", least=1)
+    invalid_elsewhere: float = option(
+        1e-3,
+        "false alarms of invalid simulations that lie all over the prior; rare, as each parameter is a chance",
+        "p-value",
+        above=0,
+        below=1,
+    )
+    unlike: float = option(
+        1.0,
+        "a log with a larger outlier factor is further from the simulations than any of them from the others",
+        "of the simulations' largest",
+        above=0,
+    )
+    first_sample_sds: float = option(
+        3.0, "a log that begins further from all simulations has another start", "sds of the noise", above=0
+    )
+    noise_ratio: float = option(
+        2.0,
+        "a training serves no log whose noise differs more: estimates from 60 samples do in less than 1 % of pairs",
+        "ratio of sds",
+        above=1,
+    )
+
 
 THRESHOLDS = Thresholds()

@@ -20,8 +20,6 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from sipe_bayes.core.arrays import Float32Array
 from sipe_bayes.models.transitions import Standardise
 
-HIDDEN = 128  # units of each layer by default
-
 
 class Discriminator(nn.Module):
     """Logit of "recorded": two layers of tanh units on standardised features.
@@ -32,7 +30,7 @@ class Discriminator(nn.Module):
         hidden: units of each layer.
     """
 
-    def __init__(self, features: int, seed: int = 0, hidden: int = HIDDEN) -> None:
+    def __init__(self, features: int, seed: int = 0, hidden: int = 128) -> None:
         super().__init__()
         self.standardise = Standardise(features)
         self.layers = nn.Sequential(

@@ -32,7 +32,6 @@ from torch import Tensor
 
 _CHUNK = 20_000_000  # numbers in memory while predicting
 _LEAST_NOISE = 1e-6  # variance, of standardised values: what keeps the Cholesky factor well conditioned
-_SQRT5 = math.sqrt(5.0)
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class GaussianProcess:
         """sqrt(5) r (A, B)."""
         a, b = a / self.lengthscale, b / self.lengthscale
         square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
-        return _SQRT5 * square.clamp_min(1e-20).sqrt()
+        return math.sqrt(5.0) * square.clamp_min(1e-20).sqrt()
 
     def predict(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (B,) and sd (B,) of the smooth function at theta (B, N), in units of y; differentiable."""

@@ -21,9 +21,6 @@ from torch import Tensor, nn
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.models.transitions import Standardise
 
-_LOG_2PI = math.log(2 * math.pi)
-_WIDEST, _NARROWEST = 3.0, 1e-4  # sd of a component along its axes, of the unit cube: flat, and a point
-
 Features = Literal["mlp", "random_fourier"]
 
 
@@ -76,6 +73,7 @@ class MixtureDensity(nn.Module):
         seed: of the random features; weights come from torch's global generator.
     """
 
+    narrowest, widest = 1e-4, 3.0  # sd of a component along its axes, in the unit cube: a point, and flat
     pick: Tensor
     gather: Tensor
 
@@ -123,7 +121,7 @@ class MixtureDensity(nn.Module):
         k, n, batch = self.components, self.n, len(inputs)
         out = self.head(self.features(self.standardise(inputs)))
         weights, means, diagonal, below = out.split([k, k * n, k * n, k * (n * (n - 1) // 2)], dim=-1)
-        diagonal = diagonal.reshape(batch, k, n).clamp(-math.log(_WIDEST), -math.log(_NARROWEST))
+        diagonal = diagonal.reshape(batch, k, n).clamp(-math.log(self.widest), -math.log(self.narrowest))
         return weights.log_softmax(-1), means.reshape(batch, k, n), diagonal, below.reshape(batch, k, -1)
 
     def log_prob(self, inputs: Tensor, theta: Tensor) -> Tensor:
@@ -132,7 +130,7 @@ class MixtureDensity(nn.Module):
         deviation = theta[:, None] - means
         white = (deviation + (below * (deviation @ self.pick)) @ self.gather) * diagonal.exp()
         terms = log_weights + diagonal.sum(-1) - (white**2).sum(-1) / 2
-        return terms.logsumexp(-1) - self.n / 2 * _LOG_2PI
+        return terms.logsumexp(-1) - self.n / 2 * math.log(2 * math.pi)
 
     @torch.no_grad()
     def mixture(self, inputs: Tensor) -> tuple[FloatArray, FloatArray, FloatArray]:

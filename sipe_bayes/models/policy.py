@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -141,7 +142,7 @@ def load_policy(path: str | os.PathLike[str], task: str | None = None) -> Policy
     return Policy(name, layers, mean=mean, scale=scale, goal_size=goal_size, **settings)
 
 
-def _read(file: Path) -> tuple[dict[str, object], dict[str, Float32Array]]:
+def _read(file: Path) -> tuple[dict[str, Any], dict[str, Float32Array]]:
     try:
         with safe_open(file, framework="numpy") as content:
             metadata = content.metadata() or {}

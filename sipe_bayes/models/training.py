@@ -17,9 +17,6 @@ Loss = Callable[[Tensor], Tensor]
 Weights = dict[str, FloatArray]
 """A network's weights and buffers by name, each in its own type."""
 
-_LONGEST_GRADIENT = 5.0  # norm beyond which a gradient is shortened, so that one odd batch undoes nothing
-_HELD_OUT_BATCH = 2000  # rows whose loss is taken at once, for memory alone
-
 
 @dataclass(frozen=True)
 class Training(Options):
@@ -95,11 +92,20 @@ def split(rows: int, share: float, generator: torch.Generator) -> tuple[Tensor, 
     return order[held:], order[:held]
 
 
-def descend(optimiser: torch.optim.Optimizer, parameters: list[nn.Parameter], loss: Tensor) -> None:
-    """One step of the optimiser down the gradient of ``loss``, which is shortened where it is very long."""
+def descend(
+    optimiser: torch.optim.Optimizer, parameters: list[nn.Parameter], loss: Tensor, longest: float = 5.0
+) -> None:
+    """One step of the optimiser down the gradient of ``loss``.
+
+    Args:
+        optimiser: of the parameters.
+        parameters: what is changed.
+        loss: a number.
+        longest: norm to which a longer gradient is shortened, so that one odd batch undoes nothing.
+    """
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    torch.nn.utils.clip_grad_norm_(parameters, _LONGEST_GRADIENT)
+    torch.nn.utils.clip_grad_norm_(parameters, longest)
     optimiser.step()
 
 
@@ -125,7 +131,7 @@ def train(network: nn.Module, loss: Loss, rows: int, settings: Training, generat
         for chosen in shuffled.split(settings.batch):
             descend(optimiser, parameters, loss(chosen).mean())
         with torch.no_grad():
-            now = float(torch.cat([loss(part) for part in outside.split(_HELD_OUT_BATCH)]).mean())
+            now = float(torch.cat([loss(part) for part in outside.split(2000)]).mean())  # parts save memory
         if stopping.stops(now):
             break
     return stopping.finish(epoch)

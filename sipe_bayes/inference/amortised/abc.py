@@ -28,15 +28,13 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.models.sbi_tools import import_sbi, seeded
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.flow import to_cube, to_line
-
-_FEW = 30  # accepted draws below which their spread says little
-_SPARE = 2  # accepted simulations for each coefficient of the regression
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
         target = observed[0, varies] / learned.scale[varies]
         theta = torch.from_numpy(learned.theta)
         kept = max(1, round(self.options.accepted * len(theta)))
-        least = _SPARE * (1 + len(target))
+        least = 2 * (1 + len(target))  # two for each coefficient
         if self.options.regression and kept < least:
             raise ValueError(
                 f"regression: {kept} accepted simulations are too few for {len(target)} statistics, expected {least}; "
@@ -120,7 +118,7 @@ class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
         spread = float(np.sqrt(2 * statistics))  # distance of two independent simulations, root mean square
         self.diagnostics.update(accepted=len(distances), epsilon=float(distances.max()), nearest=float(distances.min()))
         self.diagnostics["epsilon_relative"] = float(distances.max()) / spread
-        if len(distances) < _FEW:
+        if len(distances) < THRESHOLDS.few_accepted:
             self.find(Code.FEW_ACCEPTED, accepted=len(distances))
 
 

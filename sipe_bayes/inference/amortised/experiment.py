@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-_NEIGHBOURS = 20  # of the local outlier factor, as its authors advise at least
-_FIRST_SAMPLE_SDS = 3.0  # of the noise: how far from all simulated first samples a log may begin
-_NOISE_RATIO = 2.0  # by which estimates of one noise differ from log to log; velocities of 60 samples by 1.3
-_ROUNDING = 1e-5  # of a number, after float32
+_ROUNDING = 1e-5  # of a number: what float32 and a few steps of arithmetic leave of two equal ones
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class Experiment:
             same = np.allclose(self.starts[:, 1:], trajectories.states[:, 0, 1:], rtol=1e-6, atol=1e-6)
             return None if same else "starting states"
         first, size = trajectories.observations[:, 0], np.maximum(np.abs(self.lowest), np.abs(self.highest))
-        slack = _FIRST_SAMPLE_SDS * noise + _ROUNDING * (1 + size)
+        slack = THRESHOLDS.first_sample_sds * noise + _ROUNDING * (1 + size)
         return "starting states" if ((first < self.lowest - slack) | (first > self.highest + slack)).any() else None
 
     def other_form(
@@ -116,8 +114,8 @@ class Experiment:
             return "names"
         if not np.array_equal(measured(trajectories), self.measured):
             return "missing samples"
-        louder = (noise > _NOISE_RATIO * self.noise) | (self.noise > _NOISE_RATIO * noise)
-        return "noise" if louder.any() else None
+        ratio = THRESHOLDS.noise_ratio
+        return "noise" if ((noise > ratio * self.noise) | (self.noise > ratio * noise)).any() else None
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,7 @@ class Looks:
         return max(outlier_factor(seen, one[0]) for seen, one in looks)
 
 
-def outlier_factor(seen: FloatArray, log: FloatArray) -> float:
+def outlier_factor(seen: FloatArray, log: FloatArray, neighbours: int = 20) -> float:
     """Local outlier factor of a log among simulations, over the largest of the simulations' own.
 
     M. Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers" (https://doi.org/10.1145/342009.335388).
@@ -146,6 +144,7 @@ def outlier_factor(seen: FloatArray, log: FloatArray) -> float:
     Args:
         seen: (n, F) of simulations.
         log: (F,).
+        neighbours: that densities are taken from; twenty is the usual choice.
 
     Returns:
         Above 1 by chance once in n + 1 logs, of two looks twice as often; 0 where nothing varies.
@@ -157,7 +156,7 @@ def outlier_factor(seen: FloatArray, log: FloatArray) -> float:
     if not varies.any() or not np.isfinite(log).all():
         return 0.0
     scaled, point = seen[:, varies] / sd[varies], log[varies] / sd[varies]
-    factor = LocalOutlierFactor(min(_NEIGHBOURS, len(scaled) - 1), novelty=True).fit(scaled)
+    factor = LocalOutlierFactor(min(neighbours, len(scaled) - 1), novelty=True).fit(scaled)
     return float(-factor.score_samples(point[None])[0] / np.max(-factor.negative_outlier_factor_))
 
 

@@ -58,9 +58,6 @@ from sipe_bayes.models.training import (
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 
-_BETTER = 1e-5  # by which a look's loss must be lower to count as better
-_LOOKED_AT = 100  # held-out tasks in a look, for time alone
-
 Tensors = dict[str, Tensor]
 TaskLoss = Callable[[Tensor, Tensor, Generator], Tensor]
 
@@ -154,16 +151,16 @@ class MAML(PriorSampling[MAMLState, TrainedNetwork]):
         inside, outside = split(len(theta), options.held_out, generator)
         parameters = list(network.parameters())
         optimiser = torch.optim.Adam(parameters, options.learning_rate, foreach=True)
-        stopping = EarlyStopping(network, options.patience, absolute=_BETTER)
+        stopping = EarlyStopping(network, options.patience, absolute=1e-5)
         for k in range(1, options.iterations + 1):
             # an outer step on a meta-batch
             chosen = inside[torch.randint(len(inside), (options.tasks,), generator=generator)]
             descend(optimiser, parameters, loss(chosen, inside, generator).mean())
-            # a look at the held-out tasks, always with the same draws
+            # a look at a hundred held-out tasks, always with the same draws
             if k % options.look_every and k < options.iterations:
                 continue
             fixed = Generator().manual_seed(seed)
-            if stopping.stops(float(loss(outside[:_LOOKED_AT], inside, fixed).mean().detach())):
+            if stopping.stops(float(loss(outside[:100], inside, fixed).mean().detach())):
                 break
         trained = stopping.finish(k)
         self.still_improving(trained.converged, k, "iterations", "iterations")

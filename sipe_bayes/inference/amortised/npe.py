@@ -46,8 +46,7 @@ from sipe_bayes.models.transitions import MOST_STEPS, Standardise, StepEmbedding
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior.flow import Flow, spline_flow, to_line
 
-_TABLE = 2**26  # numbers: control steps of all simulations that are held at once, for memory alone
-_FEWEST_STEPS = 10  # of each simulation, whatever that takes
+_TABLE = 2**26  # numbers: control steps of all simulations that are held at once, ten of each at least
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,7 @@ class NPE(Rounds[TrainedFlow]):
             return np.ascontiguousarray(observations[:, _inside(trajectories)]).reshape(len(observations), -1)
         actions = trajectories.actions
         size = self.budget * (2 * observations.shape[-1] + actions.shape[-1])
-        most = max(_FEWEST_STEPS, min(MOST_STEPS, _TABLE // size))
+        most = max(10, min(MOST_STEPS, _TABLE // size))
         seen = np.where(np.isfinite(trajectories.observations), observations, np.float32(np.nan))
         return control_steps(seen, actions, trajectories.length, most)
 

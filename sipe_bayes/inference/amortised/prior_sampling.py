@@ -41,6 +41,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import CheckpointError
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.experiment import Experiment, Looks, measured
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
@@ -55,9 +56,7 @@ from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 _ROWS = 100  # simulations whose control steps are held at once, for memory alone
-_SEEN = 500  # simulations that a log is compared with
-_SAMPLES = 50  # of a log that are compared as they are
-_FEWEST = 10  # valid simulations below which nothing is trained
+_SEEN, _SAMPLES = 500, 50  # simulations that a log is compared with, and samples of each, for time alone
 
 L = TypeVar("L")
 S = TypeVar("S", bound="PriorSamplingState[Any]")
@@ -183,7 +182,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         if np.array_equal(measured(trajectories), learned.experiment.measured):
             unlikeness = learned.looks.unlikeness(self._looks(trajectories.observations[None], trajectories))
         self.diagnostics["unlikeness"] = unlikeness
-        if unlikeness > 1:
+        if unlikeness > THRESHOLDS.unlike:
             self.find(Code.UNLIKE_SIMULATIONS)
         return self.infer(learned.content, trajectories)
 
@@ -212,8 +211,8 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         last = self._recalled(stored, trajectories)
         if last is None:
             raise CheckpointError(
-                f"checkpoint {self.checkpoint}: belongs to another run, of trajectories of another form; choose another "
-                "file, or give fit(..., retrain=True) to replace it"
+                f"checkpoint {self.checkpoint}: belongs to another run, of trajectories of another form; choose "
+                "another file, or give fit(..., retrain=True) to replace it"
             )
         return last
 
@@ -281,11 +280,11 @@ class PriorSampling(Estimator[S], Generic[S, L]):
             place = place_of_invalid(made, self.space)
             self.find(Code.INVALID_SIMULATIONS, invalid=invalid, made=len(made), failure=failure, place=place)
         self.diagnostics["invalid_simulations"] = invalid
-        if valid < _FEWEST:
+        if valid < THRESHOLDS.few_valid:
             lost, narrow = (f", the others {failure}", ", or narrow the bounds") if invalid else ("", "")
             raise ValueError(
-                f"budget: {valid} of {len(made)} simulations are valid, {self.name} needs {_FEWEST}{lost}; raise the "
-                f"budget{narrow}"
+                f"budget: {valid} of {len(made)} simulations are valid, {self.name} needs {THRESHOLDS.few_valid}"
+                f"{lost}; raise the budget{narrow}"
             )
 
     def still_improving(self, converged: bool, passes: int, unit: str, argument: str) -> None:

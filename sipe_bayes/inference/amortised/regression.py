@@ -36,8 +36,6 @@ from sipe_bayes.models.training import EarlyStopping, TrainedNetwork, restore, s
 from sipe_bayes.models.transitions import Standardise, control_steps
 from sipe_bayes.posterior import Dirac
 
-_LOOK = 500  # steps at least between two looks at the held-out simulations, for time alone
-_RELATIVE, _ABSOLUTE = 1e-4, 1e-8  # by which a look's loss must be lower to count as better
 _FLAT = 1e-8  # of the largest variance: what float32's rounding leaves of none
 _ROWS = 20_000  # whose covariance is taken at once, for memory alone
 
@@ -72,15 +70,15 @@ class Regression(PriorSampling[PriorSamplingState[TrainedNetwork], TrainedNetwor
         network.bias.data.copy_(theta.mean(0))
         inputs, targets = _rows(network, steps[inside], theta[inside])
         held_inputs, held_targets = _rows(network, steps[outside], theta[outside])
-        stopping, taken, looked = EarlyStopping(network, options.patience, _ABSOLUTE, _RELATIVE), 0, 0
+        stopping, taken, looked = EarlyStopping(network, options.patience, 1e-8, relative=1e-4), 0, 0
         while taken < options.iterations:
             # a pass over the rows, or what is left of it
             order = torch.randperm(len(inputs), generator=generator).split(options.batch)
             for chosen in order[: options.iterations - taken]:
                 network.descend(inputs[chosen], targets[chosen], options.learning_rate)
             taken += min(len(order), options.iterations - taken)
-            # a look at the held-out rows, where the last one is long enough ago
-            if taken < min(looked + _LOOK, options.iterations):
+            # a look at the held-out rows, where the last one is 500 steps ago
+            if taken < min(looked + 500, options.iterations):
                 continue
             looked = taken
             if stopping.stops(float((network.map(held_inputs) - held_targets).square().mean().detach())):

@@ -37,9 +37,8 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-_DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from: a hundred times 1 / truncated
+_DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from: 1 / truncated, as it is by default
 _PROPOSALS = 2**17  # draws of the prior tried before resampling the posterior's, for time alone
-_RARE = 1e-3  # of these, below which they are no sample of the truncated prior
 
 L = TypeVar("L")
 
@@ -143,11 +142,11 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
         generator = torch_generator([self.seed, 3, number])
         own = posterior.sample((_DENSITY_DRAWS,), generator=generator)
         threshold = posterior.log_prob(own).quantile(self.options.truncated)
-        # draws of the prior, as far as they fall into the region
+        # draws of the prior, where at least one in a thousand falls into the region
         tried = self.prior.sample((_PROPOSALS,), generator=generator)
         inside = tried[posterior.log_prob(tried) >= threshold]
         self.diagnostics[f"truncated_prior_{number + 1}"] = len(inside) / _PROPOSALS
-        if len(inside) >= count and len(inside) > _RARE * _PROPOSALS:
+        if len(inside) >= count and len(inside) > 1e-3 * _PROPOSALS:
             return inside[:count].numpy()
         # draws of the posterior, accepted with the prior's density
         own = posterior.sample((_PROPOSALS,), generator=generator)

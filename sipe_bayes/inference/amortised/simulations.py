@@ -22,13 +22,13 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.seeding import torch_generator
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 BLOCK = 50  # rows; one file, one generator
-_SHIFTED = 1e-3  # p-value below which invalid simulations are said to lie elsewhere in the prior
 
 
 @dataclass(frozen=True)
@@ -160,6 +160,6 @@ def place_of_invalid(simulations: Simulations, space: ParameterSpace) -> str:
     bad, where = ~simulations.valid, []
     for j, name in enumerate(space.names):
         inside, outside = simulations.theta[~bad, j], simulations.theta[bad, j]
-        if len(inside) and scipy.stats.mannwhitneyu(inside, outside).pvalue < _SHIFTED:
+        if len(inside) and scipy.stats.mannwhitneyu(inside, outside).pvalue < THRESHOLDS.invalid_elsewhere:
             where.append(f"{'high' if np.median(outside) > np.median(inside) else 'low'} {name}")
     return f"mostly at {' and '.join(where)}" if where else "all over the prior"

@@ -33,7 +33,7 @@ from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.models.discriminator import HIDDEN, Discriminator, Training, TrainingState
+from sipe_bayes.models.discriminator import Discriminator, Training, TrainingState
 from sipe_bayes.models.transitions import control_steps
 
 REWARDS = ("state_difference", "learned")
@@ -47,7 +47,7 @@ class RewardOptions(Options):
     learning_rate: float = option(0.001, "of the discriminator's Adam", above=0)
     discriminator_batch: int = option(320, "control steps in a batch, half recorded and half simulated", least=2)
     discriminator_updates: int = option(30, "steps of Adam after each draw", least=1)
-    discriminator_hidden: int = option(HIDDEN, "units of each of the discriminator's two layers", least=1)
+    discriminator_hidden: int = option(128, "units of each of the discriminator's two layers", least=1)
 
 
 class LearnedReward:
