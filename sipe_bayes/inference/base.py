@@ -183,6 +183,10 @@ class Estimator(ABC, Generic[S]):
             raise ValueError(
                 f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
             )
+        self.prepare()
+
+    def prepare(self) -> None:
+        """For a subclass: what it checks or makes once, after the common arguments."""
         self.check_options()
 
     def check_options(self) -> None:

@@ -10,14 +10,14 @@ import importlib
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 import torch
 from torch.distributions import Distribution
 
 
-def import_sbi(module: str) -> Any:
+def import_sbi(module: str) -> ModuleType:
     """The module ``sbi.<module>``; argument validation stays as it was before."""
     before = Distribution._validate_args
     try:

@@ -53,7 +53,6 @@ from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.transitions import SMALLEST, control_steps
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.simulator import Simulator
 
 _ROWS = 100  # simulations whose control steps are held at once, for memory alone
 _SEEN, _SAMPLES = 500, 50  # simulations that a log is compared with, and samples of each, for time alone
@@ -122,8 +121,8 @@ class PriorSampling(Estimator[S], Generic[S, L]):
     options_type: ClassVar[type[Options]] = PriorSamplingOptions
     options: PriorSamplingOptions
 
-    def __init__(self, simulator: Simulator | CallableSimulator, **settings: Any) -> None:
-        super().__init__(simulator, **settings)
+    def prepare(self) -> None:
+        """Where simulations are kept; raises ValueError for no path, or a function without a name."""
         beside = None if self.checkpoint is None else self.checkpoint.with_name("simulations")
         self.cache = beside if self.options.cache is None else self.stored("cache", self.options.cache)
         self._cached: tuple[Trajectories, Cache] | None = None

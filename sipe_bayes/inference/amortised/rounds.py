@@ -19,7 +19,7 @@ Deviations:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -34,8 +34,6 @@ from sipe_bayes.inference.amortised.simulations import BLOCK, Simulations
 from sipe_bayes.inference.base import digest
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.simulator import Simulator
 
 _DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from: 1 / truncated, as it is by default
 _PROPOSALS = 2**17  # draws of the prior tried before resampling the posterior's, for time alone
@@ -73,9 +71,10 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
 
     options: RoundsOptions
 
-    def __init__(self, simulator: Simulator | CallableSimulator, **settings: Any) -> None:
-        super().__init__(simulator, **settings)
-        self.amortised = self.keeps  # type: ignore[misc]  # in rounds, this instance conditions on one log
+    def prepare(self) -> None:
+        """As the base's; in rounds, this instance conditions on one log."""
+        super().prepare()
+        self.amortised = self.keeps  # type: ignore[misc]  # of the instance
 
     @property
     def keeps(self) -> bool:
