@@ -23,7 +23,8 @@ from sipe_bayes.core.findings import Findings
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
-from sipe_bayes.inference.base import Estimator, digest
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.recorded import digest
 from sipe_bayes.inference.registry import estimator_class, get_estimator
 from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.simulation.simulator import Simulator

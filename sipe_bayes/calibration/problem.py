@@ -22,7 +22,8 @@ from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.base import Estimator, Progress
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior

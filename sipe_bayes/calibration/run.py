@@ -30,7 +30,8 @@ from sipe_bayes.diagnostics.misspecification import misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
-from sipe_bayes.inference.base import Estimator, Progress
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior

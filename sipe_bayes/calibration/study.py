@@ -15,9 +15,10 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.demonstrations import demonstrations
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.base import Estimator, digest
+from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.log_noise import fitted_noise
 from sipe_bayes.inference.recalibrated import Recalibrated
+from sipe_bayes.inference.recorded import digest
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments, StateSpace

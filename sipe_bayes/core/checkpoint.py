@@ -13,7 +13,7 @@ import json
 import types
 import typing
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -32,8 +32,11 @@ class CheckpointError(ValueError):
 class SearchState(Protocol):
     """What every method's state is: a frozen dataclass that says whether the search has ended."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
     @property
-    def done(self) -> bool: ...
+    def done(self) -> bool:
+        """Whether it has."""
 
 
 S = TypeVar("S")

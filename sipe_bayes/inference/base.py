@@ -12,23 +12,21 @@ import inspect
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
 
-from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.checkpoint import load_state, save_state
-from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
+from sipe_bayes.core.checkpoint import SearchState, load_state, save_state
+from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
-from sipe_bayes.envs.task import Task
+from sipe_bayes.inference.recorded import Progress, Recorded, digest
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
 from sipe_bayes.likelihood.windows import Windows
@@ -37,24 +35,7 @@ from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being done, rollouts so far, budget)."""
-
-
-class GymnasiumEnvironment(Protocol):
-    """What ``sipe.make`` returns, wrapped or not."""
-
-    @property
-    def unwrapped(self) -> object: ...
-
-
-Observed = FloatArray | Iterable[float]
-Recorded = Trajectory | Iterable[Trajectory] | Trajectories | Observed | str | Task | Simulator | GymnasiumEnvironment
-"""One or several trajectories, what a function was observed to give, or an environment: a task's name, a Task, a
-Simulator of one, ``sipe.make(...)``."""
-
-
-S = TypeVar("S", bound=Any)  # SearchState, once every method's state is a dataclass
+S = TypeVar("S", bound=SearchState)
 
 
 @dataclass(frozen=True)
@@ -70,55 +51,70 @@ class Snapshot(Generic[S]):
 class Estimator(ABC, Generic[S]):
     """Infers a posterior over theta from trajectories.
 
-    simulator: what is calibrated. prior: a posterior with a density over ``simulator.space``, default the one its
-    parameters state. budget: rollouts it may use. seed: the same seed gives the same posterior. likelihood: how
-    trajectories are compared, for the methods that use one. checkpoint: a file to go on from and to keep up to date;
-    the same call after an interruption gives the posterior of an undisturbed run. progress: called along the way.
+    Args:
+        simulator: what is calibrated.
+        prior: a posterior with a density over ``simulator.space``; default the one its parameters state.
+        budget: rollouts it may use.
+        seed: the same seed gives the same posterior.
+        likelihood: how trajectories are compared, for the methods that use one.
+        checkpoint: a file to go on from and to keep up to date; the same call after an interruption gives the posterior
+            of an undisturbed run.
+        progress: called along the way.
+        **options: the fields of the method's ``options_type``.
 
-    **Adding a method** takes one file and one line in ``inference.registry.ESTIMATORS``. Write three functions; the
-    base class checks, seeds, counts the budget, keeps the checkpoint and resumes:
+    **Adding a method** takes one file and one line in ``inference.registry.ESTIMATORS``. Write a frozen dataclass of its
+    state with a field ``done``, and three functions; the base class checks, seeds, counts the budget, keeps the
+    checkpoint and resumes:
 
-    - ``start(trajectories) -> State``: a flat dictionary of arrays, numbers and text (random generators as text),
-      with ``"done": False``.
-    - ``step(state, trajectories) -> State``: a new state, one affordable piece of work further; ``"done": True`` ends.
-      When the budget runs out in mid-step, BudgetExhausted ends the fit with the last whole state.
+    - ``start(trajectories) -> State``.
+    - ``step(state, trajectories) -> State``: a new state, one affordable piece of work further; ``done=True`` ends. When
+      the budget runs out in mid-step, BudgetExhausted ends the fit with the last whole state.
     - ``posterior(state, trajectories) -> Posterior``: of any state, without simulating.
 
-    The simplest method draws from the prior and keeps the best::
+    Arguments of its own are the fields of a frozen dataclass of ``core.options``, set as ``options_type``. The simplest
+    method draws from the prior and keeps the best::
+
+        from dataclasses import dataclass, replace
 
         import numpy as np
-        import torch
 
-        from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
+        from sipe_bayes.core.arrays import FloatArray
+        from sipe_bayes.core.findings import Code
+        from sipe_bayes.core.seeding import torch_generator
         from sipe_bayes.inference.base import Estimator
+        from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
         from sipe_bayes.posterior import Dirac
 
-        class RandomSearch(Estimator):
+        @dataclass(frozen=True)
+        class RandomSearchState:
+            theta: FloatArray
+            cost: FloatArray
+            done: bool = False
+
+        class RandomSearch(Estimator[RandomSearchState]):
             name = "random_search"
+            state_type = RandomSearchState
 
             def start(self, trajectories):
-                return {"theta": np.empty((0, len(self.space))), "cost": np.empty(0), "done": False}
+                return RandomSearchState(np.empty((0, len(self.space))), np.empty(0))
 
             def step(self, state, trajectories):
-                drawn = np.random.SeedSequence([self.seed, len(state["theta"])])  # other draws with every seed
-                generator = torch.Generator().manual_seed(int(drawn.generate_state(1)[0]))
+                generator = torch_generator([self.seed, len(state.theta)])  # other draws with every seed
                 theta = self.prior.sample((1,), generator=generator).numpy()
                 windows = self.windows(trajectories)
                 predicted = simulate(windows, theta)  # raises BudgetExhausted
                 cost = StateDifference(windows, channel_scale(windows, predicted))(predicted)
-                return {
-                    **state,
-                    "theta": np.concatenate([state["theta"], theta]),
-                    "cost": np.concatenate([state["cost"], cost]),
-                }
+                return replace(
+                    state, theta=np.concatenate([state.theta, theta]), cost=np.concatenate([state.cost, cost])
+                )
 
             def posterior(self, state, trajectories):
-                lost = int(np.isinf(state["cost"]).sum())
+                lost = int(np.isinf(state.cost).sum())
                 if lost:
-                    self.warn(f"{lost} of {len(state['cost'])} simulations {self.simulator.failure} and do not count")
-                return Dirac(state["theta"][state["cost"].argmin()], self.space)
+                    self.find(Code.DIVERGED_COUNT_AS_WORST, count=lost, total=len(state.cost), failure=self.simulator.failure)
+                return Dirac(state.theta[state.cost.argmin()], self.space)
 
-    ``find`` notes a finding, whose code and text stand in ``core.finding_texts``; ``digest`` tells trajectories apart.
+    ``find`` notes a finding, whose code and text stand in ``core.finding_texts``.
     """
 
     name: ClassVar[str]
@@ -129,7 +125,7 @@ class Estimator(ABC, Generic[S]):
     default_budget: ClassVar[int] = 1000
     checkpoint_seconds: float = 1.0
     options_type: ClassVar[type[Options]] = Options
-    state_type: ClassVar[Any] = dict[str, Any]  # the dataclass of a method's state
+    state_type: ClassVar[Any]  # the frozen dataclass of a method's state
     options: Options
 
     def __init__(
@@ -214,13 +210,16 @@ class Estimator(ABC, Generic[S]):
         cls.__signature__ = inspect.Signature([*common[1:], *own])  # type: ignore[attr-defined]
 
     @abstractmethod
-    def start(self, trajectories: Trajectories) -> S: ...
+    def start(self, trajectories: Trajectories) -> S:
+        """The first state."""
 
     @abstractmethod
-    def step(self, state: S, trajectories: Trajectories) -> S: ...
+    def step(self, state: S, trajectories: Trajectories) -> S:
+        """One affordable piece of work further."""
 
     @abstractmethod
-    def posterior(self, state: S, trajectories: Trajectories) -> Posterior: ...
+    def posterior(self, state: S, trajectories: Trajectories) -> Posterior:
+        """Of a state, without simulating."""
 
     def fit(self, trajectories: Recorded, *, retrain: bool = False) -> Posterior:
         """Infer. Afterwards ``rollouts`` is what this fit simulated, with what a checkpoint of it had counted.
@@ -248,10 +247,10 @@ class Estimator(ABC, Generic[S]):
         saved = time.monotonic()
         try:
             last = self._keep(self.start(batch)) if last is None else last
-            while not _ended(last.state):
+            while not last.state.done:
                 last = self._keep(self.step(last.state, batch))
                 late = time.monotonic() - saved > self.checkpoint_seconds
-                if self.checkpoint is not None and (_ended(last.state) or late):
+                if self.checkpoint is not None and (last.state.done or late):
                     save_state(self.checkpoint, last, fingerprint)
                     saved = time.monotonic()
                 if self.progress is not None:
@@ -275,13 +274,13 @@ class Estimator(ABC, Generic[S]):
                 last = self._keep(self.start(batch))
             except BudgetExhausted as error:
                 raise BudgetTooSmall(f"budget: {error}; raise it") from None
-        if not _ended(last.state):
+        if not last.state.done:
             self.go_on_from(last)
             try:
                 self._keep(self.step(last.state, batch))
             except BudgetExhausted:
                 self.find(Code.BUDGET_SPENT, budget=self.budget)
-                self._keep(_with_end(last.state))
+                self._keep(replace(last.state, done=True))
 
     def get_parameter_estimate(self, trajectories: Recorded) -> Posterior:
         """The posterior of the present state."""
@@ -339,7 +338,7 @@ class Estimator(ABC, Generic[S]):
     @property
     def ended(self) -> bool:
         """Whether the search is over."""
-        return self._last is not None and _ended(self._last.state)
+        return self._last is not None and self._last.state.done
 
     @property
     def state(self) -> S | None:
@@ -354,16 +353,6 @@ class Estimator(ABC, Generic[S]):
     def find(self, code: Code, **about: Any) -> None:
         """Note a finding, once; ``about``: as of ``core.findings.finding``."""
         self.findings.add(finding(code, **about))
-
-    def warn(self, sentence: str | None) -> None:
-        """Add a sentence to the warnings, once; None adds nothing."""
-        if sentence is not None:
-            self.find(Code.REMARK, text=sentence)
-
-    def doubt(self, sentence: str) -> None:
-        """Warn of something for which no interval is to be trusted."""
-        self.findings = Findings(item for item in self.findings if item.text != sentence)
-        self.find(Code.REMARK, severity=Severity.BLOCKING, text=sentence)
 
     @property
     def warnings(self) -> list[str]:
@@ -410,23 +399,6 @@ class Estimator(ABC, Generic[S]):
     def _fingerprint(self, trajectories: Trajectories) -> str:
         """What tells runs apart: all settings, and the trajectories."""
         return hashlib.sha256(f"{self.settings()!r}{digest(trajectories)}".encode()).hexdigest()
-
-
-def _ended(state: Any) -> bool:
-    return bool(state["done"] if isinstance(state, dict) else state.done)
-
-
-def _with_end(state: Any) -> Any:
-    return {**state, "done": True} if isinstance(state, dict) else replace(state, done=True)
-
-
-def digest(trajectories: Trajectories) -> str:
-    """SHA-256 of what was recorded: the same trajectories have the same, others another."""
-    found = hashlib.sha256()
-    states = np.empty(0) if trajectories.states is None else trajectories.states
-    for array in (trajectories.observations, trajectories.actions, trajectories.dt, trajectories.length, states):
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
 
 
 def _default_likelihood(simulator: Simulator | CallableSimulator) -> Segments:

@@ -54,10 +54,11 @@ from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
-from sipe_bayes.inference.base import Estimator, Progress, Recorded
+from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.inverse_regression import Line
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.log_noise import NOISE_BUDGET, fitted_noise, noise_is_unknown, process_noise
+from sipe_bayes.inference.recorded import Progress, Recorded
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import Replicas, observation_noise

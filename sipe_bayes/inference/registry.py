@@ -11,7 +11,8 @@ from sipe_bayes.core.validation import nearest_name
 
 if TYPE_CHECKING:
     from sipe_bayes.envs.task import Task
-    from sipe_bayes.inference.base import Estimator, GymnasiumEnvironment
+    from sipe_bayes.inference.base import Estimator
+    from sipe_bayes.inference.recorded import GymnasiumEnvironment
     from sipe_bayes.simulation.callable_simulator import CallableSimulator
     from sipe_bayes.simulation.simulator import Simulator
 

@@ -44,7 +44,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.checkpoint import SearchState, load_state, save_state
 from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.core.findings import Finding, Findings
 from sipe_bayes.core.trajectory import Trajectories
@@ -55,7 +55,7 @@ from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report
 
-S = TypeVar("S")
+S = TypeVar("S", bound=SearchState)
 CHECKPOINT = "checkpoint/state.safetensors"
 
 

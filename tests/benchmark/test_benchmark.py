@@ -270,21 +270,27 @@ def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) 
 
 
 MIDDLE = '''"""A toy: the answer is the middle, whatever was recorded."""
+from dataclasses import dataclass
 import numpy as np
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.posterior import Dirac
 
-class Middle(Estimator):
+@dataclass(frozen=True)
+class Ended:
+    done: bool
+
+class Middle(Estimator[Ended]):
     """The middle; seed 1 fails."""
     name = "middle"
+    state_type = Ended
 
     def start(self, trajectories):
-        return {"done": False}
+        return Ended(False)
 
     def step(self, state, trajectories):
         if self.seed == 1:
             raise ArithmeticError("no middle")
-        return {"done": True}
+        return Ended(True)
 
     def posterior(self, state, trajectories):
         return Dirac(np.full(len(self.space), 0.5), self.space)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from sipe_bayes.core.findings import Code
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.models.training import Training
@@ -100,11 +102,12 @@ def test_the_guides_example_is_an_estimator(tmp_path: Path) -> None:
     assert np.abs(one.mean.numpy() - truth).mean() < 0.5 * np.abs(0.5 - truth).mean()
     other = names["RandomSearch"](simulator, budget=60, seed=3)
     assert other.fit(log(simulator, [0.45, 0.16], 3)).mean.tolist() != one.mean.tolist()
-    assert not set(other.state["theta"][:, 0]) & set(made[0].state["theta"][:, 0])
-    lost = other.state["cost"].copy()
+    assert not set(other.state.theta[:, 0]) & set(made[0].state.theta[:, 0])
+    lost = other.state.cost.copy()
     lost[int(lost.argmin())] = np.inf  # the best diverges
     assert (
-        other.posterior({**other.state, "cost": lost}, None).mean.tolist()
+        other.posterior(replace(other.state, cost=lost), None).mean.tolist()
         != other.posterior(other.state, None).mean.tolist()
     )
-    assert other.warnings[-1:] == ["1 of 60 simulations diverged and do not count"]
+    (noticed,) = other.findings.of(Code.DIVERGED_COUNT_AS_WORST)
+    assert noticed.text.startswith("1 of 60 simulations diverged")

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from sipe_bayes.core.checkpoint import CheckpointError
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference import ESTIMATORS, get_estimator
@@ -186,7 +187,7 @@ def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: P
 def test_a_doubt_survives_an_interruption(tmp_path: Path) -> None:
     class Doubting(type(get_estimator(pendulum(), "cem"))):  # type: ignore[misc]
         def step(self, state: Any, trajectories: Any) -> Any:
-            self.doubt("nothing is certain")
+            self.find(Code.PROCESS_NOISE_UNSETTLED)
             return super().step(state, trajectories)
 
     def fitted() -> Any:
@@ -195,7 +196,8 @@ def test_a_doubt_survives_an_interruption(tmp_path: Path) -> None:
         return doubting
 
     first, again = fitted(), fitted()  # the second one only reads
-    assert again.doubts == first.doubts == ["nothing is certain"]
+    assert again.findings.blocking == first.findings.blocking
+    assert [item.code for item in first.findings.blocking] == [Code.PROCESS_NOISE_UNSETTLED]
     first.checkpoint = None
     first.step = super(Doubting, first).step
     first.fit(log(pendulum(), TRUTH, 1, steps=100))

@@ -12,13 +12,13 @@ import torch
 import sipe_bayes as sipe
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
-from sipe_bayes.inference.base import default_prior
 from sipe_bayes.inference.importance import Draws, ImportanceTuning
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.posterior import prior as default_prior
 from tests.problems.pendulums import log as pendulum_log
 from tests.problems.pendulums import pendulum
 

@@ -14,7 +14,8 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.core.checkpoint import CheckpointError, State
+from sipe_bayes.core.checkpoint import CheckpointError
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting
@@ -26,6 +27,7 @@ from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from tests.problems.pendulums import log, pendulum
+from tests.problems.planted import Ended
 from tests.problems.springs import HIGH, LOW, PROCESS, spring, spring_logs
 
 MIXING = np.array([[1.0, 0.6], [0.6, 1.0]])
@@ -44,10 +46,11 @@ OBSERVED = MIXING @ TRUTH + SD * np.random.default_rng(5).standard_normal(2)
 EXACT = GaussianMixture([0.0], np.linalg.solve(MIXING, OBSERVED)[None], COVARIANCE[None], SPACE)
 
 
-class Planted(Estimator):
+class Planted(Estimator[Ended]):
     """The exact posterior's mean, ``shift`` off, with ``width`` times its sds and no correlation; a point for a width of zero."""
 
     name = "planted"
+    state_type = Ended
 
     def __init__(
         self,
@@ -62,14 +65,14 @@ class Planted(Estimator):
         self.mixing = MIXING[: len(self.space), : len(self.space)]
         self.amortised = amortised  # type: ignore[misc]
 
-    def start(self, trajectories: Trajectories) -> State:
-        return {"done": False}
+    def start(self, trajectories: Trajectories) -> Ended:
+        return Ended(False)
 
-    def step(self, state: State, trajectories: Trajectories) -> State:
+    def step(self, state: Ended, trajectories: Trajectories) -> Ended:
         self.rollouts += 1
-        return {"done": True}
+        return Ended(True)
 
-    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+    def posterior(self, state: Ended, trajectories: Trajectories) -> Posterior:
         mean = np.linalg.solve(self.mixing, trajectories.observations[0, 1]) + self.shift
         if not self.width:
             return Dirac(np.clip(mean, 0, 1), self.space)
@@ -115,7 +118,7 @@ def test_a_parameter_that_the_estimate_does_not_follow_comes_back_as_the_prior()
     """The point stays at 0.5 whatever the second parameter is."""
 
     class Deaf(Planted):
-        def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+        def posterior(self, state: Ended, trajectories: Trajectories) -> Posterior:
             return Dirac([float(np.clip(trajectories.observations[0, 1, 0], 0, 1)), 0.5], SPACE)
 
     def alone(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -150,15 +153,16 @@ def test_what_an_amortised_estimator_doubts_of_the_log_stays_in_doubt(amortised:
     """Not what it says of replicas; one that is fitted anew doubts its widths, which are mended."""
 
     class Doubting(Planted):
-        def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
-            self.doubt(f"unlike {trajectories.observations[0, 1].tolist()}")
+        def posterior(self, state: Ended, trajectories: Trajectories) -> Posterior:
+            seen = trajectories.observations[0, 1].tolist()
+            self.find(Code.NOT_MIXED, what=f"chains of {seen}", rhat=2.0, ess=1.0, unit="", remedy="wait")
             return super().posterior(state, trajectories)
 
     recalibrated = Recalibrated(Doubting(amortised=amortised), refits=20)
     for _ in range(2):
         recalibrated.fit(OBSERVED)
         assert len(recalibrated.doubts) == doubts
-        assert sum("unlike" in said for said in recalibrated.warnings) == 1
+        assert len(recalibrated.findings.of(Code.NOT_MIXED)) == 1
 
 
 def test_a_point_that_the_start_moves_more_than_theta_does() -> None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
-from sipe_bayes.core.checkpoint import State
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.estimator import Laplace, LaplaceState
 from sipe_bayes.posterior import GaussianMixture, Posterior
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A state of a method that has nothing to remember."""
+
+    done: bool
 
 
 class Planted(Laplace):
@@ -15,7 +22,7 @@ class Planted(Laplace):
 
     width: ClassVar[float]
 
-    def posterior(self, state: State, trajectories: Trajectories) -> Posterior:
+    def posterior(self, state: LaplaceState, trajectories: Trajectories) -> Posterior:
         found = super().posterior(state, trajectories)
         assert isinstance(found, GaussianMixture)
         return GaussianMixture(found.log_weights, found.means, self.width**2 * found.covariances, found.space)

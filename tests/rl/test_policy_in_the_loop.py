@@ -24,6 +24,7 @@ from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, LoopResult, train_in_th
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.checkpoints import contents
+from tests.problems.planted import Ended
 from tests.problems.quick import FORM
 
 EPISODE, HORIZON = 30, 20
@@ -49,24 +50,25 @@ def loop(of: Estimator, updates: int = 2, steps: int = 120, **settings: Any) -> 
     return train_in_the_loop(of, "in_distribution", steps, updates=updates, **given)
 
 
-class Told(Estimator):
+class Told(Estimator[Ended]):
     """Keeps the trajectories it is given and answers with a corner of the cube; fails where it is told to."""
 
     name = "told"
+    state_type = Ended
     fails: tuple[int, ...] = ()
 
-    def start(self, trajectories: Trajectories) -> dict[str, Any]:
+    def start(self, trajectories: Trajectories) -> Ended:
         self.given = [*getattr(self, "given", []), trajectories]
         self.budgets = [*getattr(self, "budgets", []), self.budget]
         if len(self.given) in self.fails:
             raise ValueError("no idea")
-        return {"done": False}
+        return Ended(False)
 
-    def step(self, state: dict[str, Any], trajectories: Trajectories) -> dict[str, Any]:
+    def step(self, state: Ended, trajectories: Trajectories) -> Ended:
         self.rollouts = min(7, self.budget)
-        return {"done": True}
+        return Ended(True)
 
-    def posterior(self, state: dict[str, Any], trajectories: Trajectories) -> Dirac:
+    def posterior(self, state: Ended, trajectories: Trajectories) -> Dirac:
         return Dirac(np.full(len(self.space), 0.25), self.space)
 
 

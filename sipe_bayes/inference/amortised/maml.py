@@ -43,7 +43,7 @@ from sipe_bayes.inference.amortised.prior_sampling import (
     recorded_steps,
 )
 from sipe_bayes.inference.amortised.simulations import Simulations
-from sipe_bayes.inference.base import digest
+from sipe_bayes.inference.recorded import digest
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.models.training import (
     EarlyStopping,

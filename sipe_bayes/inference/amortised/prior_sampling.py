@@ -45,7 +45,8 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.experiment import Experiment, Looks, measured
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
-from sipe_bayes.inference.base import Estimator, Recorded, Snapshot, digest
+from sipe_bayes.inference.base import Estimator, Snapshot
+from sipe_bayes.inference.recorded import Recorded, digest
 from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import first_states

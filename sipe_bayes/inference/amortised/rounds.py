@@ -31,7 +31,7 @@ from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import BLOCK, Simulations
-from sipe_bayes.inference.base import digest
+from sipe_bayes.inference.recorded import digest
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.posterior import Posterior
 

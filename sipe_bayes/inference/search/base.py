@@ -16,7 +16,8 @@ from sipe_bayes.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.base import Estimator, Recorded, digest
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.recorded import Recorded, digest
 from sipe_bayes.inference.search.learned_reward import LearnedReward, RewardOptions
 from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall

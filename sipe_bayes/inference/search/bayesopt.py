@@ -56,7 +56,8 @@ from sipe_bayes.core.options import option
 from sipe_bayes.core.seeding import seed_integer, torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.base import Estimator, digest
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.recorded import digest
 from sipe_bayes.inference.search.acquisition import (
     Acquisition,
     CandidateOptions,
