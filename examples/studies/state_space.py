@@ -89,7 +89,7 @@ def one_fit(simulator: sipe.Simulator, task: str, level: float, seed: int, steps
         "wall_seconds": round(seconds, 2),
         "processor_seconds": round(processor, 2),
         "process_over_measurement": round(_process_share(estimator.diagnostics, task in CHEETAHS), 4),
-        "loose_jumps": len(estimator.diagnostics["loose"]),
+        "loose_jumps": len(estimator.diagnostics["outliers"]),
         "warnings": estimator.warnings,
         "source": source(),
     }

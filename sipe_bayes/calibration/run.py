@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -37,6 +36,7 @@ from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import observation_noise
 from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
@@ -201,11 +201,11 @@ def _left_out(problem: Problem, method: Estimator) -> list[Finding]:
     if not isinstance(problem.likelihood, StateSpace):
         return []
     noticed = [finding(Code.RESIDUALS_LEFT_OUT)]
-    known = ("process_noise", "movement", "loose")
+    known = ("process_noise", "movement", "outliers")
     if set(known) <= method.diagnostics.keys():
-        chain: Any = method.windows(problem.train)
-        text = chain.lacking(*(np.array(method.diagnostics[key]) for key in known))
-        noticed.append(finding(Code.PROCESS_NOISE, text=text))
+        chain = bind(problem.likelihood, problem.simulator, problem.train)
+        process, movement, outliers = (np.array(method.diagnostics[key]) for key in known)
+        noticed.extend(process_noise_findings(chain, process, movement, outliers))
     return noticed
 
 

@@ -75,6 +75,9 @@ class Code(StrEnum):
     MISFIT_UNKNOWN = auto()
     RESIDUALS_LEFT_OUT = auto()
     PROCESS_NOISE = auto()
+    PROCESS_OUTLIERS = auto()
+    PROCESS_NOISE_SMALL = auto()
+    PROCESS_NOISE_LARGE = auto()
 
     # logs
     WITHIN_PRIOR = auto()
@@ -280,7 +283,20 @@ TEXTS: dict[Code, Text] = {
         "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "
         "measured starts.",
     ),
-    Code.PROCESS_NOISE: Text(_NOTE, "{text}"),
+    Code.PROCESS_NOISE: Text(
+        _NOTE,
+        "Process noise is largest in the {coordinate}: its sd is {sd:.2g}, {percent} % of how far that moves in a "
+        "control step.",
+    ),
+    Code.PROCESS_OUTLIERS: Text(
+        _NOTE,
+        "{count} of {steps} control steps stand out and count for little, as where a contact is missed: at {times}.",
+    ),
+    Code.PROCESS_NOISE_SMALL: Text(_NOTE, "The model follows the logs closely{elsewhere}."),
+    Code.PROCESS_NOISE_LARGE: Text(
+        _NOTE,
+        "A model that lacks nothing needs next to none: look for what it lacks there before you trust the values.",
+    ),
     # logs
     Code.WITHIN_PRIOR: Text(_NOTE, "log {log} is like simulations of the prior (p = {p:.2g})"),
     Code.OUTSIDE_PRIOR: Text(

@@ -76,6 +76,9 @@ class Thresholds(Options):
     small_misfit: float = option(
         0.1, "a cause that explains less of every channel's residual is small", "of the residual", above=0, below=1
     )
+    much_process_noise: float = option(
+        0.1, "process noise below it leaves the motion to the model", "of the movement in a control step", above=0
+    )
     far_shift: float = option(
         1.0,
         "a parameter that would move further if the model had the cause is not to be trusted",

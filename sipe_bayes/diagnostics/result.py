@@ -32,7 +32,13 @@ FLAGS: Mapping[Code, str] = {
 }
 """Findings about single parameters, and the flag that result.json has for them."""
 NUISANCE = "nuisance"
-_LEFT_OUT = (Code.RESIDUALS_LEFT_OUT, Code.PROCESS_NOISE)
+_LEFT_OUT = (
+    Code.RESIDUALS_LEFT_OUT,
+    Code.PROCESS_NOISE,
+    Code.PROCESS_OUTLIERS,
+    Code.PROCESS_NOISE_SMALL,
+    Code.PROCESS_NOISE_LARGE,
+)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008
 The target is that of ``window_target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes first and also places the
 walkers; that saves D of D + 1 simulations. How far a fresh Jacobian would move the target is measured on some of the first walkers and reported as
 ``linearisation_error`` (sd in nats; NaN where it would cost more than a tenth of the budget). With ``StateSpace`` the target is that of
-``state_space_target``, with the noise of the ``laplace`` fit.
+``state_space.target``, with the noise of the ``laplace`` fit.
 
 Deviations: R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do;
 walkers share information, so R-hat is an optimistic diagnostic.
@@ -30,9 +30,9 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.chain_state import ChainOptimum, process_diagnostics
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.state_space_target import ChainFit, ChainTarget
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
+from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import distinct
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
@@ -366,7 +366,7 @@ def _noise_of(fit: WindowFit | ChainFit) -> dict[str, object]:
     optimum = fit.optimum
     noise = {"noise_sd": optimum.sd.tolist(), "noise_tau": optimum.tau.tolist()}
     if isinstance(optimum, ChainOptimum):
-        return noise | process_diagnostics(optimum.process, optimum.movement, optimum.loose)
+        return noise | optimum.diagnostics()
     return noise
 
 

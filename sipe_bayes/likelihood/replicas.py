@@ -48,7 +48,7 @@ def observation_noise(
 
 class Replicas:
     """Makes replicas of ``trajectories`` with a given ``noise`` (O channels), and process noise of sd ``process`` (D,), default none, in the
-    tangent coordinates of ``StateSpace``, whose loose jumps are not repeated."""
+    tangent coordinates of ``StateSpace``, whose outliers are not repeated."""
 
     def __init__(
         self,

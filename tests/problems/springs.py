@@ -6,7 +6,10 @@ import numpy as np
 
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainNoise
 from sipe_bayes.likelihood.windows import START_SD
 from sipe_bayes.simulation.simulator import Simulator
@@ -85,3 +88,15 @@ def kalman(
                 mean = transition @ mean + push * log.actions[k, 0]
                 covariance = transition @ covariance @ transition.T + np.diag(noise.process**2)
     return total
+
+
+def kicked_logs(kick: float = 1.0) -> list[Trajectory]:
+    """Little process noise, but for a kick in each of two logs."""
+    return spring_logs(steps=120, process=PROCESS / 20, kick=kick)
+
+
+def spring_chain() -> tuple[Chain, list[Trajectory], np.ndarray]:
+    """The chain of the logs, these, and the means of their first states."""
+    logs = spring_logs()
+    chain = bind(StateSpace(noise_sd=(SD,)), spring(), Trajectories.stack(logs))
+    return chain, logs, chain.reference[chain.first][:, 1:3]

@@ -16,11 +16,11 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws
-from sipe_bayes.inference.laplace.chain_state import ChainOptimum, ChainState, process_diagnostics
-from sipe_bayes.inference.laplace.known_start_search import KnownStartSearch
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST
-from sipe_bayes.inference.laplace.state_space_search import StateSpaceSearch
+from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
+from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
@@ -45,7 +45,7 @@ class LaplaceState:
         done: whether both have ended.
     """
 
-    search: WindowState | ChainState
+    search: WindowState | StateSpaceState | KnownStartState
     draws: Draws | None = None
     done: bool = False
 
@@ -56,7 +56,7 @@ class Laplace(Estimator[LaplaceState]):
     Args:
         restarts: starting points followed, at most.
         candidates: points among which they are chosen: draws from the prior and, of 40 or more, later ones around the
-            best; without effect where ``known_start_search`` finds them.
+            best; without effect where ``state_space.known_starts`` finds them.
         initial: (R, N), the starting points themselves instead.
         tuning: numbers of the search itself.
     """
@@ -173,7 +173,7 @@ class Laplace(Estimator[LaplaceState]):
         best = kept[0]
         self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
         if isinstance(best, ChainOptimum):
-            self.diagnostics |= process_diagnostics(best.process, best.movement, best.loose)
+            self.diagnostics |= best.diagnostics()
             if not best.settled:
                 self.find(Code.PROCESS_NOISE_UNSETTLED)
         for optimum in kept:

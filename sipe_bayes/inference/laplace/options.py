@@ -9,6 +9,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.pattern_search import PatternTuning
+from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class LaplaceTuning(Options):
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
     pattern: PatternTuning = option(PatternTuning(), "how the surroundings of an optimum are looked at")
+    state_space: ChainTuning = option(ChainTuning(), "how the searches over a chain of states go")
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import pytest
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.inference.laplace.posterior_linearisation import linearise
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.differences import linearise, linearise_widely
 from sipe_bayes.simulation.simulator import Simulator
 
 STEP = 0.01
@@ -40,8 +40,8 @@ def states(positions: list[float]) -> np.ndarray:
 def test_a_linear_model_has_the_same_slopes_at_any_length_and_no_error() -> None:
     chain = sliding()
     theta, at = np.array([0.25]), states([0.0, 0.3, 0.2])
-    short = chain.linearise(theta, at)
-    wide = linearise(chain, theta, at, np.array([0.2]), np.full((3, 2), 0.3))
+    short = linearise(chain, theta, at)
+    wide = linearise_widely(chain, theta, at, np.array([0.2]), np.full((3, 2), 0.3))
     assert short is not None
     assert wide is not None
     np.testing.assert_allclose(wide.transition, short.transition, atol=1e-6)
@@ -59,7 +59,7 @@ def test_at_a_stop_the_slope_is_between_both_sides_and_the_jump_has_an_error() -
     pushes back. Half of that is the slope, and half the squared deviation of one side, once more halved, the variance."""
     chain, step = sliding(spring=1e-9, limited="true"), 0.01
     theta, at = np.array([0.0]), states([0.0, 0.5, 0.5])
-    wide = linearise(chain, theta, at, np.array([1e-4]), np.full((3, 2), step))
+    wide = linearise_widely(chain, theta, at, np.array([1e-4]), np.full((3, 2), step))
     assert wide is not None
     behind = chain.simulate(theta[None], states([-step, 0.5, 0.5])[None])[1][0, 0, 2]
     print("velocity after a control step behind the stop", behind)
@@ -81,7 +81,7 @@ def test_a_side_that_diverges_counts_as_no_slope(monkeypatch: pytest.MonkeyPatch
         return predicted, ends, valid
 
     monkeypatch.setattr(chain, "simulate", broken)
-    wide = linearise(chain, np.array([0.25]), states([0.0, 0.3, 0.2]), np.array([0.2]), np.full((3, 2), 0.3))
+    wide = linearise_widely(chain, np.array([0.25]), states([0.0, 0.3, 0.2]), np.array([0.2]), np.full((3, 2), 0.3))
     assert wide is not None
     assert (wide.transition[0, :, 1] == 0).all()
     assert wide.transition[1, 0, 1] == pytest.approx(STEP)

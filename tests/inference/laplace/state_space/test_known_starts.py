@@ -11,9 +11,9 @@ import sipe_bayes as sipe
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.inference.laplace import known_start_search
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.growing_horizon import grown
+from sipe_bayes.inference.laplace.state_space.growing_horizon import grown
+from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -111,14 +111,14 @@ def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
     """With every budget around the one at which the first estimate of the noise is done, nothing likelier is known than what is kept."""
     log, start, seen = bouncing_log(np.array([0.4, 0.6, 0.5]), 5, 60), np.array([[0.5, 0.5, 0.5]]), []
 
-    def noted(*given):  # type: ignore[no-untyped-def]
-        found = estimated(*given)
-        seen.append((given[1].rollouts, float(found[1]["mode_evidence"].max())))
-        return found
+    def noted(self, state, linear):  # type: ignore[no-untyped-def]
+        after = estimated(self, state, linear)
+        seen.append((self.chain.rollouts, max(one.evidence for one in after[0].optima)))
+        return after
 
-    estimated = known_start_search._estimated
+    estimated = KnownStartSearch.estimated
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(known_start_search, "_estimated", noted)
+        patch.setattr(KnownStartSearch, "estimated", noted)
         Laplace(bouncing(), likelihood=KNOWN, initial=start).fit(log)
         (first, evidence), *_ = seen
         for budget in range(first, first + 4):

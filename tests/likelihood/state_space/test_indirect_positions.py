@@ -29,7 +29,7 @@ def swing(truth: np.ndarray, seed: int, steps: int = 100, level: float = 0.01) -
     return simulator, Trajectory(noisy, actions, motion.dt[0], motion.states[0])
 
 
-def test_an_angle_is_read_off_its_cosine_and_sine() -> None:
+def test_an_angle_is_found_from_its_cosine_and_sine() -> None:
     """Within four sds of the noise, all round the circle, without jumps; recorded states are left aside."""
     for seed in range(4):
         simulator, log = swing(np.full(3, 0.5), seed)
@@ -38,8 +38,8 @@ def test_an_angle_is_read_off_its_cosine_and_sine() -> None:
         turns = np.round((angle - true) / (2 * np.pi))
         np.testing.assert_array_equal(turns, turns[0])
         assert np.abs(angle - true - 2 * np.pi * turns).max() < 4 * 0.01
-        assert chain.placed.all()
-        assert (chain.rollouts, chain.prepared > 30) == (0, True)
+        assert chain.determined.all()
+        assert (chain.rollouts, chain.setup_rollouts > 30) == (0, True)
         given = bind(StateSpace(), simulator, Trajectories.stack(log))
         np.testing.assert_array_equal(given.reference, chain.reference)
 
@@ -52,8 +52,8 @@ SECOND = """<body name="two" pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping
 size="0.01" mass="0.6" contype="0" conaffinity="0"/><site name="tip" pos="0 0 -0.5"/></body>"""
 
 
-@pytest.mark.parametrize(("links", "seen", "told"), [(1, "xz", True), (1, "z", False), (2, "xz", False)])
-def test_an_angle_that_is_not_unique_is_not_read_off(links: int, seen: str, told: bool) -> None:
+@pytest.mark.parametrize(("links", "seen", "indirect"), [(1, "xz", True), (1, "z", False), (2, "xz", False)])
+def test_an_angle_that_is_not_unique_is_not_made_up(links: int, seen: str, indirect: bool) -> None:
     """The place of a rod's tip tells its angle; its height alone leaves two, and two angles move the tip of a second rod together: there
     nothing is made up, and the search goes by the filter as before."""
     xml = TIPS.format(rest=SECOND if links == 2 else '<site name="tip" pos="0 0 -0.5"/>')
@@ -67,11 +67,11 @@ def test_an_angle_that_is_not_unique_is_not_read_off(links: int, seen: str, told
     assert motion.states is not None
     noise = 0.001 * np.random.default_rng(0).standard_normal(motion.observations[0].shape)
     chain = bind(StateSpace(), simulator, Trajectories.stack(Trajectory(motion.observations[0] + noise, actions, 0.01)))
-    assert chain.placed[0] == told
-    if told:
+    assert chain.determined[0] == indirect
+    if indirect:
         np.testing.assert_allclose(chain.reference[:, 1], motion.states[0, :, 1], atol=0.05)
     else:
-        assert not chain.placed[: simulator.model.nv].any()
+        assert not chain.determined[: simulator.model.nv].any()
         assert (chain.reference[1:, 1] == chain.reference[0, 1]).all()
 
 
@@ -82,7 +82,7 @@ def test_what_no_channel_depends_on_stays_where_it_is() -> None:
     log = replace(sipe.demonstrations(task, count=1, steps=20, seed=0)[0], states=None)
     chain = bind(StateSpace(), simulator, Trajectories.stack(log))
     assert (chain.reference[:, 1] == simulator.default_state()[1]).all()
-    assert chain.placed.all()
+    assert chain.determined.all()
 
 
 def test_intervals_hold_the_truth_where_cosine_and_sine_are_measured() -> None:

@@ -1,9 +1,9 @@
 """log p(theta | y) with all states of a ``StateSpace`` marginalised, for ``mcmc``: one simulation of the logs a value.
 
-The states follow theta as the smoother found, x(theta) = x_hat - slope (theta - theta_hat), and are simulated there; what
-remains of the likelihood is quadratic in them with the Jacobians of the ``laplace`` optimum, so its block-tridiagonal
-matrix is factorised once. Exact where measurement and transition are linear in the states. The noise is that of the
-optimum.
+The states follow theta as the smoother found, x(theta) = x_hat - slope (theta - theta_hat), and are simulated there;
+what remains of the likelihood is quadratic in them with the Jacobians of the ``laplace`` optimum, so its
+block-tridiagonal matrix is factorised once. Exact where measurement and transition are linear in the states. The noise
+is that of the optimum.
 """
 
 from __future__ import annotations
@@ -12,23 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from sipe_bayes.inference.laplace.chain_state import ChainOptimum
-from sipe_bayes.inference.laplace.posterior_linearisation import linearise
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.differences import compare, linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
-    ChainNoise,
     eliminate_states,
     log_likelihood,
     pull,
 )
 from sipe_bayes.posterior import Posterior
 
-FloatArray = NDArray[np.float64]
-
-_STEPS = 2  # of the states, before a fresh linearisation is compared
+_STEPS = 2  # of the states, before a fresh linearisation is compared: Gauss-Newton's second is below rounding
 
 
 @dataclass(frozen=True)
@@ -40,33 +37,34 @@ class ChainFit:
 
     @classmethod
     def at(cls, chain: Chain, optimum: ChainOptimum) -> ChainFit:
-        """Linearise at an optimum.
+        """Linearise at an optimum, by differences as long as the fit took them.
+
+        Args:
+            chain: the logs.
+            optimum: of the fit.
 
         Raises:
             ValueError: where the simulation diverges there.
         """
-        found = _linearised(chain, optimum.theta, optimum.states, optimum.theta_step, optimum.state_step)
-        if found is None:
+        linear = linearise_by(chain, optimum.theta, optimum.states, optimum.theta_step, optimum.state_step)
+        if linear is None:
             raise ValueError("mcmc: the simulation diverges at the laplace fit; narrow the bounds")
-        return cls(optimum, found)
-
-
-def _linearised(
-    chain: Chain, theta: FloatArray, states: FloatArray, theta_step: FloatArray, state_step: FloatArray
-) -> ChainLinearisation | None:
-    """By differences as long as the fit took them."""
-    if not state_step.any():
-        return chain.linearise(theta, states)
-    return linearise(chain, theta, states, theta_step, state_step)
+        return cls(optimum, linear)
 
 
 class ChainTarget:
-    """log p(theta | y) of walkers (B, N), up to the prior's constant."""
+    """log p(theta | y) of walkers (B, N), up to the prior's constant.
+
+    Args:
+        prior: on theta.
+        chain: the logs.
+        fit: the optimum.
+    """
 
     def __init__(self, prior: Posterior, chain: Chain, fit: ChainFit) -> None:
         self.prior, self.chain, self.optimum, self.fit = prior, chain, fit.optimum, fit.linearisation
-        self.sd = ChainNoise(fit.optimum.sd, fit.optimum.process, fit.optimum.movement, fit.optimum.loose)
-        self.solved = eliminate_states(self.fit, self.sd)
+        self.noise = fit.optimum.noise
+        self.solved = eliminate_states(self.fit, self.noise)
 
     def states(self, theta: FloatArray) -> FloatArray:
         """States (B, K, S) that follow theta (B, N)."""
@@ -74,26 +72,26 @@ class ChainTarget:
         return self.chain.moved(self.optimum.states, -away)
 
     def __call__(self, points: FloatArray) -> FloatArray:
+        """Values (B,) at points (B, N); minus infinity outside the cube and where a simulation diverges."""
         out = np.full(len(points), -np.inf)
         inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
         if not len(inside):
             return out
         theta = points[inside]
-        found = self.chain.compare(theta, self.states(theta), self.fit)
-        good = [k for k, one in enumerate(found) if one is not None]
-        if not good:
+        compared = compare(self.chain, theta, self.states(theta), self.fit)
+        valid = [k for k, one in enumerate(compared) if one is not None]
+        if not valid:
             return out
-        values = self._marginal([one for one in found if one is not None])
-        out[inside[good]] = values + self.prior.log_prob(torch.from_numpy(theta[good])).numpy()
+        values = self._marginal([one for one in compared if one is not None])
+        out[inside[valid]] = values + self.prior.log_prob(torch.from_numpy(theta[valid])).numpy()
         return out
 
-    def _marginal(self, found: list[ChainLinearisation]) -> FloatArray:
+    def _marginal(self, compared: list[ChainLinearisation]) -> FloatArray:
         """log p(y | theta) of comparisons that share the optimum's Jacobians."""
-        forces = np.stack([pull(one, self.sd).ravel() for one in found], axis=1)
-        moved = self.solved.solve(forces)
-        gains = (forces * moved).sum(0)
+        forces = np.stack([pull(one, self.noise).ravel() for one in compared], axis=1)
+        gains = (forces * self.solved.solve(forces)).sum(0)
         solved = [replace(self.solved, explained=float(g)) for g in gains]
-        return np.array([log_likelihood(one, self.sd, s) for one, s in zip(found, solved, strict=True)])
+        return np.array([log_likelihood(one, self.noise, s) for one, s in zip(compared, solved, strict=True)])
 
     @property
     def check_cost(self) -> int:
@@ -106,10 +104,10 @@ class ChainTarget:
         states = self.states(point[None])[0]
         value = -np.inf
         for _ in range(_STEPS):
-            found = _linearised(self.chain, point, states, self.optimum.theta_step, self.optimum.state_step)
-            if found is None:
+            linear = linearise_by(self.chain, point, states, self.optimum.theta_step, self.optimum.state_step)
+            if linear is None:
                 return -np.inf
-            solved = eliminate_states(found, self.sd)
-            value = log_likelihood(found, self.sd, solved)
+            solved = eliminate_states(linear, self.noise)
+            value = log_likelihood(linear, self.noise, solved)
             states = self.chain.moved(states, solved.shift)
         return value + float(self.prior.log_prob(torch.from_numpy(point)))

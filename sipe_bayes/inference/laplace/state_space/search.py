@@ -1,0 +1,296 @@
+"""The ``Strategy`` for a ``StateSpace``: from starting point to recorded optimum, in phases.
+
+1. REGRESS: theta by reweighted least squares of the jumps between states as measured. A later starting point is dropped
+   once its regression ends where an earlier one did. Or FOLLOW, where some coordinate is not measured: the filter's
+   states about those that the commands lead to.
+2. SMOOTH: steps of theta and all states (``smoother``).
+3. NOISE: an estimate of the noise, and a step. After each of the first few an extended Kalman filter runs through the
+   logs (``kalman_filter``), and the search goes on from its states where that ends lower.
+4. At an optimum, or where the noise does not settle, jumps that stand out become outliers (``outlying_jumps``) and the
+   search goes on; from the optimum without them the filter tries to make do without outliers, and where that is
+   likelier the search goes on from there. It turns to the next starting point once it comes to nothing likelier.
+
+Of each starting point the likeliest optimum is kept: its normal in theta, with the states integrated out, is what
+``laplace`` makes its truncated normal of. Where the logs' first states are known another search is made
+(``known_starts``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.inference.laplace.state_space.kalman_filter import filtered
+from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise, likeliest_share, regress
+from sipe_bayes.inference.laplace.state_space.options import ChainTuning
+from sipe_bayes.inference.laplace.state_space.outlying_jumps import needed, outstanding
+from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
+from sipe_bayes.inference.laplace.state_space.state import (
+    ChainState,
+    Phase,
+    Position,
+    evidence,
+    optimum_at,
+    screened,
+    unknown_noise,
+)
+from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.differences import linearise
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise
+
+
+@dataclass(frozen=True)
+class SmoothingPosition(Position):
+    """Where the search from one starting point stands.
+
+    Args:
+        refused: jumps (K-1,) that turned out to be no outliers.
+        proposals: how often outliers were proposed.
+    """
+
+    refused: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    proposals: int = 0
+
+
+@dataclass(frozen=True)
+class StateSpaceState(ChainState[SmoothingPosition]):
+    """A search from measured states.
+
+    Args:
+        regressed: thetas (R, N) at which regressions have ended.
+    """
+
+    here: SmoothingPosition
+    regressed: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """Where Gauss-Newton comes from the filter's states."""
+
+    point: ChainPoint
+    damping: float
+    energy: float
+
+
+@dataclass(frozen=True)
+class StateSpaceSearch:
+    """The ``Strategy`` for a ``StateSpace``.
+
+    Args:
+        problem: prior, starting points, options.
+        chain: the logs.
+    """
+
+    problem: SearchProblem
+    chain: Chain
+
+    @property
+    def step_rollouts(self) -> int:
+        """Rollouts that a step takes."""
+        return ((self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
+
+    @property
+    def tuning(self) -> ChainTuning:
+        """Numbers of the search."""
+        return self.problem.options.tuning.state_space
+
+    def start(self) -> StateSpaceState:
+        """The first state: at the first starting point."""
+        chain, initial = self.chain, self.problem.initial
+        chain.rollouts += chain.setup_rollouts
+        points = screened(self.problem, chain) if initial is None else initial
+        none = np.empty((0, chain.num_theta))
+        return StateSpaceState(points, 0, self._begin(points[0]), chain.uncounted, regressed=none)
+
+    def step(self, state: StateSpaceState) -> StateSpaceState:
+        """One linearisation and what follows from it; what it does is the phase's."""
+        phases: dict[Phase, Callable[[StateSpaceState], StateSpaceState]] = {
+            Phase.REGRESS: self._regress,
+            Phase.FOLLOW: self._follow,
+            Phase.SMOOTH: self._smooth,
+            Phase.NOISE: self._noise,
+        }
+        self.chain.uncounted = state.uncounted
+        return replace(phases[state.here.phase](state), uncounted=self.chain.uncounted)
+
+    def _begin(self, theta: FloatArray) -> SmoothingPosition:
+        """At a starting point (N,)."""
+        chain = self.chain
+        phase, ones = Phase.REGRESS if chain.determined.all() else Phase.FOLLOW, np.ones(chain.num_start)
+        none, damping = np.zeros(len(chain.linked), bool), self.tuning.damping.first
+        return SmoothingPosition(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
+
+    # ------------------------------------------------------------------ phases
+
+    def _regress(self, state: StateSpaceState) -> StateSpaceState:
+        """A step of the regression; at its end a first guess of the noise."""
+        chain, here, tuning = self.chain, state.here, self.tuning.smoothing
+        linear = linearise(chain, here.theta, here.states, with_states=False)
+        if linear is None:
+            return state.after_divergence(self._begin)
+        theta = regress(linear, self.problem.quadratic_prior, here.theta, self.tuning.noise)
+        still = np.abs(theta - here.theta).max() < tuning.still or here.iteration + 1 >= tuning.most_regressions
+        here = replace(here, theta=theta, iteration=here.iteration + 1)
+        if not still:
+            return state.at(here)
+        if any(np.abs(theta - earlier).max() < tuning.same for earlier in state.regressed):
+            return state.next_point(self._begin)
+        movement = chain.movement(here.states)
+        noise = self._guessed(first_noise(chain, linear, movement, self.tuning.noise), movement)
+        here = replace(here, phase=Phase.SMOOTH, noise=noise, movement=movement)
+        return replace(state, here=here, regressed=np.concatenate([state.regressed, theta[None]]))
+
+    def _follow(self, state: StateSpaceState) -> StateSpaceState:
+        """The filter's states, about those that the commands lead to."""
+        chain, theta, prior = self.chain, state.here.theta, self.problem.quadratic_prior
+        states = chain.predicted(theta)
+        states = state.here.states if states is None else states
+        linear = linearise(chain, theta, states)
+        if linear is None:
+            return state.after_divergence(self._begin)
+        movement, tuning = chain.movement(states), self.tuning.noise
+        noise = first_noise(chain, linear, movement, tuning)
+        noise = solvable(linear, likeliest_share(chain, linear, noise, prior, theta, tuning))
+        better = filtered(chain, linear, noise, theta, states, self.tuning.smoothing)
+        states, noise = states if better is None else better, self._guessed(noise, movement)
+        return state.at(replace(state.here, phase=Phase.SMOOTH, states=states, noise=noise, movement=movement))
+
+    def _smooth(self, state: StateSpaceState) -> StateSpaceState:
+        """A step of theta and all states; where none gains anything, an estimate of the noise at once."""
+        linear = linearise(self.chain, state.here.theta, state.here.states)
+        if linear is None:
+            return state.after_divergence(self._begin)
+        tuning, here = self.tuning.smoothing, replace(state.here, iteration=state.here.iteration + 1)
+        here = replace(here, steps=here.steps + 1)
+        prior, tolerance = self.problem.quadratic_prior, tuning.tolerance
+        point, fit = smooth(self.chain, linear, here.noise, prior, here.point, here.damping, tolerance, self.tuning)
+        if fit.point is None:
+            return self._estimated(state.at(here), linear, still=True)
+        most = tuning.steps if here.estimates else tuning.first_steps
+        phase = Phase.NOISE if here.steps >= most else Phase.SMOOTH
+        return state.at(replace(here, phase=phase, theta=point.theta, states=point.states, damping=fit.damping))
+
+    def _noise(self, state: StateSpaceState) -> StateSpaceState:
+        """An estimate of the noise, and a step."""
+        linear = linearise(self.chain, state.here.theta, state.here.states)
+        if linear is None:
+            return state.after_divergence(self._begin)
+        here = replace(state.here, iteration=state.here.iteration + 1, steps=state.here.steps + 1)
+        return self._estimated(state.at(here), linear, still=False)
+
+    # ------------------------------------------------------------------ the noise, and what follows from it
+
+    def _guessed(self, noise: ChainNoise, movement: FloatArray) -> ChainNoise:
+        """A first guess, outliers as wide as a movement (D,), and none yet."""
+        return replace(noise, wide=movement, outliers=np.zeros(len(self.chain.linked), bool))
+
+    def _estimated(self, state: StateSpaceState, linear: ChainLinearisation, still: bool) -> StateSpaceState:
+        """Estimate the noise, and take a step, or end; still: whether no step gains anything for the old noise."""
+        chain, here, tuning = self.chain, state.here, self.tuning.smoothing
+        prior, noise = self.problem.quadratic_prior, solvable(linear, here.noise)
+        estimate, gain = infer_noise(chain, linear, noise, prior, here.theta, here.movement, self.tuning.noise)
+        settled, last = gain < tuning.settled and still, here.estimates >= tuning.most_estimates
+        if here.estimates and (settled or last or self._struggles(here, linear, noise)):
+            return self._ended(state, linear, noise, settled)
+        point, fit = smooth(chain, linear, estimate, prior, here.point, here.damping, tuning.tolerance, self.tuning)
+        damping, energy = fit.damping, fit.energy
+        # the filter, where the noise was only guessed, or much too large until now
+        dropped = np.log(noise.process / estimate.process).mean() > tuning.dropped
+        if here.estimates == 0 or (here.estimates < tuning.most_filters and dropped):
+            other = self._refiltered(linear, estimate, point.theta, here.states)
+            if other is not None and other.energy < energy:
+                point, damping = other.point, other.damping
+        here = replace(here, phase=Phase.SMOOTH, theta=point.theta, states=point.states, damping=damping)
+        noise = replace(here.noise, sd=estimate.sd, process=estimate.process)
+        return state.at(replace(here, noise=noise, estimates=here.estimates + 1, steps=0))
+
+    def _struggles(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> bool:
+        """Whether the noise does not settle, and there are jumps that stand out."""
+        assert here.noise.outliers is not None
+        late = here.estimates >= self.tuning.outliers.unsettled_after and not here.noise.outliers.any()
+        return late and bool(self._candidates(here, linear, noise).any())
+
+    def _refiltered(
+        self, linear: ChainLinearisation, noise: ChainNoise, theta: FloatArray, states: FloatArray
+    ) -> _Filtered | None:
+        """Where Gauss-Newton comes from the filter's states.
+
+        The linearisation is that at ``states``; None where the simulation diverges.
+        """
+        chain, tuning = self.chain, self.tuning.smoothing
+        begin = filtered(chain, linear, noise, theta, states, tuning)
+        if begin is None:
+            return None
+        prior = self.problem.quadratic_prior
+        end = _Filtered(ChainPoint(theta, begin), self.tuning.damping.first, np.inf)
+        for _ in range(tuning.filter_steps):
+            there = linearise(chain, end.point.theta, end.point.states)
+            if there is None:
+                return None
+            point, fit = smooth(chain, there, noise, prior, end.point, end.damping, tuning.tolerance, self.tuning)
+            end = _Filtered(point, fit.damping, fit.energy)
+            if fit.point is None:
+                break
+        return end
+
+    def _ended(
+        self, state: StateSpaceState, linear: ChainLinearisation, noise: ChainNoise, settled: bool
+    ) -> StateSpaceState:
+        """After an optimum: keep it if it is likelier than those before, and go on from it."""
+        here, tuning, before = state.here, self.tuning, state.best_evidence
+        assert here.noise.outliers is not None
+        worthwhile, more = before + tuning.smoothing.settled, here.estimates < tuning.smoothing.most_estimates
+        # first without the outliers that need not be
+        outliers = needed(linear, noise, self.problem.quadratic_prior, here.theta, tuning.outliers)
+        if not np.array_equal(outliers, here.noise.outliers):
+            refused = here.refused | (here.noise.outliers & ~outliers)
+            here = replace(here, noise=replace(here.noise, outliers=outliers), refused=refused)
+            noise = replace(noise, outliers=outliers)
+            likelier = outliers.any() or evidence(self.problem, here, linear, noise, True) > worthwhile
+            if likelier and more:
+                return state.at(replace(here, phase=Phase.SMOOTH, steps=0))
+        value = evidence(self.problem, here, linear, noise, settled)
+        if value <= worthwhile:
+            return state.next_point(self._begin)
+        state = state.at(here)
+        state = state.with_optimum(optimum_at(self.problem, state, linear, noise, value, settled))
+        # then from the optimum: without any outlier, or with those that stand out now
+        again = replace(here, phase=Phase.SMOOTH, estimates=1, steps=0)
+        if outliers.any():
+            other = self._without_outliers(here, linear, noise)
+            if other is None or other[1] <= value + tuning.smoothing.settled:
+                return state.next_point(self._begin)
+            end, _ = other
+            again = replace(again, theta=end.point.theta, states=end.point.states, damping=end.damping)
+            return state.at(replace(again, noise=replace(here.noise, outliers=np.zeros_like(outliers))))
+        proposed = self._candidates(here, linear, noise)
+        if not proposed.any():
+            return state.next_point(self._begin)
+        noise = replace(here.noise, outliers=proposed)
+        return state.at(replace(again, noise=noise, proposals=here.proposals + 1))
+
+    def _candidates(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> BoolArray:
+        """Jumps (K-1,) to propose: none that turned out to be no outlier, and none after a few times."""
+        tuning = self.tuning.outliers
+        return outstanding(linear, noise, tuning) & ~here.refused & (here.proposals < tuning.proposals)
+
+    def _without_outliers(
+        self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise
+    ) -> tuple[_Filtered, float] | None:
+        """Where the filter leads with no outlier, and the evidence there; None if the budget ends or it diverges."""
+        regular = solvable(linear, replace(noise, outliers=np.zeros_like(here.refused)))
+        try:
+            end = self._refiltered(linear, regular, here.theta, here.states)
+            there = None if end is None else linearise(self.chain, end.point.theta, end.point.states)
+        except BudgetExhausted:
+            return None
+        if end is None or there is None:
+            return None
+        position = replace(here, theta=end.point.theta, states=end.point.states)
+        return end, evidence(self.problem, position, there, solvable(there, regular), False)

@@ -1,0 +1,275 @@
+"""The state of a search over a chain of states: where it stands, what it has recorded, and how it turns to the next start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum, auto
+from typing import Any, Generic, Self, TypeVar
+
+import numpy as np
+import torch
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.state_space.noise import jump_scale, process_penalty
+from sipe_bayes.inference.laplace.state_space.outlying_jumps import rarity
+from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, border, penalty
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
+from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.state_space.differences import compare
+from sipe_bayes.likelihood.state_space.linearisation import (
+    ChainLinearisation,
+    ChainNoise,
+    eliminate_states,
+    restricted,
+)
+
+
+class Phase(StrEnum):
+    """What the next step of a search does; each search has a function for each of its phases."""
+
+    REGRESS = auto()
+    """Theta by regression on the measured states."""
+    FOLLOW = auto()
+    """States where the commands lead, and a first guess of the noise about them."""
+    SMOOTH = auto()
+    """A step of theta and all states."""
+    NOISE = auto()
+    """The noise is estimated anew before the step."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where the search from one starting point stands.
+
+    Args:
+        phase: what the next step does.
+        theta: (N,), within the cube.
+        states: (K, S).
+        noise: as last estimated; ones before the first guess.
+        movement: (D,), of a coordinate in a control step; ones before the first guess.
+        damping: of the next step.
+        iteration: steps until now.
+        estimates: of the noise until now.
+        steps: since the last of them.
+    """
+
+    phase: Phase
+    theta: FloatArray
+    states: FloatArray
+    noise: ChainNoise
+    movement: FloatArray
+    damping: float
+    iteration: int = 0
+    estimates: int = 0
+    steps: int = 0
+
+    @property
+    def point(self) -> ChainPoint:
+        """theta and states."""
+        return ChainPoint(self.theta, self.states)
+
+
+@dataclass(frozen=True)
+class ChainOptimum(Optimum):
+    """An optimum of a chain of states.
+
+    Args:
+        states: (K, S).
+        slope: (K, D, N): states follow theta by minus this.
+        process: (D,), sd of the process noise.
+        movement: (D,), of a coordinate in a control step.
+        outliers: (K-1,), jumps that are.
+        theta_step: (N,), of the finite differences; zero: short ones.
+        state_step: (K, D).
+        settled: whether the noise had.
+        point: number of the starting point.
+    """
+
+    states: FloatArray
+    slope: FloatArray
+    process: FloatArray
+    movement: FloatArray
+    outliers: BoolArray
+    theta_step: FloatArray
+    state_step: FloatArray
+    settled: bool
+    point: int
+
+    @property
+    def noise(self) -> ChainNoise:
+        """Of measurements and jumps."""
+        return ChainNoise(self.sd, self.process, self.movement, self.outliers)
+
+    def diagnostics(self) -> dict[str, list[Any]]:
+        """Process noise and movement of each coordinate, and after which of the chain's states a jump is an outlier."""
+        return {
+            "process_noise": self.process.tolist(),
+            "movement": self.movement.tolist(),
+            "outliers": np.flatnonzero(self.outliers).tolist(),
+        }
+
+
+P = TypeVar("P", bound=Position)
+
+
+@dataclass(frozen=True)
+class ChainState(Generic[P]):
+    """A search over a chain of states.
+
+    Args:
+        points: (R, N), starting points.
+        point: which of them is followed.
+        here: where that stands.
+        uncounted: part of a rollout, not counted yet.
+        optima: those recorded, one of a starting point.
+        done: whether the last point has been followed to its end.
+    """
+
+    points: FloatArray
+    point: int
+    here: P
+    uncounted: float
+    optima: tuple[ChainOptimum, ...] = ()
+    done: bool = False
+
+    def describe(self) -> str:
+        """Starting point and step."""
+        return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
+
+    @property
+    def best_evidence(self) -> float:
+        """Of this starting point's optimum; minus infinity before there is one."""
+        return max((one.evidence for one in self.optima if one.point == self.point), default=-np.inf)
+
+    def at(self, here: P) -> Self:
+        """The search at another position."""
+        return replace(self, here=here)
+
+    def with_optimum(self, optimum: ChainOptimum) -> Self:
+        """With an optimum in place of this starting point's earlier one."""
+        return replace(self, optima=(*(one for one in self.optima if one.point != self.point), optimum))
+
+    def next_point(self, begin: Callable[[FloatArray], P]) -> Self:
+        """Turn to the next starting point, or end.
+
+        Args:
+            begin: the position at a starting point (N,).
+        """
+        point = self.point + 1
+        if point >= len(self.points):
+            return replace(self, done=True)
+        return replace(self, point=point, here=begin(self.points[point]))
+
+    def after_divergence(self, begin: Callable[[FloatArray], P]) -> Self:
+        """Turn to the next starting point after a linearisation that diverged.
+
+        Args:
+            begin: the position at a starting point (N,).
+
+        Raises:
+            ValueError: where none is left and no optimum was found.
+        """
+        if self.point + 1 == len(self.points) and not self.optima:
+            raise ValueError(
+                "trajectories: the simulation diverges from the measured states at every starting point; look at the "
+                "log's channels and units, or shorten the model's timestep"
+            )
+        return self.next_point(begin)
+
+
+def unknown_noise(chain: Chain) -> ChainNoise:
+    """Ones, before the first guess."""
+    none = np.zeros(len(chain.linked), bool)
+    return ChainNoise(np.ones(len(chain.channels)), np.ones(chain.num_start), np.ones(chain.num_start), none)
+
+
+def screened(problem: SearchProblem, chain: Chain) -> FloatArray:
+    """Starting points: the model as given and the best of a few draws from the prior.
+
+    Args:
+        problem: prior, seed, and how many.
+        chain: the logs; what counts are the jumps that a point leaves between states as measured.
+
+    Returns:
+        (R, N).
+
+    Raises:
+        ValueError: where all diverge.
+    """
+    generator = torch.Generator().manual_seed(problem.seed)
+    draws = problem.prior.sample((problem.options.candidates,), generator=generator).numpy()
+    points = np.concatenate([problem.space.default_theta[None], draws])
+    compared = compare(chain, points, np.tile(chain.reference, (len(points), 1, 1)))
+    valid = [k for k, one in enumerate(compared) if one is not None]
+    if not valid:
+        raise ValueError(
+            f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
+            "or shorten the model's timestep"
+        )
+    if valid[0] != 0:
+        problem.find(finding(Code.DIVERGES_AS_GIVEN))
+    sizes = np.array([jump_scale(one) for one in compared if one is not None])
+    order = np.argsort(np.log(sizes).sum(1), kind="stable")
+    chosen = [valid[k] for k in order if valid[k] != 0]
+    return points[([0] if valid[0] == 0 else []) + chosen][: problem.options.restarts]
+
+
+def evidence(
+    problem: SearchProblem, here: Position, linear: ChainLinearisation, noise: ChainNoise, settled: bool
+) -> float:
+    """log p(noise | y), states and theta integrated out, up to a constant.
+
+    Args:
+        problem: with the prior.
+        here: where the linearisation was taken.
+        linear: the linearisation.
+        noise: of measurements and jumps.
+        settled: else it lacks what the next step would gain, were the model linear.
+    """
+    prior, tuning = problem.quadratic_prior, problem.options.tuning.state_space
+    hold = border(prior, here.theta, eliminate_states(linear, noise).gradient)
+    value = restricted(linear, noise, hold, held=not settled)[0]
+    value = value - penalty(prior, here.theta) - rarity(noise, tuning.outliers)
+    return value - process_penalty(noise, here.movement, tuning.noise)
+
+
+def optimum_at(
+    problem: SearchProblem,
+    state: ChainState[P],
+    linear: ChainLinearisation,
+    noise: ChainNoise,
+    value: float,
+    settled: bool,
+) -> ChainOptimum:
+    """The optimum at its linearisation, its normal about the best step from there.
+
+    Args:
+        problem: with the prior.
+        state: where the search stands.
+        linear: the linearisation there, by short differences.
+        noise: of measurements and jumps.
+        value: the evidence.
+        settled: whether the noise has.
+    """
+    here, solved = state.here, eliminate_states(linear, noise)
+    mean, covariance = problem.normal(here.theta, solved.precision, solved.gradient)
+    none = np.zeros(len(linear.linked), bool)
+    return ChainOptimum(
+        theta=here.theta,
+        mean=mean,
+        covariance=covariance,
+        evidence=value,
+        sd=noise.sd,
+        tau=np.zeros_like(noise.sd),
+        states=here.states,
+        slope=solved.slope,
+        process=noise.process,
+        movement=here.movement,
+        outliers=none if noise.outliers is None else noise.outliers,
+        theta_step=np.zeros(len(mean)),
+        state_step=np.zeros_like(linear.offset),
+        settled=settled,
+        point=state.point,
+    )

@@ -1,0 +1,52 @@
+"""What inferred process noise says of the model: a hint, no test."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.likelihood.state_space.chain import Chain
+
+_NAMED = 4  # times that a text names
+
+
+def process_noise_findings(
+    chain: Chain, process: FloatArray, movement: FloatArray, outliers: Sequence[int] | IntArray = ()
+) -> list[Finding]:
+    """Hold the process noise against how far states move in a control step.
+
+    Args:
+        chain: the logs.
+        process: (D,), sd of the process noise.
+        movement: (D,), of each coordinate in a control step.
+        outliers: after which of the chain's states a jump is an outlier.
+
+    Returns:
+        Where process noise is largest, which steps stand out, and whether the model follows the logs.
+    """
+    share = np.where(chain.irrelevant, 0.0, process / movement)
+    worst = int(share.argmax())
+    percent = f"{100 * share[worst]:.0f}" if share[worst] > 0.1 else f"{100 * share[worst]:.2g}"
+    findings = [finding(Code.PROCESS_NOISE, coordinate=chain.labels[worst], sd=float(process[worst]), percent=percent)]
+    if len(outliers):
+        count, steps = len(outliers), int(chain.linked.sum())
+        findings.append(finding(Code.PROCESS_OUTLIERS, count=count, steps=steps, times=_times(chain, outliers)))
+    if share[worst] < THRESHOLDS.much_process_noise:
+        findings.append(finding(Code.PROCESS_NOISE_SMALL, elsewhere=" elsewhere" if len(outliers) else ""))
+    else:
+        findings.append(finding(Code.PROCESS_NOISE_LARGE))
+    return findings
+
+
+def _times(chain: Chain, outliers: Sequence[int] | IntArray) -> str:
+    """When the first of them happen."""
+    many = len(chain.trajectories) > 1
+    times = [
+        f"{chain.sample[k] * chain.dt[k]:.3g} s" + (f" of {chain.names[k] or f'log {chain.log[k]}'}" if many else "")
+        for k in outliers[:_NAMED]
+    ]
+    return ", ".join(times) + (", ..." if len(outliers) > _NAMED else "")

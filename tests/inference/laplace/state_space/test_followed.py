@@ -1,0 +1,51 @@
+"""The search from known first states where a mass is not measured, and with little budget."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.likelihood.settings import StateSpace
+from tests.problems.hung import hung, hung_log
+
+
+def test_what_nothing_measures_is_followed() -> None:
+    """Of 12 intervals of 90 % at least 8 hold the truth (right ones fail with probability 0.4 %)."""
+    rng, covered = np.random.default_rng(3), 0
+    for seed in range(12):
+        theta = rng.uniform(0.1, 0.9, 1)
+        estimator = Laplace(hung(), likelihood=StateSpace(starts="recorded"), restarts=1, candidates=0)
+        posterior = estimator.fit(hung_log(theta, seed))
+        low, high = posterior.quantile([0.05, 0.95]).numpy()
+        covered += int(low[0] <= theta[0] <= high[0])
+        print(theta, posterior.mean.numpy(), posterior.stddev.numpy(), estimator.warnings)
+        assert float(posterior.stddev[0]) < 0.1
+    assert covered >= 8
+
+
+def test_a_known_start_costs_two_fifths_of_the_budget_at_most() -> None:
+    """A budget that is too small for anything says so."""
+    logs, likelihood = [hung_log(np.array([0.4]), 0)], StateSpace(starts="recorded")
+    for budget in (20, 100):
+        estimator = Laplace(hung(), likelihood=likelihood, budget=budget)
+        chain = estimator.windows(Trajectories.stack(logs))
+        points = estimator.start(Trajectories.stack(logs)).search.points
+        print(budget, points)
+        assert points.shape[1] == 1
+        assert chain.rollouts <= 0.4 * budget + 2
+    with pytest.raises(ValueError, match="budget"):
+        Laplace(hung(), likelihood=likelihood, budget=2).fit(logs)
+
+
+def test_a_budget_that_ends_early_leaves_a_wide_posterior() -> None:
+    """Of six logs with each of three budgets, some before the first step: the truth within four sds (right ones all do but with
+    probability 0.1 %)."""
+    for seed in range(6):
+        for budget in (20, 50, 100):
+            estimator = Laplace(hung(), likelihood=StateSpace(starts="recorded"), budget=budget, seed=seed)
+            posterior = estimator.fit(hung_log(np.array([0.4]), seed))
+            mean, sd = float(posterior.mean[0]), float(posterior.stddev[0])
+            print(seed, budget, mean, sd)
+            assert abs(mean - 0.4) < 4 * sd

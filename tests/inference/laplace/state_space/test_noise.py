@@ -1,0 +1,82 @@
+"""Noise of a chain of states: raised where rounding asks for it, inferred, and what it says of the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sipe_bayes.core.findings import Code
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise
+from sipe_bayes.inference.laplace.state_space.options import ChainTuning, NoiseTuning
+from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.state_space.differences import linearise
+from sipe_bayes.likelihood.state_space.linearisation import ChainNoise, eliminate_states
+from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
+from tests.problems.hung import hung, hung_log
+from tests.problems.pendulums import log as pendulum_log
+from tests.problems.pendulums import pendulum
+
+
+def test_noise_that_rounding_cannot_bear_is_raised() -> None:
+    """The process noise that ``solvable`` returns is the least of a few that the equations can be solved with, and no other is touched."""
+    chain = bind(StateSpace(), hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))
+    linear = linearise(chain, np.array([0.4]), chain.reference)
+    assert linear is not None
+    fair = ChainNoise(np.array([0.01]), np.full(4, 1e-4))
+    assert solvable(linear, fair) is fair
+    never = ChainNoise(np.array([0.01]), np.full(4, 1e-14))
+    with pytest.raises(np.linalg.LinAlgError):
+        eliminate_states(linear, never)
+    raised = solvable(linear, never)
+    assert raised.sd is never.sd
+    assert (raised.process > never.process).all()
+    with pytest.raises(np.linalg.LinAlgError):
+        eliminate_states(linear, ChainNoise(raised.sd, raised.process / 3))
+
+
+def test_given_noise_is_kept_and_process_noise_shrinks_where_the_model_is_right() -> None:
+    """Without process noise in the log the inferred one falls to less than a tenth of the measurement's effect."""
+    simulator = pendulum()
+    log = pendulum_log(simulator, [0.6, 0.1], 3, steps=120, sd=0.01)
+    chain = bind(StateSpace(noise_sd=(0.01,)), simulator, Trajectories.stack(log))
+    theta = simulator.space.normalise(np.array([0.6, 0.1]))
+    linear = linearise(chain, theta, chain.reference)
+    assert linear is not None
+    movement, states = chain.movement(chain.reference), chain.reference
+    noise, tuning = first_noise(chain, linear, movement, NoiseTuning()), ChainTuning()
+    flat = QuadraticPrior(np.full(2, 0.5), np.zeros((2, 2)))
+    assert noise.sd[0] == 0.01
+    for _ in range(6):
+        linear = linearise(chain, theta, states)
+        assert linear is not None
+        noise, _ = infer_noise(chain, linear, noise, flat, theta, movement, tuning.noise)
+        point, _ = smooth(chain, linear, noise, flat, ChainPoint(theta, states), 1e-4, 1e-3, tuning)
+        theta, states = point.theta, point.states
+    assert noise.sd[0] == 0.01
+    print("process noise", noise.process)
+    assert noise.process[0] < 1e-3
+
+
+def test_process_noise_says_where_the_model_lacks_something() -> None:
+    """A pendulum whose pivot sways, which the model does not know, and one whose does not."""
+    findings = {}
+    for name, share in (("right", 0.0), ("wrong", 0.1)):
+        simulator = pendulum()
+        log = pendulum_log(simulator, [0.6, 0.05], 3, steps=200)
+        log = replace(log, observations=log.observations + share * np.sin(np.arange(201)[:, None] * 0.4))
+        estimator = Laplace(simulator, likelihood=StateSpace(), restarts=1, candidates=0)
+        estimator.fit(log)
+        chain = bind(StateSpace(), simulator, Trajectories.stack(log))
+        noise = (np.array(estimator.diagnostics[k]) for k in ("process_noise", "movement"))
+        findings[name] = process_noise_findings(chain, *noise)
+    print(findings)
+    assert [item.code for item in findings["right"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_SMALL]
+    assert [item.code for item in findings["wrong"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_LARGE]
+    assert "of hinge" in findings["wrong"][0].text
