@@ -4,9 +4,9 @@
     [ C'  B ] [ theta ] = [ gradient ]     theta: N unknowns on the border.
 
 The blocks are the starts of windows that share a noise sample (``likelihood.restricted``), or the states of a chain
-(``likelihood.state_space``). LAPACK factorises A as a banded matrix in O(K D^3). Eliminating x leaves Schur's complement
-B - C' A^-1 C for theta, and the likelihood with x integrated out follows from log|A|. The covariances of neighbouring
-blocks come from the factor by Takahashi's recursion: the inverse is never formed as a whole.
+(``likelihood.state_space``). LAPACK factorises A as a banded matrix in O(K D^3). Eliminating x leaves Schur's
+complement B - C' A^-1 C for theta, and the likelihood with x integrated out follows from log|A|. The covariances of
+neighbouring blocks come from the factor by Takahashi's recursion: the inverse is never formed as a whole.
 
 References:
 

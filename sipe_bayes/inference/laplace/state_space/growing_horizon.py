@@ -1,4 +1,4 @@
-"""Starting points of logs whose first states are known: ever longer beginnings are fitted, each from the last one's end.
+"""Starting points of logs whose first states are known: ever longer beginnings, each fitted from the last one's end.
 
 What whole logs say of theta is sharp, but through contact so rough that a search from afar finds nothing: the trouble
 of every initial-value approach to chaotic systems (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear dynamical system

@@ -1,11 +1,11 @@
-"""The state of a search over a chain of states: where it stands, what it has recorded, and how it turns to the next start."""
+"""The state of a search over a chain of states: where it stands, what it recorded, how it turns to the next start."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum, auto
-from typing import Any, Generic, Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -102,7 +102,7 @@ class ChainOptimum(Optimum):
         """Of measurements and jumps."""
         return ChainNoise(self.sd, self.process, self.movement, self.outliers)
 
-    def diagnostics(self) -> dict[str, list[Any]]:
+    def diagnostics(self) -> dict[str, list[float] | list[int]]:
         """Process noise and movement of each coordinate, and after which of the chain's states a jump is an outlier."""
         return {
             "process_noise": self.process.tolist(),
