@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs import targets
+from sipe_bayes.envs.export import write_identified
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import TargetError, bind, body_frame_inertia, check_inertia
 
 XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worldbody>
@@ -231,6 +235,21 @@ def test_repeated_writes_do_not_drift(target: str) -> None:
     once = written(model, (target, value))
     often = written(model, *[(target, value * factor) for factor in (1.1, 0.9, 1.02, 1.0) * 25])
     assert_same(often, once, target)
+
+
+@pytest.mark.parametrize(("target", "value"), [c[:2] for c in CASES], ids=[c[0] for c in CASES])
+def test_an_exported_model_has_the_value(target: str, value: float, tmp_path: Path) -> None:
+    """The writing of the file compares every field of the model; a target that nothing copies is refused."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    low, high = sorted((bind(model, target).value, value))
+    environment = MjcfEnvironment.build(
+        XML, [Parameter("p", low, high, targets=(target,))], [], ["joint:hinge.position"]
+    )
+    assert write_identified(environment, np.array([value]), tmp_path / "identified.xml") == []
+    exported = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
+    assert bind(model, target).value != pytest.approx(value)
+    expected = 0.0 if target.endswith("offset") else value  # an offset is relative to the model's bias
+    assert bind(exported, target).value == pytest.approx(expected, rel=1e-5)
 
 
 def test_mass_before_inertia_in_any_earlier_state() -> None:

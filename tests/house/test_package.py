@@ -29,6 +29,7 @@ from sipe_bayes.calibration.config_tables import (
     Search,
     TimeColumn,
 )
+from sipe_bayes.calibration.tables import READERS
 from sipe_bayes.core.units import UNITS
 from sipe_bayes.diagnostics.catalogue import tasks
 from sipe_bayes.envs.targets import _ATTRIBUTES
@@ -183,16 +184,19 @@ def target_words() -> list[str]:
 
 
 def test_readme_lists_every_target() -> None:
-    assert sorted(rows("Targets")) == sorted([*target_words(), "sensor:NAME.bias"])
+    differing = set(rows("Targets")) ^ {*target_words(), "sensor:NAME.bias"}
+    assert not differing, "README, Targets: a row for each, and for no other"
 
 
 def test_readme_lists_every_estimator() -> None:
-    assert {name: cls for name, (_, cls) in ESTIMATORS.items()} == {
-        name: re.findall(r"`(\w+)`", line)[1] for name, line in rows("Estimators").items()
-    }
+    listed = {(name, re.findall(r"`(\w+)`", line)[1]) for name, line in rows("Estimators").items()}
+    differing = listed ^ {(name, cls) for name, (_, cls) in ESTIMATORS.items()}
+    assert not differing, "README, Estimators: a row for each with its class, and for no other"
 
 
 def test_readme_lists_every_environment() -> None:
+    differing = set(rows("Environments")) ^ {row["name"] for row in tasks()}
+    assert not differing, "README, Environments: a row for each, and for no other"
     for row in tasks():
         cells = [row[k] for k in ("parameters", "observations", "actions", "reproduces")]
         assert rows("Environments")[row["name"]] == f"| `{row['name']}` | {' | '.join(map(str, cells))} |"
@@ -223,6 +227,10 @@ def test_readme_explains_every_key() -> None:
     keys |= {f"{prefix}{key}" for prefix, table in TABLES.items() for key in table.also}
     inner = {prefix.rstrip(".") for prefix in TABLES if prefix}
     assert sorted(rows("Configuration")) == sorted(keys - inner)
+
+
+def test_readme_lists_every_format_of_logs() -> None:
+    assert set(re.findall(r"\.[a-z]+\b", rows("Configuration")["logs.file"].split("|", 2)[2])) == set(READERS)
 
 
 def test_readme_lists_every_unit() -> None:
