@@ -1,0 +1,1 @@
+"""The user's machine: configuration, logs, the calibration's run, its checks and its output folder."""

@@ -113,8 +113,8 @@ class CheckResult:
         """The verdict."""
         share = float(self.check.coverage(THRESHOLDS.shown_interval).mean())
         held = (
-            f"{self.study.method} on {self.study.name}: {100 * THRESHOLDS.shown_interval:.0f} % intervals hold the truth "
-            f"{100 * share:.0f} ± {100 * self.standard_error:.0f} % of the time ({self.check.truths} logs)"
+            f"{self.study.method} on {self.study.name}: {100 * THRESHOLDS.shown_interval:.0f} % intervals hold the "
+            f"truth {100 * share:.0f} ± {100 * self.standard_error:.0f} % of the time ({self.check.truths} logs)"
         )
         lost = f"; {self.failed} more logs could not be fitted" if self.failed else ""
         lost += f"; the estimator itself warned of {self.warned} fits" if self.warned else ""

@@ -19,6 +19,9 @@ from sipe_bayes.cli.refusing import refusing
 from sipe_bayes.inference.registry import ESTIMATORS
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sipe_bayes.diagnostics.catalogue import TaskDescription, TaskRow
     from sipe_bayes.diagnostics.result import Calibration
 
 app = typer.Typer(
@@ -85,11 +88,11 @@ def calibrate(
         _check("--seed", seed, 0)
         _check("--budget", budget, 1)
         _check("--threads", threads, 1)
-        found = run(config, estimator, seed, budget, out, threads, progress.update)
+        calibration = run(config, estimator, seed, budget, out, threads, progress.update)
     if as_json:
-        print(to_json(found.to_dict()))
+        print(to_json(calibration.to_dict()))
     else:
-        print_calibration(found)
+        print_calibration(calibration)
 
 
 @app.command()
@@ -99,16 +102,16 @@ def envs(
 ) -> None:
     """The benchmark's environments; with NAME its parameters and how much each moves what is observed."""
     from sipe_bayes.core.files import to_json
-    from sipe_bayes.diagnostics.catalogue import describe, tasks
+    from sipe_bayes.diagnostics.catalogue import describe, tasks, to_json_row
 
     with refusing():  # assets may not be installed
-        found: Any = tasks() if name is None else describe(name)
+        rows, one = (tasks(), None) if name is None else (None, describe(name))
     if as_json:
-        print(to_json(found))
-    elif name is None:
-        print_tasks(found)
+        print(to_json(rows if one is None else to_json_row(one)))
+    elif one is None:
+        print_tasks(rows or [])
     else:
-        print_task(found)
+        print_task(one)
 
 
 def _check(option: str, value: int | None, least: int) -> None:
@@ -116,7 +119,7 @@ def _check(option: str, value: int | None, least: int) -> None:
         raise ValueError(f"{option} {value}: expected at least {least}; raise it or leave it out")
 
 
-def _console() -> Any:
+def _console() -> Console:
     from rich.console import Console
 
     console = Console(soft_wrap=True)
@@ -125,56 +128,57 @@ def _console() -> Any:
     return console
 
 
-def print_tasks(found: list[dict[str, Any]]) -> None:
+def print_tasks(rows: list[TaskRow]) -> None:
     """One line for every task, on standard output."""
     from rich.table import Table
 
     table = Table()
     for heading in ("environment", "parameters", "observations", "actions", "steps", "solved at", "reproduces"):
         table.add_column(heading, justify="left" if heading in ("environment", "reproduces") else "right")
-    for t in found:
+    for t in rows:
         solved = f"{t['solved_by']} {t['solved_at']:g}"
-        sizes = (str(t[k]) for k in ("parameters", "observations", "actions", "episode_steps"))
+        sizes = (str(n) for n in (t["parameters"], t["observations"], t["actions"], t["episode_steps"]))
         table.add_row(t["name"], *sizes, solved, t["reproduces"])
     _console().print(table)
 
 
-def print_task(found: dict[str, Any]) -> None:
+def print_task(described: TaskDescription) -> None:
     """A task's parameter table, what each does, its sensitivities and what changes nothing, on standard output."""
     from rich.table import Table
     from rich.text import Text
 
     console = _console()
-    console.print(Text(f"{found['name']} ({found['id']}): {found['summary']}"))
+    task = described["task"]
+    console.print(Text(f"{task['name']} ({task['id']}): {task['summary']}"))
     console.print(
         Text(
-            f"{found['observations']} observations, {found['actions']} actions, {found['episode_steps']} steps an episode; "
-            f"solved at a {found['solved_by']} of {found['solved_at']:g}; theta = 0.5 is {found['reproduces']}"
+            f"{task['observations']} observations, {task['actions']} actions, {task['episode_steps']} steps an "
+            f"episode; solved at a {task['solved_by']} of {task['solved_at']:g}; theta = 0.5 is {task['reproduces']}"
         )
     )
-    levels = found["sensitivity_at_theta"]
+    levels = described["sensitivity_at_theta"]
     table = Table(
         caption="moved at theta: rms change of the observations, in their spreads, for a 10 % change of the value"
     )
     for heading in ("parameter", "default", "from", "to", "unit", *(f"at {level:g}" for level in levels)):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
-    for p in found["parameters"]:
-        numbers = (f"{p[k]:.4g}" for k in ("default", "low", "high"))
+    for p in described["parameters"]:
+        numbers = (f"{x:.4g}" for x in (p["default"], p["low"], p["high"]))
         moved = (f"{x:.2g}" for x in p["sensitivity"])
         table.add_row(p["name"], *numbers, p["unit"], *moved)
     console.print(table)
-    for p in found["parameters"]:
+    for p in described["parameters"]:
         console.print(Text(f"{p['name']} ({', '.join(p['writes'])}): {p['description']}"))
-    for name in found["changes_nothing"]:
+    for name in described["changes_nothing"]:
         console.print(
             Text(f"{name} changes nothing under random actions: expect the prior back unless the actions do better")
         )
-    for name, where in found["changes_nothing_at_theta"].items():
+    for name, where in described["changes_nothing_at_theta"].items():
         console.print(Text(f"{name} changes nothing at theta = {', '.join(f'{w:g}' for w in where)}"))
 
 
-def print_calibration(found: Calibration) -> None:
-    """What to think of it, the table of parameters, the errors, the warnings and where the report lies, on standard output."""
+def print_calibration(calibration: Calibration) -> None:
+    """What to think of it, parameters, errors, warnings and where the report lies, on standard output."""
     from rich.table import Table
     from rich.text import Text
 
@@ -183,20 +187,20 @@ def print_calibration(found: Calibration) -> None:
     from sipe_bayes.report.words import significant
 
     console = _console()
-    console.print(Text(f"{found.name}: posterior by {found.estimator}"))
-    for verdict in verdicts(found):
+    console.print(Text(f"{calibration.name}: posterior by {calibration.estimator}"))
+    for verdict in verdicts(calibration):
         console.print(Text(verdict.text, style=_TONES[verdict.tone]))
-    findings, table = Findings(found.findings), Table()
+    findings, table = Findings(calibration.findings), Table()
     for heading in ("parameter", "value", "90 % interval", "unit", "verdict"):
         table.add_column(heading, justify="right" if heading in ("value", "90 % interval") else "left")
-    for p in found.parameters:
+    for p in calibration.parameters:
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
         verdict = parameter_verdict(p, findings)
         # brackets of a name are not markup
         table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     console.print(table)
-    for title, scores in (("held out", found.holdout), ("train", found.train)):
+    for title, scores in (("held out", calibration.holdout), ("train", calibration.train)):
         for s in scores:
             ratio = s.rmse_default / s.rmse if s.rmse else float("inf")
             console.print(
@@ -205,13 +209,13 @@ def print_calibration(found: Calibration) -> None:
                 highlight=False,
                 markup=False,
             )
-    for sentence in found.left_out:
+    for sentence in calibration.left_out:
         console.print(f"left out: {sentence}", highlight=False, markup=False)
-    for warning in found.warnings:
+    for warning in calibration.warnings:
         console.print(f"warning: {warning}", highlight=False, markup=False)
-    console.print(f"{found.rollouts} rollouts, {found.seconds:.1f} s", highlight=False)
-    if found.out:
-        console.print(f"report: {Path(found.out) / 'report.html'}", highlight=False, markup=False)
+    console.print(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s", highlight=False)
+    if calibration.out:
+        console.print(f"report: {Path(calibration.out) / 'report.html'}", highlight=False, markup=False)
 
 
 if __name__ == "__main__":

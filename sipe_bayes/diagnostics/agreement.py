@@ -1,10 +1,10 @@
 """Do the logs agree? Each is fitted by itself; estimates that differ by more than their uncertainty are an alarm.
 
-With m_k the optimum of log k and L_k its information (starts and its own nuisance parameters marginalised,
-directions of which it says less than a uniform prior left out), Q is the least of sum_k (m_k - mu)' L_k (m_k - mu) over a common mu.
-When the logs agree it is chi-square, with as many degrees of freedom as the logs determine directions, each by itself,
-less those that they determine together (Cochran's test). Along directions that even together they leave open mu keeps
-within the cube, which makes Q smaller than that at most.
+With m_k the optimum of log k and L_k its information (starts and its own nuisance parameters marginalised, directions
+of which it says less than a uniform prior left out), Q is the least of sum_k (m_k - mu)' L_k (m_k - mu) over a common
+mu. When the logs agree it is chi-square, with as many degrees of freedom as the logs determine directions, each by
+itself, less those that they determine together (Cochran's test). Along directions that even together they leave open mu
+keeps within the cube, which makes Q smaller than that at most.
 
 The parameter named is the one whose freedom to differ between logs lowers Q most: the most economical explanation, not
 merely the largest shift. Where even that leaves the logs in disagreement, the text says that no single parameter

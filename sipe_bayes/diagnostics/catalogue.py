@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict
 
 from sipe_bayes.diagnostics.sensitivity import LEVELS, Sensitivity, sensitivity
 from sipe_bayes.envs.registry import TASKS, make_task
@@ -10,17 +10,69 @@ from sipe_bayes.envs.task import VARIANTS, Task
 from sipe_bayes.simulation.simulator import Simulator
 
 
-def tasks() -> list[dict[str, Any]]:
+class TaskRow(TypedDict):
+    """One task in a line."""
+
+    name: str
+    id: str
+    summary: str
+    parameters: int
+    observations: int
+    actions: int
+    episode_steps: int
+    solved_by: str
+    solved_at: float
+    reproduces: str
+
+
+class ParameterRow(TypedDict):
+    """One parameter of a task; its sensitivity at each of the levels of theta."""
+
+    name: str
+    unit: str
+    default: float | None
+    low: float
+    high: float
+    writes: list[str]
+    description: str
+    sensitivity: list[float]
+
+
+class TaskDescription(TypedDict):
+    """One task with its parameters, variants and measured sensitivities."""
+
+    task: TaskRow
+    observation: list[str]
+    sensitivity_at_theta: list[float]
+    parameters: list[ParameterRow]
+    variants: dict[str, list[float]]
+    changes_nothing: list[str]
+    changes_nothing_at_theta: dict[str, list[float]]
+
+
+def tasks() -> list[TaskRow]:
     """One row for every task of the registry."""
     return [_row(make_task(name)) for name in TASKS]
 
 
-def describe(name: str) -> dict[str, Any]:
-    """One task with its parameters, variants and measured sensitivities; raises ValueError for an unknown name."""
+def to_json_row(description: TaskDescription) -> dict[str, object]:
+    """What ``--json`` prints: the task's line and the rest in one object, its parameters in full."""
+    return {**description["task"], **{k: v for k, v in description.items() if k != "task"}}
+
+
+def describe(name: str) -> TaskDescription:
+    """One task with its parameters, variants and measured sensitivities.
+
+    Args:
+        name: of the task.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
     task = make_task(name)
     measured = sensitivity(Simulator(task))
     return {
-        **_row(task),
+        "task": _row(task),
         "observation": list(task.channels),
         "sensitivity_at_theta": list(LEVELS),
         "parameters": [_parameter(task, j, measured) for j in range(len(task.space))],
@@ -30,7 +82,7 @@ def describe(name: str) -> dict[str, Any]:
     }
 
 
-def _row(task: Task) -> dict[str, Any]:
+def _row(task: Task) -> TaskRow:
     return {
         "name": task.name,
         "id": f"sipe/{task.name}-v0",
@@ -45,7 +97,7 @@ def _row(task: Task) -> dict[str, Any]:
     }
 
 
-def _parameter(task: Task, index: int, measured: Sensitivity) -> dict[str, Any]:
+def _parameter(task: Task, index: int, measured: Sensitivity) -> ParameterRow:
     parameter = task.space[index]
     return {
         "name": parameter.name,

@@ -13,8 +13,8 @@ uniform in one way.
   miss.
 
 Compared with uniform by the largest deviation of the empirical distribution, on 99 levels, in terms of the binomial
-tail probability there, calibrated by simulation; its simultaneous band is that of T. Sailynoja, P.-C. Burkner, A. Vehtari
-2022, "Graphical test for discrete uniformity", https://arxiv.org/abs/2103.10522.
+tail probability there, calibrated by simulation; its simultaneous band is that of T. Sailynoja, P.-C. Burkner, A.
+Vehtari 2022, "Graphical test for discrete uniformity", https://arxiv.org/abs/2103.10522.
 
 sbi has these checks too (``sbi.diagnostics``) and is not called, because it would lose what is said here. Its
 ``run_sbc`` and ``run_tarp`` draw from sbi's own posteriors and x; under them, ranks are counts without ties broken, so

@@ -79,9 +79,9 @@ def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
     """Errors of theta against those of the model as given.
 
     The mean over logs and channels of log(RMSE as given / RMSE of theta), with the jackknife's standard error over
-    tenths of each log, which takes the errors of both models and all channels out together (a paired t-test on pieces of
-    time). It speaks of these logs, not of others that the machine might give; in a log of few windows the pieces of one
-    share its start, and p is too small.
+    tenths of each log, which takes the errors of both models and all channels out together (a paired t-test on pieces
+    of time). It speaks of these logs, not of others that the machine might give; in a log of few windows the pieces of
+    one share its start, and p is too small.
 
     Where measured starts make nearly all of theta's error (velocities from noisy positions), both models are compared
     from the starts that each fits best.

@@ -4,8 +4,8 @@ At theta the simulation of the planned commands is linearised as ``laplace`` wou
 unknown and marginalised, noise as given; what is left is the Fisher information I(theta) = J' V^-1 J of the parameters
 alone. With the present knowledge, a normal of precision P, the experiment leaves the covariance (P + I)^-1: D. Lindley
 1956, "On a measure of the information provided by an experiment" (https://doi.org/10.1214/aoms/1177728069); K.
-Chaloner, I. Verdinelli 1995, "Bayesian experimental design: a review" (https://doi.org/10.1214/ss/1177009939), whose A-criterion,
-averaged over draws of theta, this is, in sds.
+Chaloner, I. Verdinelli 1995, "Bayesian experimental design: a review" (https://doi.org/10.1214/ss/1177009939), whose
+A-criterion, averaged over draws of theta, this is, in sds.
 
 A parameter of one log (a zero error) says nothing of the planned one, which has a value of its own: that is
 marginalised, with a uniform prior, and the old ones learn nothing. What is determined is judged by the sd that is left,

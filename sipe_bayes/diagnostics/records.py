@@ -275,10 +275,10 @@ class Mixing:
     @property
     def worst(self) -> tuple[float, str] | None:
         """Largest R-hat and the parameter that it is of, empty where that is not told; None without any."""
-        told = self.by_parameter.get("rhat")
-        if told:
-            name = max(told, key=lambda n: told[n])
-            return told[name], name
+        each = self.by_parameter.get("rhat")
+        if each:
+            name = max(each, key=lambda n: each[n])
+            return each[name], name
         return (self.overall["rhat"], "") if "rhat" in self.overall else None
 
     def to_dict(self) -> dict[str, object]:

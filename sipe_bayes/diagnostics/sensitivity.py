@@ -1,10 +1,10 @@
 """How much each parameter of a task moves what is observed, and what changes nothing.
 
 From the same starts and under the same random actions, a parameter's value is changed by 10 % while the others stay at
-theta = 0.5; its sensitivity is the root-mean-square change of the observations, each in units of its own spread over the
-undisturbed episodes (at least 0.001 of its unit) and at most 1, so that a channel that hardly varies does not drown the
-others. What random actions never touch, such as an object out of reach, counts as changing nothing. Episodes are short,
-since a contact-rich simulation multiplies any change in the long run.
+theta = 0.5; its sensitivity is the root-mean-square change of the observations, each in units of its own spread over
+the undisturbed episodes (at least 0.001 of its unit) and at most 1, so that a channel that hardly varies does not drown
+the others. What random actions never touch, such as an object out of reach, counts as changing nothing. Episodes are
+short, since a contact-rich simulation multiplies any change in the long run.
 """
 
 from __future__ import annotations
@@ -19,15 +19,20 @@ from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
 
 LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta
-_CHANGE = 0.1  # of the value
-_EPISODES, _STEPS = 8, 25
+_CHANGE = 0.1  # of the value: large against rounding, small against what is not linear
+_EPISODES, _STEPS = 8, 25  # short: contacts multiply any change in the long run
 _LEAST_SPREAD = 1e-3  # m, rad, m/s, N, ...
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """moved (5, N): at theta = LEVELS the change of the observations that a 10 % change of each parameter makes, in units
-    of their spread; names (N,)."""
+    """How much each parameter moves what is observed.
+
+    Args:
+        moved: (5, N) at theta = LEVELS the change of the observations that a 10 % change of each parameter makes, in
+            units of their spread.
+        names: (N,) of the parameters.
+    """
 
     moved: FloatArray
     names: tuple[str, ...]
@@ -86,12 +91,12 @@ def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
     spread = np.maximum(middle[0].std(axis=(0, 1)), _LEAST_SPREAD)
     moved = np.empty((len(LEVELS), n))
     for row, level in enumerate(LEVELS):
-        here, there = np.full((n, n), 0.5), np.full((n, n), 0.5)
+        given, changed = np.full((n, n), 0.5), np.full((n, n), 0.5)
         for j, parameter in enumerate(task.space):
-            here[j, j] = level
+            given[j, j] = level
             sign = -1.0 if level == LEVELS[-1] else 1.0
-            there[j, j] = parameter.normalise(float(parameter.value(level)) * (1 + sign * _CHANGE))
-        (a, good_a), (b, good_b) = observe(here), observe(there)
+            changed[j, j] = parameter.normalise(float(parameter.value(level)) * (1 + sign * _CHANGE))
+        (a, good_a), (b, good_b) = observe(given), observe(changed)
         change = np.minimum(np.abs(b - a) / spread, 1.0)
         change = np.where((good_a & good_b)[..., None], change, np.nan)
         moved[row] = np.sqrt(np.nanmean(change**2, axis=(1, 2, 3)))

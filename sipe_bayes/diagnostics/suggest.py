@@ -7,7 +7,8 @@ given, or generated within each actuator's limits:
 - chirps: the frequency goes from one end of the band to the other, up or down, by equal factors in equal times;
 - band-limited noise: white noise through a Butterworth band-pass filter of second order, scaled to its largest value;
 - sums of sines of random phases, as many as the band holds multiples of 1 / duration, at most ten (M. Schroeder 1970,
-  "Synthesis of low-peak-factor signals", https://doi.org/10.1109/TIT.1970.1054411, chooses phases; here they are drawn).
+  "Synthesis of low-peak-factor signals", https://doi.org/10.1109/TIT.1970.1054411, chooses phases; here they are
+  drawn).
 
 A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at
 a draw counts there as telling nothing. What each candidate makes the measured quantities reach is stated, for whether
@@ -159,8 +160,8 @@ def generate(
     steps = round(duration / dt)
     if not 1 / duration <= low < high < 0.5 / dt:
         raise ValueError(
-            f"band: expected {1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s steps, "
-            f"got {low:g} and {high:g}"
+            f"band: expected {1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s "
+            f"steps, got {low:g} and {high:g}"
         )
     rng = np.random.default_rng(seed)
     time = np.asarray(np.arange(steps) * dt, np.float64)

@@ -91,8 +91,8 @@ def headline(parameters: Sequence[ParameterSummary], findings: Findings) -> Verd
     doubts = findings.doubts
     if doubts:
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
-        said = "; ".join(doubts[:_DOUBTS])
-        return Verdict("bad", f"No value may be trusted within its interval yet: {said}{others}.")
+        first = "; ".join(doubts[:_DOUBTS])
+        return Verdict("bad", f"No value may be trusted within its interval yet: {first}{others}.")
     good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")

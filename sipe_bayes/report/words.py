@@ -10,7 +10,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 
 
 def significant(value: float, sd: float, scale: float | None = None) -> str:
-    """``value`` to the second significant digit of ``sd``: significant(0.69751, 0.0030) is "0.6975".
+    """A value to the second significant digit of its sd: 0.69751 with 0.0030 is "0.6975".
 
     Args:
         value: the number.

@@ -1,7 +1,7 @@
 """Calibration checks are seen to pass exact posteriors and to fail wide, narrow, shifted and wrongly correlated ones.
 
-Posteriors of a normal mean: truth ~ N(0.5, 0.1) per parameter, datum ~ N(truth, 0.1), so the posterior is N((0.5 + datum) / 2,
-0.1 / sqrt 2), well inside the cube.
+Posteriors of a normal mean: truth ~ N(0.5, 0.1) per parameter, datum ~ N(truth, 0.1), so the posterior is N((0.5 +
+datum) / 2, 0.1 / sqrt 2), well inside the cube.
 """
 
 from __future__ import annotations
@@ -88,8 +88,11 @@ def test_a_point_is_too_narrow_and_the_prior_passes() -> None:
 
 
 def test_false_alarms_are_as_rare_as_they_say() -> None:
-    """1000 uniform samples of 50: p below 0.05 in 50 of them with sd 7, the curve outside the 99 % band in 10 with sd 3;
-    five sd either way fail once in 10^6."""
+    """1000 uniform samples of 50.
+
+    P below 0.05 in 50 of them with sd 7, the curve outside the 99 % band in 10 with sd 3; five sd either way fail once
+    in 10^6.
+    """
     rng = np.random.default_rng(2)
     found = [uniformity(rng.random(50)) for _ in range(1000)]
     assert 15 < sum(u.p < 0.05 for u in found) < 85
@@ -117,7 +120,7 @@ def test_the_band_holds_the_diagonal_and_narrows() -> None:
 
 
 def test_tarp_is_that_of_sbi() -> None:
-    """sbi's curve, on its own grid of levels, is the share of our values at or below them; ours differ within ties."""
+    """The curve of sbi, on its own grid of levels, is the share of our values at or below them; ours differ within ties."""
     tarp = import_sbi("diagnostics.tarp")
     rng = np.random.default_rng(3)
     truths, references = rng.random((100, 2)), rng.random((100, 2))
@@ -131,7 +134,10 @@ def test_tarp_is_that_of_sbi() -> None:
 
 
 def test_ranks_are_those_of_sbi() -> None:
-    """sbi counts the draws below the truth; our masses are these counts, and a share of one draw, in units of all draws and one."""
+    """What sbi counts are the draws below the truth.
+
+    Our masses are these counts, and a share of one draw, in units of all draws and one.
+    """
     sbc = import_sbi("diagnostics.sbc")
     rng = np.random.default_rng(5)
     truths, draws = rng.random((30, 2)), rng.random((200, 30, 2))

@@ -1,4 +1,4 @@
-"""``sipe check`` passes an honest estimator, sees posteriors half and twice as wide, and goes on where it was interrupted."""
+"""``sipe check`` passes an honest estimator, sees planted widths, and goes on where it was interrupted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def call(*arguments: object) -> Any:
 def test_planted_widths_are_seen_and_honest_ones_pass(
     config: Path, estimator: str, verdict: str, tmp_path: Path
 ) -> None:
-    """The false-alarm rate of a check is 2 % in all; halved and doubled posteriors are seen in 40 logs all but surely."""
+    """A check alarms falsely in 2 % in all; halved and doubled posteriors are seen in 40 logs all but surely."""
     result = call(config, estimator, "--truths", 40, "--out", tmp_path / "out", "--threads", 1, "--json")
     found = json.loads(result.stdout)
     print(found["verdict"], found["sharpness"])

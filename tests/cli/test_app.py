@@ -242,9 +242,10 @@ def test_a_check_that_fails_is_one_warning(
 
 
 def test_killed_run_resumes_to_the_same_posterior(tmp_path: Path, log: pd.DataFrame) -> None:
-    """kill -9 in the middle of the chain; the same command again gives bit for bit what nobody disturbed gives.
+    """A kill -9 in the middle of the chain; the same command again gives bit for bit what nobody disturbed gives.
 
-    The number of native threads differs on purpose."""
+    The number of native threads differs on purpose.
+    """
     config = write_case(tmp_path, log)
     text('model = "white"', 'model = "ar1"')(tmp_path)
     whole = [config, "--estimator", "mcmc", "--out", tmp_path / "whole", "--threads", 1]

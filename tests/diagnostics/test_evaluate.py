@@ -54,7 +54,10 @@ CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint 
 
 
 def held_out(truth: list[float], *windows: float | None) -> Windows:
-    """Logs of a pendulum at ``truth``, one for each length of windows; the model as given has 0.6 kg and a damping of 0.05."""
+    """Logs of a pendulum at ``truth``, one for each length of windows.
+
+    The model as given has 0.6 kg and a damping of 0.05.
+    """
     simulator = pendulum()
     logs = Trajectories.stack([log(simulator, truth, seed, f"log {seed}") for seed in range(len(windows))])
     each = tuple((f"log {k}", window) for k, window in enumerate(windows))
@@ -62,7 +65,7 @@ def held_out(truth: list[float], *windows: float | None) -> Windows:
 
 
 def test_a_model_that_helps_is_better_and_its_mirror_image_is_worse() -> None:
-    """From either model's side the same numbers come out, turned round; whatever the windows, also a log that is one."""
+    """From either model's side the same numbers come out, turned round; whatever the windows."""
     windows = held_out([0.9, 0.15], 0.5, None)
     truth = windows.simulator.space.normalise(np.array([0.9, 0.15]))
     found = compare_errors(windows, truth)
@@ -86,8 +89,11 @@ def test_models_alike_are_not_better() -> None:
 
 
 def test_models_that_err_alike_are_called_different_as_rarely_as_it_says() -> None:
-    """1000 comparisons of errors that are equally large and correlated along the log (rho 0.9, 100 samples a piece): a t-test at the 5 %
-    level on two logs' tenths should call 50 of them different, with sd 7; up to 90 allows for what dependence is left."""
+    """1000 comparisons of errors that are equally large and correlated along the log (rho 0.9, 100 samples a piece).
+
+    A t-test at the 5 % level on two logs' tenths should call 50 of them different, with sd 7; up to 90 allows for what
+    dependence is left.
+    """
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((1000, 2, 2, 1000))
     for i in range(1, 1000):
@@ -105,8 +111,11 @@ def test_nothing_finite_is_no_comparison() -> None:
 
 
 def test_noisy_starts_do_not_decide() -> None:
-    """A cart on a rail, its place with noise of 2 mm and no velocity: a free run of 4 s from measured starts errs by its start, so each model fits its
-    own. The right model is then better than one of the wrong mass, and a worse one worse; with little noise on a pendulum nothing is fitted."""
+    """A cart on a rail, its place with noise of 2 mm and no velocity.
+
+    A free run of 4 s from measured starts errs by its start, so each model fits its own. The right model is then better
+    than one of the wrong mass, and a worse one worse; with little noise on a pendulum nothing is fitted.
+    """
     parameters = [Parameter("mass", 0.3, 3.0, targets=("body:cart.mass",))]
     environment = MjcfEnvironment.build(CART, parameters, ["push"], ["joint:rail.position"])
     simulator, rng = Simulator(environment, num_threads=1), np.random.default_rng(0)

@@ -37,7 +37,10 @@ def test_the_carts_ridge_is_foreseen_in_words_and_units(scale: str) -> None:
 
 
 def test_what_is_expected_is_what_a_fit_finds() -> None:
-    """The same experiment again takes sds to 1 / sqrt 2 of what the first left, by the information at draws of its posterior."""
+    """The same experiment again takes sds to 1 / sqrt 2 of what the first left.
+
+    By the information at draws of its posterior.
+    """
     simulator = pendulum()
     recorded = log(simulator, [0.6, 0.08], 3)
     posterior = get_estimator(simulator, "laplace", likelihood=SEGMENTS).fit(recorded)
@@ -58,9 +61,12 @@ def test_what_is_known_now_is_not_called_open() -> None:
 
 
 def test_a_new_log_has_nuisances_of_its_own() -> None:
-    """Zero errors of two old logs: the plan says nothing of them, and of the rest what it says where its own zero error is unknown. A
-    mass at one place and a zero of 0.3 rad do much the same to a pendulum that hardly moves, so that this is not what it
-    says with a known zero."""
+    """Zero errors of two old logs.
+
+    The plan says nothing of them, and of the rest what it says where its own zero error is unknown. A mass at one place
+    and a zero of 0.3 rad do much the same to a pendulum that hardly moves, so that this is not what it says with a
+    known zero.
+    """
     bias = ("sensor:joint:hinge.position.bias",)
     old = [Parameter(f"zero[{log}]", -0.3, 0.3, targets=bias, log=log) for log in ("a", "b")]
     plan = Plan(0.5 * np.sin(0.05 * np.arange(300))[:, None], DT)

@@ -56,7 +56,10 @@ def test_a_member_that_is_determined_is_not_said_to_be_open() -> None:
 
 
 def test_three_that_go_together_are_all_named() -> None:
-    """Mass, gear and damping of a cart whose forces have no scale: two determined combinations, in which each of the three occurs."""
+    """Mass, gear and damping of a cart whose forces have no scale.
+
+    Two determined combinations, in which each of the three occurs.
+    """
     rng = np.random.default_rng(0)
     space = ParameterSpace(
         [Parameter("mass", 0.5, 3.0, unit="kg"), Parameter("gear", 3.0, 18.0), Parameter("damping", 0.0, 3.0)]

@@ -62,7 +62,7 @@ def test_what_is_left_out_is_seen_and_named(missing: Parameter, value: float, rh
 
 
 def test_the_shift_is_how_far_the_estimate_moves_when_the_cause_is_modelled() -> None:
-    """With the offset among the parameters the estimate goes where the probe of the offset said, but for what is not linear."""
+    """With the offset among the parameters the estimate goes where its probe said, but for what is not linear."""
     offset = Parameter("offset", -0.3, 0.3, targets=("actuator:motor.offset",))
     recorded = log(pendulum(offset), [0.6, 0.08, 0.05], 2)
     moved = []
@@ -172,8 +172,10 @@ def of_mass_and_damping(recorded: Trajectory, high: float = 1.0, believed: float
 
 
 def test_an_optimum_at_a_bound_is_no_excuse() -> None:
-    """With a mass of .6 kg where at most .5 is allowed, or .72 is firmly believed, the residuals are not noise; where 1 is allowed, and
-    also where the truth is believed, they are."""
+    """With a mass of .6 kg where at most .5 is allowed, or .72 is firmly believed, the residuals are not noise.
+
+    Where 1 is allowed, and also where the truth is believed, they are.
+    """
     recorded = log(pendulum(), [0.6, 0.08], 3)
     for right in (of_mass_and_damping(recorded), of_mass_and_damping(recorded, believed=3 / 7)):
         assert right.p > 0.05
@@ -228,8 +230,11 @@ def test_a_log_outside_the_prior_is_named_and_one_inside_is_not() -> None:
 
 
 def test_a_start_is_as_uncertain_as_its_estimate() -> None:
-    """White noise of sd s on a position sampled at dt: the slope of a quadratic over 7 samples at its first has the sd of least squares.
-    100 draws tell it to 7 %, five standard errors are 35 %."""
+    """White noise of sd s on a position sampled at dt.
+
+    The slope of a quadratic over 7 samples at its first has the sd of least squares. 100 draws tell it to 7 %, five
+    standard errors are 35 %.
+    """
     simulator = pendulum()
     recorded = Trajectories.stack(log(simulator, [0.6, 0.08], 1, steps=60))
     replicas, rng = Replicas(simulator, recorded, Noise(np.array([0.01]), np.zeros(1))), np.random.default_rng(0)
@@ -240,7 +245,10 @@ def test_a_start_is_as_uncertain_as_its_estimate() -> None:
 
 
 def test_alarms_over_many_logs_of_the_prior_are_rare() -> None:
-    """Five calibrations of three logs each of the prior: the chance of any alarm is 5 % each, of two or more in five 2.3 %."""
+    """Five calibrations of three logs each of the prior.
+
+    The chance of any alarm is 5 % each, of two or more in five 2.3 %.
+    """
     rng, alarms = np.random.default_rng(0), 0
     for seed in range(5):
         values = [rng.uniform(0.3, 1.0), rng.uniform(0.0, 0.2)]

@@ -90,9 +90,12 @@ def with_quantiles_once(posterior: Posterior) -> Posterior:
 
 @pytest.mark.parametrize(("mean", "sd"), [([0.5, 0.5], 0.03), ([0.5, 0.5], 0.27), ([0.65, 0.4], 0.09)])
 def test_the_true_posterior_scores_best_on_average(mean: list[float], sd: float) -> None:
-    """Truths from N(0.5, 0.09): narrow, wide and shifted forecasts lose on CRPS, energy and nats, each by more than 4
-    standard errors of its mean difference over 400 truths. The expected differences are 12 and more (measured: from 10 over
-    other seeds): a false alarm has a probability below 1e-6, and with these seeds none."""
+    """Truths from N(0.5, 0.09).
+
+    Narrow, wide and shifted forecasts lose on CRPS, energy and nats, each by more than 4 standard errors of its mean
+    difference over 400 truths. The expected differences are 12 and more (measured: from 10 over other seeds): a false
+    alarm has a probability below 1e-6, and with these seeds none.
+    """
     right, rng = with_quantiles_once(normal([0.5, 0.5], 0.09)), np.random.default_rng(0)
     wrong = with_quantiles_once(normal(mean, sd))
     truths = np.clip(rng.normal(0.5, 0.09, (400, 2)), 0, 1)
@@ -160,7 +163,10 @@ def test_a_classifier_tells_what_differs_and_not_what_agrees() -> None:
 
 
 def test_stored_draws_are_not_repeated() -> None:
-    """A SurrogatePosterior of 400 exact draws against 400 others: 0.5 to 0.1; drawn with replacement, half of them twice, 0.6 and more."""
+    """A SurrogatePosterior of 400 exact draws against 400 others: 0.5 to 0.1.
+
+    Drawn with replacement, half of them twice, 0.6 and more.
+    """
     exact = example_surrogate(SPACE, 800)
     halves = [Particles(part, SPACE) for part in exact.draws.split(400)]
     args = (exact.process, exact.epsilon, exact.prior, halves[0].theta, 1, exact.log_normaliser, exact.normaliser_error)

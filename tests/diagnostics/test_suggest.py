@@ -44,8 +44,11 @@ def contraction(simulator: Simulator, plan: Plan, seed: int) -> float:
 
 
 def test_the_suggested_experiment_beats_random_ones() -> None:
-    """Contraction of actual fits, 8 plans: what is left of the sd after the first is less than 0.6 of the mean over all, less
-    than after any but at most one, and the order is much that of the scores."""
+    """Contraction of actual fits, 8 plans.
+
+    What is left of the sd after the first is less than 0.6 of the mean over all, less than after any but at most one,
+    and the order is much that of the scores.
+    """
     simulator = pendulum()
     plans = generate(8, 2.0, DT, BOUNDS, (0.5, 5.0), seed=1)
     ranked = rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), draws=3)
