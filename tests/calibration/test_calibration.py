@@ -120,7 +120,7 @@ def test_the_band_holds_the_diagonal_and_narrows() -> None:
 
 
 def test_tarp_is_that_of_sbi() -> None:
-    """The curve of sbi, on its own grid of levels, is the share of our values at or below them; ours differ within ties."""
+    """The curve of sbi, on its own levels, is the share of our values at or below them; ours differ within ties."""
     tarp = import_sbi("diagnostics.tarp")
     rng = np.random.default_rng(3)
     truths, references = rng.random((100, 2)), rng.random((100, 2))

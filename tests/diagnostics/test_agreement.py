@@ -95,7 +95,7 @@ def test_logs_of_different_ranks_that_agree_raise_no_more_alarms_than_stated(inf
 
 
 def test_a_parameter_that_few_logs_determine_is_named_alone() -> None:
-    """Parameter a differs between the two logs that determine it; b, which three more determine as well, is the same."""
+    """Parameter a differs between the two logs that determine it; b, which three more determine too, is the same."""
     space, rng, single = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(4), 0
     informations = [np.diag([1e4, 1e4])] * 2 + [np.diag([0.0, 1e4])] * 3
     for _ in range(300):
