@@ -1,0 +1,1 @@
+"""What every room uses: parameters, trajectories, units, checks, findings, options, checkpoints, seeds and files."""

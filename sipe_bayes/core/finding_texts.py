@@ -114,7 +114,7 @@ class Code(StrEnum):
 
 @dataclass(frozen=True)
 class Text:
-    """How severe a finding usually is, its text with {places}, and what a row of a table says of a parameter with it."""
+    """How severe a finding usually is, its text with {places}, and what a table's row says of a parameter with it."""
 
     severity: Severity
     template: str

@@ -36,7 +36,7 @@ class LogNoise:
 
 
 def process_noise(diagnostics: Mapping[str, object]) -> FloatArray:
-    """sd (D,) of a fit with a ``StateSpace``, none of any other."""
+    """Process noise sd (D,) of a fit with a ``StateSpace``, none of any other."""
     return np.array(diagnostics.get("process_noise", ()), float)
 
 

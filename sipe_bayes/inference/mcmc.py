@@ -15,7 +15,6 @@ walkers share information, so R-hat is an optimistic diagnostic.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -40,10 +39,10 @@ from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Particles
+from sipe_bayes.posterior.ensemble import mixing_of
 
 _MOVES = (0.6, 0.3, 0.1)  # shares of independent Metropolis-Hastings, differential evolution, and its snooker
 _FEWEST_CHECKED = 4  # walkers that make an sd
-_LONG = 10  # autocorrelation times in a chain from which on its estimate is believed
 
 
 @dataclass(frozen=True)
@@ -295,23 +294,8 @@ class MCMC(Estimator[MCMCState]):
         kept = self._kept(state)
         if len(kept) < 2 * self.options.tuning.block:
             return {"rhat": np.inf, "ess": 0.0, "acceptance": 0.0, "steps": len(state.chain)}
-        import arviz
-        import emcee
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            rhat = max(float(arviz.rhat(kept[:, :, j].T)) for j in range(kept.shape[2]))
-            time = emcee.autocorr.integrated_time(kept, quiet=True, tol=0, has_walkers=True)
-        steps, walkers = kept.shape[:2]
-        tau = max(1.0, float(np.nanmax(time))) if np.isfinite(time).any() else float(steps)
-        ess = steps * walkers / tau
-        return {
-            "rhat": rhat,
-            "ess": ess if steps >= _LONG * tau else min(ess, float(_LONG * walkers)),
-            "autocorrelation_steps": tau,
-            "acceptance": float(state.accepted.sum()) / (len(state.chain) * walkers),
-            "steps": len(state.chain),
-        }
+        acceptance = float(state.accepted.sum()) / (len(state.chain) * kept.shape[1])
+        return {**mixing_of(kept), "acceptance": acceptance, "steps": len(state.chain)}
 
     def _kept(self, state: MCMCState) -> FloatArray:
         """The chain after warm-up (steps, W, N)."""

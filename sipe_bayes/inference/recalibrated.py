@@ -240,8 +240,8 @@ class Recalibrated(Estimator[RecalibratedState]):
         theta, estimates = self._local(state)
         if len(theta) < 2 * n + 4:
             raise ValueError(
-                f"refits: {len(theta)} of {state.tried} gave an estimate, {2 * n + 4} are the least for {n} parameters; "
-                "raise refits or budget, or narrow the bounds"
+                f"refits: {len(theta)} of {state.tried} gave an estimate, {2 * n + 4} are the least for {n} "
+                "parameters; raise refits or budget, or narrow the bounds"
             )
         tried = state.tried - state.round_tried
         lost = 1 - (len(state.theta) - state.round_valid) / max(1, tried)

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 Numbers = ArrayLike | Tensor
 """A number or an array of numbers of any kind."""
-REFERENCE_DRAWS = 20_000  # of moments, quantiles and mode, where a family knows no better: 1 % of an sd
-MARGINAL_DRAWS = 8_000  # of marginals and wider ones, which are kept
 _ROUNDING = 1e-6  # theta that far outside the cube was rounded, and is clipped
 _POINT = 1e-12  # range of draws below which they are one point
 
@@ -91,7 +89,9 @@ def _drawn(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> d
 class DrawsFamily(Protocol):
     """Makes a posterior of draws (n, N)."""
 
-    def __call__(self, draws: Tensor, space: ParameterSpace, /) -> Posterior: ...
+    def __call__(self, draws: Tensor, space: ParameterSpace, /) -> Posterior:
+        """The posterior."""
+        ...
 
 
 class Posterior(TorchDistribution):
@@ -135,6 +135,8 @@ class Posterior(TorchDistribution):
     support = constraints.independent(constraints.unit_interval, 1)
     has_rsample = False
     has_density: ClassVar[bool] = True
+    reference_draws: ClassVar[int] = 20_000  # of moments, quantiles and mode where a family knows no better: 1 % of sd
+    marginal_draws: ClassVar[int] = 8_000  # of marginals and wider ones, which are kept
 
     def __init__(self, space: ParameterSpace) -> None:
         if not isinstance(space, ParameterSpace):
@@ -180,7 +182,7 @@ class Posterior(TorchDistribution):
 
     @cached_property
     def _reference(self) -> Tensor:
-        return self._fixed_draws(REFERENCE_DRAWS)
+        return self._fixed_draws(self.reference_draws)
 
     @cached_property
     def _cached_moments(self) -> tuple[Tensor, Tensor]:
@@ -310,7 +312,7 @@ class Posterior(TorchDistribution):
     def marginal(self, names: Iterable[str]) -> Posterior:
         """The posterior of some parameters, in the order given: here Particles of 8,000 fixed-seed draws."""
         columns, space = self._columns(names)
-        return self.of_draws(self._fixed_draws(MARGINAL_DRAWS)[:, columns], space)
+        return self.of_draws(self._fixed_draws(self.marginal_draws)[:, columns], space)
 
     def wider(self, factor: float) -> Posterior:
         """This posterior spread further about its mean, for cautious domain randomisation.
@@ -325,7 +327,7 @@ class Posterior(TorchDistribution):
             ValueError: for a factor below 1, and for a point, which has no spread.
         """
         factor = at_least("factor", factor, 1.0)
-        draws = self._fixed_draws(MARGINAL_DRAWS)
+        draws = self._fixed_draws(self.marginal_draws)
         if float(np.ptp(draws.numpy(), axis=0).max()) < _POINT:
             raise ValueError("wider: expected a posterior with spread, got a point; take .smoothed(bandwidth)")
         centre = draws.mean(0)

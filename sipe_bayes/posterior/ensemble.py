@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 LogDensity = Callable[[FloatArray], FloatArray]
 """Unnormalised log density (n,) of z (n, N), with respect to z."""
-_LOG_2PI = math.log(2 * math.pi)
 _EDGE = 1e-12  # theta is kept this far inside the cube where it becomes z, which is finite then
 
 
@@ -133,18 +132,18 @@ def mixing_of(chain: FloatArray) -> dict[str, float]:
 
 
 def from_line(z: FloatArray) -> Tensor:
-    """theta = Phi(z)."""
+    """The theta = Phi(z) of z."""
     return torch.from_numpy(ndtr(z))
 
 
 def onto_line(theta: FloatArray) -> FloatArray:
-    """z = Phi^-1(theta), finite."""
+    """The z = Phi^-1(theta) of theta, finite."""
     return np.asarray(ndtri(np.clip(theta, _EDGE, 1 - _EDGE)))
 
 
 def log_jacobian(z: FloatArray) -> FloatArray:
-    """log |d theta / d z| (n,) of z (n, N)."""
-    return -0.5 * (z**2).sum(1) - z.shape[1] / 2 * _LOG_2PI
+    """The log |d theta / d z| (n,) of z (n, N)."""
+    return -0.5 * (z**2).sum(1) - z.shape[1] / 2 * math.log(2 * math.pi)
 
 
 def draws_on_line(distribution: Posterior, count: int, random: np.random.RandomState) -> FloatArray:
@@ -184,7 +183,7 @@ class DefensiveMixture:
 
     def log_density(self, z: FloatArray) -> FloatArray:
         """Log density (n,) of z (n, N)."""
-        half = z.shape[1] / 2 * _LOG_2PI
+        half = z.shape[1] / 2 * math.log(2 * math.pi)
         white = np.linalg.solve(self.factor, (z - self.mean).T)
         normal = -0.5 * (white**2).sum(0) - np.log(np.diag(self.factor)).sum() - half
         points, centres = (np.linalg.solve(self.kernel, (a - self.mean).T).T for a in (z, self.centres))
@@ -242,7 +241,7 @@ def _core(z: FloatArray) -> FloatArray:
 def _importance(
     log_density: LogDensity, proposal: DefensiveMixture, count: int, random: np.random.RandomState, trusted: float
 ) -> tuple[float, float, FloatArray | None]:
-    """log Z by importance sampling, and its standard error.
+    """The normaliser log Z by importance sampling, and its standard error.
 
     The third is z (count, N) drawn by the weights; None where a few points have all the weight.
     """

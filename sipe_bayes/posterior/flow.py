@@ -33,12 +33,10 @@ if TYPE_CHECKING:
 
 MARGIN = 1e-6  # theta closer to a bound has the density of the point that far from it: z stays finite
 _AUTOREGRESSIVE = 8  # parameters up to which every layer is fully autoregressive
-_CHUNK = 2**22  # spline coefficients in memory at once
-_MODE_STARTS = 4
 
 
 def spline_flow(features: int, context: int, transforms: int, hidden: int, bins: int) -> zuko.flows.NSF:
-    """zuko's neural spline flow, float32, with random weights.
+    """A neural spline flow of zuko's, float32, with random weights.
 
     Args:
         features: of u.
@@ -56,12 +54,12 @@ def spline_flow(features: int, context: int, transforms: int, hidden: int, bins:
 
 
 def to_line(theta: Tensor) -> Tensor:
-    """z = Phi^-1(theta), of theta kept 1e-6 away from the bounds."""
+    """The z = Phi^-1(theta) of theta kept 1e-6 away from the bounds."""
     return torch.special.ndtri(theta.clamp(MARGIN, 1 - MARGIN))
 
 
 def to_cube(z: Tensor) -> Tensor:
-    """theta = Phi(z)."""
+    """The theta = Phi(z) of z."""
     return torch.special.ndtr(z)
 
 
@@ -80,6 +78,8 @@ class Flow(Posterior):
     """
 
     has_density: ClassVar[bool] = True
+    coefficients_at_once: ClassVar[int] = 2**22  # of splines, in memory
+    mode_starts: ClassVar[int] = 4  # draws that are climbed from
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Flow(Posterior):
         except RuntimeError as error:
             raise ValueError(f"weights: expected those of the flow {self.architecture}, got others ({error})") from None
         self._net = net.double().eval().requires_grad_(False)
-        self._chunk = max(64, _CHUNK // (n * 3 * self.architecture["bins"]))
+        self._chunk = max(64, self.coefficients_at_once // (n * 3 * self.architecture["bins"]))
 
     def _given(self) -> Any:
         return self._net(self.context)
@@ -134,7 +134,7 @@ class Flow(Posterior):
     def _mode(self) -> Tensor:
         """The best of the reference draws, climbed from with bounds by L-BFGS-B."""
         density = self._log_prob(self._reference)
-        best = density.topk(min(_MODE_STARTS, len(density))).indices
+        best = density.topk(min(self.mode_starts, len(density))).indices
         starts = self._reference[best]
         candidates = torch.cat([starts, torch.stack([self._climb(start) for start in starts])])
         return candidates[self._log_prob(candidates).argmax()]
@@ -148,8 +148,8 @@ class Flow(Posterior):
             return float(value), np.zeros_like(point) if theta.grad is None else theta.grad.numpy()
 
         bounds = [(MARGIN, 1 - MARGIN)] * len(self.space)
-        found = minimize(objective, start.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 50})
-        return torch.from_numpy(np.clip(found.x, 0.0, 1.0))
+        end = minimize(objective, start.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 50})
+        return torch.from_numpy(np.clip(end.x, 0.0, 1.0))
 
     def _state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {"context": self.context, "mean": self.line_mean, "sd": self.line_sd}

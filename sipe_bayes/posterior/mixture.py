@@ -22,6 +22,7 @@ the mass cut off along them is below 1e-9 of the component's own. Otherwise the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -38,9 +39,6 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Numbers, Posterior, as_float64
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal, log_interval
 
-_LOG_2PI = float(np.log(2 * np.pi))
-_CHUNK = 10_000_000  # numbers in memory at once
-_MODE_STARTS, _MODE_STEPS = 8, 100  # components that are climbed from, and steps after which the density stands still
 _MARGINAL_ERROR = 1e-9  # mass that a closed form may leave out
 
 
@@ -59,6 +57,9 @@ class GaussianMixture(Posterior):
     """
 
     has_density: ClassVar[bool] = True
+    numbers_at_once: ClassVar[int] = 10_000_000  # in memory
+    mode_starts: ClassVar[int] = 8  # components that are climbed from
+    mode_steps: ClassVar[int] = 100  # of a climb, after which the density stands still
 
     def __init__(self, log_weights: Numbers, means: Numbers, covariances: Numbers, space: ParameterSpace) -> None:
         super().__init__(space)
@@ -81,7 +82,7 @@ class GaussianMixture(Posterior):
 
     @cached_property
     def log_masses(self) -> Tensor:
-        """log Z_k (K,): the log mass of each untruncated component in the cube."""
+        """The log Z_k (K,): the log mass of each untruncated component in the cube."""
         return torch.tensor([c.log_mass for c in self._components], dtype=torch.float64)
 
     @cached_property
@@ -91,7 +92,7 @@ class GaussianMixture(Posterior):
 
     @cached_property
     def log_normaliser(self) -> Tensor:
-        """log Z, the log mass of the mixture in the cube."""
+        """The log Z, the log mass of the mixture in the cube."""
         log_z = torch.logsumexp(self.log_weights + self.log_masses, 0)
         if not torch.isfinite(log_z):
             raise ValueError("means: expected mass in the cube, but every component is out of reach of it; move them")
@@ -103,14 +104,14 @@ class GaussianMixture(Posterior):
         return torch.exp(self.log_weights + self.log_masses - self.log_normaliser)
 
     def _log_terms(self, theta: Tensor) -> Tensor:
-        """log of w_k N(theta; m_k, C_k), (K, n)."""
+        """The log of w_k N(theta; m_k, C_k), (K, n)."""
         deviation = theta.T - self.means[..., None]
         diagonal = self._cholesky.diagonal(dim1=1, dim2=2)
         if self._diagonal:
             white = deviation / diagonal[..., None]
         else:
             white = torch.linalg.solve_triangular(self._cholesky, deviation, upper=False)
-        constant = self.log_weights - diagonal.log().sum(1) - len(self.space) / 2 * _LOG_2PI
+        constant = self.log_weights - diagonal.log().sum(1) - len(self.space) / 2 * math.log(2 * math.pi)
         return constant[:, None] - (white**2).sum(1) / 2
 
     @cached_property
@@ -118,7 +119,7 @@ class GaussianMixture(Posterior):
         return all(c.diagonal for c in self._components)
 
     def _log_prob(self, theta: Tensor) -> Tensor:
-        rows = max(1, _CHUNK // self.means.numel())
+        rows = max(1, self.numbers_at_once // self.means.numel())
         chunks = [torch.logsumexp(self._log_terms(part), 0) for part in theta.split(rows)]
         return torch.cat(chunks) - self.log_normaliser
 
@@ -166,7 +167,7 @@ class GaussianMixture(Posterior):
 
     def _mode(self) -> Tensor:
         starts = self.means.clamp(0.0, 1.0)
-        best = self._log_prob(starts).topk(min(_MODE_STARTS, len(starts))).indices
+        best = self._log_prob(starts).topk(min(self.mode_starts, len(starts))).indices
         candidates = torch.stack([self._climb(k) for k in best.tolist()])
         return candidates[self._log_prob(candidates).argmax()]
 
@@ -174,7 +175,7 @@ class GaussianMixture(Posterior):
         share = torch.zeros(len(self.means), dtype=torch.float64)
         share[k] = 1.0
         theta, height = self._bound_maximum(share), -torch.inf
-        for _ in range(_MODE_STEPS if len(self.means) > 1 else 0):
+        for _ in range(self.mode_steps if len(self.means) > 1 else 0):
             terms = self._log_terms(theta[None])[:, 0]
             now = float(torch.logsumexp(terms, 0))
             if now <= height + 1e-12:

@@ -21,7 +21,6 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Numbers, Posterior, as_float64, as_theta, check_bandwidth
 from sipe_bayes.posterior.mixture import GaussianMixture
 
-MAX_KERNELS = 500  # of a smoothed set of points: a density of more takes seconds
 _STATS = "sample_stats."
 
 
@@ -40,6 +39,7 @@ class Particles(Posterior):
     """
 
     has_density: ClassVar[bool] = False
+    most_kernels: ClassVar[int] = 500  # of a smoothed set of points: a density of more takes seconds
 
     def __init__(
         self,
@@ -94,11 +94,12 @@ class Particles(Posterior):
 
     def _kernels(self) -> tuple[Tensor, Tensor]:
         used = self.weights > 0
-        if used.sum() <= MAX_KERNELS:
+        most = self.most_kernels
+        if used.sum() <= most:
             return self.theta[used], self.weights[used]
-        levels = (torch.arange(MAX_KERNELS, dtype=torch.float64) + 0.5) / MAX_KERNELS
+        levels = (torch.arange(most, dtype=torch.float64) + 0.5) / most
         rows = torch.searchsorted(self.weights.cumsum(0), levels).clamp_max(len(self.theta) - 1)
-        return self.theta[rows], torch.full((MAX_KERNELS,), 1 / MAX_KERNELS, dtype=torch.float64)
+        return self.theta[rows], torch.full((most,), 1 / most, dtype=torch.float64)
 
     def marginal(self, names: Iterable[str]) -> Particles:
         """The same points in fewer parameters; weights and chains stay, ``best`` of the whole does not."""

@@ -165,7 +165,7 @@ class SurrogatePosterior(Posterior):
 
 
 def log_acceptance(process: GaussianProcess, epsilon: float, theta: Tensor) -> Tensor:
-    """log Phi((epsilon - mu) / sqrt(s^2 + sigma^2)) (n,) of theta (n, N)."""
+    """The log Phi((epsilon - mu) / sqrt(s^2 + sigma^2)) (n,) of theta (n, N)."""
     mean, sd = process.predict(theta)
     return torch.special.log_ndtr((epsilon - mean) / (sd**2 + process.noise_sd**2).sqrt())
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -44,12 +44,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 Bounds = FloatArray | float
 Draw = Callable[[int, Generator | None], FloatArray]
 """Tries (n,), some of which are accepted (m, N)."""
-RELATIVE_ERROR = 1e-4  # aimed at, of a mass
 _UNTRUNCATED = 1e-12  # mass outside the cube below which nothing is cut off
-_SCRAMBLES = 8  # Sobol sequences, whose spread is the error
-_FIRST_POINTS, _MOST_POINTS = 2**11, 2**13  # of each sequence
-_REJECTION_MASS = 0.05  # above it plain draws are thrown away until enough are inside
-_LEAST_ACCEPTANCE = 1e-6  # of tilted draws, below which drawing would take forever
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
@@ -198,11 +193,20 @@ def saddle_point(lower: FloatArray, low: FloatArray, high: FloatArray) -> tuple[
 
 
 class TruncatedNormal:
-    """N(mean, covariance) restricted to [0, 1]^N and renormalised. mean (N,), covariance (N, N), positive
-    definite.
+    """N(mean, covariance) restricted to [0, 1]^N and renormalised.
 
-    log_mass: given when it is known already, so that it is not estimated again.
+    Args:
+        mean: (N,).
+        covariance: (N, N), positive definite.
+        log_mass: with its standard error, when it is known already, so that it is not estimated again.
     """
+
+    relative_error: ClassVar[float] = 1e-4  # of a mass, which is aimed at
+    scrambles: ClassVar[int] = 8  # Sobol sequences, whose spread is the error
+    first_points: ClassVar[int] = 2**11  # of each sequence
+    most_points: ClassVar[int] = 2**13
+    rejection_mass: ClassVar[float] = 0.05  # above it plain draws are thrown away until enough are inside
+    least_acceptance: ClassVar[float] = 1e-6  # of tilted draws, below which drawing would take forever
 
     def __init__(self, mean: FloatArray, covariance: FloatArray, log_mass: tuple[float, float] | None = None) -> None:
         self.mean, self.covariance = mean, covariance
@@ -240,8 +244,8 @@ class TruncatedNormal:
     def _estimate(self) -> Estimate:
         theta, psi = self._points()
         per_scramble = logsumexp(psi, axis=1) - math.log(psi.shape[1])
-        log_mass = float(logsumexp(per_scramble) - math.log(_SCRAMBLES))
-        error = float(np.exp(per_scramble - log_mass).std(ddof=1)) / math.sqrt(_SCRAMBLES)
+        log_mass = float(logsumexp(per_scramble) - math.log(self.scrambles))
+        error = float(np.exp(per_scramble - log_mass).std(ddof=1)) / math.sqrt(self.scrambles)
         theta, psi = theta.reshape(-1, len(self.mean)), psi.reshape(-1)
         weight = np.exp(psi - logsumexp(psi))
         mean = weight @ theta
@@ -256,7 +260,7 @@ class TruncatedNormal:
         return Tilting(order, diagonal, lower, low, high, *saddle_point(lower, low, high))
 
     def _propose(self, uniforms: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """theta (n, N) and log likelihood ratios psi (n,) of uniform numbers (n, N)."""
+        """Draws theta (n, N) and log likelihood ratios psi (n,) of uniform numbers (n, N)."""
         tilting = self._tilting
         z, psi = np.zeros_like(uniforms), np.zeros(len(uniforms))
         for k, mu in enumerate(tilting.mu):
@@ -269,13 +273,13 @@ class TruncatedNormal:
         return np.clip(theta + self.mean, 0.0, 1.0), psi
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
-        """theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences, n doubled until precise."""
-        engines = [qmc.Sobol(len(self.mean), scramble=True, seed=seed) for seed in range(_SCRAMBLES)]
-        uniforms = np.stack([engine.random(_FIRST_POINTS) for engine in engines])
+        """Draws theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences, n doubled until precise."""
+        engines = [qmc.Sobol(len(self.mean), scramble=True, seed=seed) for seed in range(self.scrambles)]
+        uniforms = np.stack([engine.random(self.first_points) for engine in engines])
         theta, psi = self._propose_batch(uniforms)
-        while psi.shape[1] < _MOST_POINTS:
+        while psi.shape[1] < self.most_points:
             masses = np.exp(logsumexp(psi, axis=1) - logsumexp(psi))
-            if masses.std(ddof=1) / masses.mean() / math.sqrt(_SCRAMBLES) < RELATIVE_ERROR / 2:
+            if masses.std(ddof=1) / masses.mean() / math.sqrt(self.scrambles) < self.relative_error / 2:
                 break
             more = self._propose_batch(np.stack([engine.random(psi.shape[1]) for engine in engines]))
             theta, psi = np.concatenate([theta, more[0]], 1), np.concatenate([psi, more[1]], 1)
@@ -300,10 +304,10 @@ class TruncatedNormal:
             uniforms = torch.rand(n, len(self.mean), dtype=torch.float64, generator=generator).numpy()
             a, b = -self.mean / self.sd, (1 - self.mean) / self.sd
             return np.clip(self.mean + self.sd * interval_quantile(a, b, uniforms), 0.0, 1.0)
-        if self.log_mass > math.log(_REJECTION_MASS):
+        if self.log_mass > math.log(self.rejection_mass):
             return self._accepted(n, math.exp(self.log_mass), self._plain_draws, generator)
         rate = math.exp(min(self.log_mass - self._tilting.log_bound, 0.0))
-        if rate < _LEAST_ACCEPTANCE:
+        if rate < self.least_acceptance:
             raise RuntimeError(
                 f"sample: one draw in {1 / max(rate, 1e-300):.0e} would be accepted; the covariance is too "
                 "close to singular in the tail, add a little to its diagonal"

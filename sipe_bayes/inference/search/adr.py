@@ -8,7 +8,8 @@ expected rewards J approach q(phi) proportional to exp(J(phi) / alpha), by
 
     phi_i += step / M sum_j [ k(phi_j, phi_i) grad J(phi_j) / alpha + grad_phi_j k(phi_j, phi_i) ],
 
-the first part towards reward, the second away from each other; k(a, b) = exp(-|a - b|^2 / h), h = median^2 / log(M + 1).
+the first part towards reward, the second away from each other, with k(a, b) = exp(-|a - b|^2 / h) and
+h = median^2 / log(M + 1).
 
 Deviations:
 
@@ -192,6 +193,6 @@ def _slope(offset: FloatArray, utility: FloatArray, wanted: float, ridge: float)
 
 
 def _folded(theta: FloatArray) -> FloatArray:
-    """theta reflected at the bounds into the cube."""
+    """Theta reflected at the bounds into the cube."""
     theta = np.abs(theta) % 2.0
     return np.where(theta > 1, 2.0 - theta, theta)

@@ -234,7 +234,7 @@ class BayesOpt(Estimator[BayesOptState]):
         )
 
     def _values(self, state: BayesOptState) -> Tensor:
-        """y (n,): log costs, the worst finite one where a simulation diverged."""
+        """Log costs y (n,), the worst finite one where a simulation diverged."""
         finite = np.isfinite(state.cost)
         worst = state.cost[finite].max() if finite.any() else 1.0
         return torch.from_numpy(np.log(np.where(finite, state.cost, worst) + self.options.floor))
@@ -260,7 +260,7 @@ class BayesOpt(Estimator[BayesOptState]):
         return ConfidenceBound(options.kappa) if by_bound else ExpectedImprovement(options.xi)
 
     def _candidates(self, state: BayesOptState, count: int) -> FloatArray:
-        """theta (count, N) chosen one after the other, the first of a batch's checks drawn from the posterior."""
+        """Candidates (count, N) chosen one after the other, the first of a batch's checks drawn from the posterior."""
         process, done, options = self._process(state), len(state.theta), self.options
         rng = np.random.default_rng([self.seed, done])
         low, high = self.prior.quantile(torch.tensor([options.tail, 1 - options.tail])).numpy()
