@@ -8,7 +8,7 @@ The blocks are the starts of windows that share a noise sample (``likelihood.res
 complement B - C' A^-1 C for theta, and the likelihood with x integrated out follows from log|A|. The covariances of
 neighbouring blocks come from the factor by Takahashi's recursion: the inverse is never formed as a whole.
 
-References:
+The recursion is that of
 
 - K. Takahashi, J. Fagan, M.-S. Chin, "Formation of a sparse bus impedance matrix and its application to short circuit
   study", 1973; in the block form that Rauch, Tung and Striebel's smoother has.

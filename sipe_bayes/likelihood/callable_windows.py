@@ -1,19 +1,17 @@
-"""A CallableSimulator's x as windows, so that methods written for trajectories take it: one sample, no start to estimate."""
+"""A CallableSimulator's x as windows, for methods written for trajectories: one sample, no start to estimate."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import sequences
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.windows import Windows, fitted_channels
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-
-FloatArray = NDArray[np.float64]
 
 
 class CallableWindows(Windows):
@@ -46,15 +44,19 @@ class CallableWindows(Windows):
 
     @property
     def starts_measured(self) -> bool:
+        """There is nothing to measure."""
         return True
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
+        """Zero (N,): a function takes any difference."""
         return np.zeros(self.num_theta)
 
     def states(self, starts: FloatArray) -> FloatArray:
+        """The starts (..., 0) themselves."""
         return starts
 
-    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Predictions (B, W, 2, C) of theta (B, N), and which are finite (B,); raises BudgetExhausted."""
         batch, count = len(theta), len(self.trajectories)
         if self.rollouts + batch * count > self.budget:
             raise BudgetExhausted(

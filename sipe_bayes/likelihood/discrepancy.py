@@ -2,19 +2,21 @@
 
 Recorded trajectories are cut into windows (``likelihood.Segments``), each replayed from its own recorded or estimated
 starting state with the recorded actions. ``Segments(window=None)`` replays whole trajectories, as the SiPE paper does
-(Mehta, Handa, Fox, Ramos 2020, section 2.3). The default, half a second, is a deviation from it: over a whole trajectory
-contact and chaos hide the parameters (half-cheetah, 200 steps: least squares is no better than the prior mean).
+(Mehta, Handa, Fox, Ramos 2020, section 2.3).
+
+Deviations:
+
+- The default window is half a second: over a whole trajectory contact and chaos hide the parameters (half-cheetah, 200
+  steps: least squares is no better than the prior mean).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.likelihood.callable_windows import CallableWindows
 from sipe_bayes.likelihood.windows import Windows
-
-FloatArray = NDArray[np.float64]
 
 _BATCH = 32  # thetas simulated at once
 _STILL = 1e-3  # of the median channel's spread: less motion than that is scaled as if it were that much
@@ -22,9 +24,13 @@ _ROUNDING = 1e-7  # of a function's output: outputs that differ by less are equa
 
 
 class StateDifference:
-    """Mean squared difference between simulated and recorded channels, each in units of ``scale`` (C,), see ``channel_scale``.
+    """Mean squared difference between simulated and recorded channels, each in units of its scale.
 
     Deviation from the SiPE paper: it sums plain squares, so that its metres and radians per second weigh alike.
+
+    Args:
+        windows: of the recording.
+        scale: (C,), see ``channel_scale``.
     """
 
     def __init__(self, windows: Windows, scale: FloatArray) -> None:
@@ -40,11 +46,18 @@ class StateDifference:
 
 
 def channel_scale(windows: Windows, first: FloatArray) -> FloatArray:
-    """What a channel's differences are divided by (C,): its recorded spread, of channels that hardly move as much as
-    ``_STILL`` of the median channel's.
+    """What a channel's differences are divided by, so that nothing depends on the channels' units.
 
-    One observed x of a function has no spread: it is that of the first simulations ``first`` (B, W, L, C) there, and the
-    channel's magnitude where they do not differ; NaN where none was valid. So nothing depends on the channels' units.
+    Its recorded spread; of channels that hardly move as much as a thousandth of the median channel's. One observed x of
+    a function has no spread: it is that of the first simulations there, and the channel's magnitude where they do not
+    differ.
+
+    Args:
+        windows: of the recording.
+        first: (B, W, L, C), simulations.
+
+    Returns:
+        (C,), NaN where no simulation was valid.
     """
     if isinstance(windows, CallableWindows):
         return _simulated_scale(windows, first)
@@ -67,7 +80,18 @@ def _simulated_scale(windows: CallableWindows, first: FloatArray) -> FloatArray:
 
 
 def simulate(windows: Windows, theta: FloatArray) -> FloatArray:
-    """Predictions (B, W, L, C) of theta (B, N) from the windows' own starts; raises BudgetExhausted."""
+    """Simulate theta from the windows' own starts.
+
+    Args:
+        windows: of the recording.
+        theta: (B, N).
+
+    Returns:
+        Predictions (B, W, L, C).
+
+    Raises:
+        BudgetExhausted: instead of simulating beyond the budget.
+    """
     starts = windows.no_starts()
     parts = [
         windows.predict(rows, np.broadcast_to(starts, (len(rows), *starts.shape)))[0]

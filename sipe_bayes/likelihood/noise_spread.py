@@ -1,22 +1,28 @@
-"""How uncertain an estimate of the noise is, and what it leaves uncertain in theta: weighted noise values, and the sandwich."""
+"""How uncertain an estimate of the noise is, and what that leaves uncertain in theta: noise values, the sandwich."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients
 from sipe_bayes.likelihood.restricted import Pulls, restricted, restricted_slopes
 from sipe_bayes.likelihood.sequences import Sequence
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 
 def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArray) -> FloatArray:
-    """Covariance of the ``free`` entries of (log sd (C), log tau (C)): inverse curvature of the restricted likelihood
-    at ``noise``, sds held between 0.01 and 1."""
+    """Uncertainty of estimated noise: the inverse curvature of the restricted likelihood, sds held between 0.01 and 1.
+
+    Args:
+        moments: of the linearisation.
+        noise: the estimate.
+        pulls: what holds theta and the starts besides the data.
+        free: which of (log sd (C), log tau (C)) were estimated (F,).
+
+    Returns:
+        Covariance (F, F) of the logarithms.
+    """
     if not len(free):
         return np.zeros((0, 0))
     centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
@@ -42,8 +48,21 @@ def _from_logs(logs: FloatArray, like: Noise) -> Noise:
 def noise_cloud(
     moments: Moments, noise: Noise, pulls: Pulls, free: IntArray, longest: float
 ) -> list[tuple[float, Noise]]:
-    """Weighted points that stand for the uncertainty of the noise: two along each principal axis of its covariance, at
-    sqrt(dimensions) sds, weighted by the restricted likelihood against its normal approximation."""
+    """Weighted points that stand for the uncertainty of the noise.
+
+    Two along each principal axis of its covariance, at sqrt(dimensions) sds, weighted by the restricted likelihood
+    against its normal approximation.
+
+    Args:
+        moments: of the linearisation.
+        noise: the estimate.
+        pulls: what holds theta and the starts besides the data.
+        free: which of (log sd (C), log tau (C)) were estimated (F,).
+        longest: correlation time at most, in seconds.
+
+    Returns:
+        Weights, which sum to one, and noises.
+    """
     if not len(free):
         return [(1.0, noise)]
     covariance, d = noise_covariance(moments, noise, pulls, free), len(free)
@@ -65,9 +84,19 @@ def noise_cloud(
 
 
 def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
-    """X' V X (N, N) of the rows X (n, N) of one channel, V its residual covariance.
+    """X' V X of rows X of one channel, V its residual covariance.
 
-    With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion."""
+    With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion.
+
+    Args:
+        rows: (n, N).
+        sequence: the channel's samples in order.
+        sd: of its noise.
+        tau: correlation time in seconds.
+
+    Returns:
+        (N, N).
+    """
     a = coefficients(sequence.gaps, tau)[sequence.gap]
     scale = sd * np.sqrt(1 - a**2)
     z = np.empty_like(rows)
@@ -81,11 +110,20 @@ def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float)
 def sandwich(
     jacobian: FloatArray, slope: FloatArray, white: FloatArray, all_sequences: list[Sequence], noise: Noise
 ) -> FloatArray:
-    """The middle (N, N) of the sandwich covariance H^-1 M H^-1 of plain least squares under coloured noise.
+    """The middle of the sandwich covariance H^-1 M H^-1 of plain least squares under coloured noise.
 
-    jacobian (W, L, C, N + D); slope (W, D, N): how the starts answer to theta; white (C,): the sds by which least squares
-    weighs the channels; noise: what the residuals really look like. (Huber 1967, "The behavior of maximum likelihood
-    estimates under nonstandard conditions", Berkeley Symposium 5.)"""
+    Huber 1967, "The behavior of maximum likelihood estimates under nonstandard conditions", Berkeley Symposium 5.
+
+    Args:
+        jacobian: (W, L, C, N + D).
+        slope: (W, D, N), how the starts answer to theta.
+        white: (C,), the sds by which least squares weighs the channels.
+        all_sequences: the samples of each channel in order.
+        noise: what the residuals really look like.
+
+    Returns:
+        M (N, N).
+    """
     n = slope.shape[2]
     projected = jacobian[..., :n] - np.einsum("wlcd,wdn->wlcn", jacobian[..., n:], slope)
     flat = projected.reshape(-1, projected.shape[2], n)

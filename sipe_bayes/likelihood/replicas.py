@@ -1,9 +1,9 @@
-"""Replicas of recorded trajectories: the same experiment simulated at a known theta, with the noise that the recording has.
+"""Replicas of recorded trajectories: the same experiment simulated at a known theta, with the recording's noise.
 
-Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white or
-first-order autoregressive in each channel, and where the recording has process noise, each state after a control step is moved by some. The
-commands are replayed open loop: where a feedback law kept the machine on its
-course, a replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta only.
+Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white
+or first-order autoregressive in each channel, and where the recording has process noise, each state after a control
+step is moved by some. The commands are replayed open loop: where a feedback law kept the machine on its course, a
+replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 import scipy.signal
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_level import noise_level
@@ -26,16 +26,19 @@ from sipe_bayes.likelihood.windows import estimate_states, first_states, moved
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
-
 _BEGINNING, _LEAST_STEPS = 0.2, 4  # s and steps of a log on which the estimate of its start depends, and more
 
 
 def observation_noise(
     diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments | StateSpace
 ) -> Noise:
-    """Noise of all O channels: what an estimator's ``diagnostics`` say of the channels that it fitted, ``noise_level`` of the
-    others, as white."""
+    """Noise of all O channels.
+
+    Args:
+        diagnostics: of an estimator, which say it of the channels that it fitted.
+        trajectories: the logs, whose ``noise_level`` the others have, as white.
+        likelihood: which channels were fitted.
+    """
     sd = noise_level(trajectories, likelihood)
     tau = np.zeros(len(sd))
     fitted = list(range(len(sd)))
@@ -47,8 +50,15 @@ def observation_noise(
 
 
 class Replicas:
-    """Makes replicas of ``trajectories`` with a given ``noise`` (O channels), and process noise of sd ``process`` (D,), default none, in the
-    tangent coordinates of ``StateSpace``, whose outliers are not repeated."""
+    """Makes replicas of recorded trajectories.
+
+    Args:
+        simulator: of the machine.
+        trajectories: the recording.
+        noise: of all O channels.
+        process: (D,), sd of the process noise in the tangent coordinates of ``StateSpace``, default none; outliers are
+            not repeated.
+    """
 
     def __init__(
         self,
@@ -62,25 +72,40 @@ class Replicas:
         self.starts = _starts(simulator, trajectories)
 
     def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
-        """One replica of every trajectory at theta (N,), with states where the recording has them; None where one diverges."""
+        """One replica of every trajectory, with states where the recording has them.
+
+        Args:
+            theta: (N,).
+            rng: draws the noise.
+
+        Returns:
+            The replicas, None where one diverges.
+        """
         return self.many(theta[None], rng)[0]
 
     def many(self, theta: FloatArray, rng: np.random.Generator, estimated: bool = False) -> list[Trajectories | None]:
-        """What ``make`` gives for each theta (B, N), simulated in one batch.
+        """What ``make`` gives for several theta, simulated in one batch.
 
-        estimated: a replica starts where the recording's own start would lie if the replica's noise were what its estimate is off
-        by, so that a recording is as far from its replicas as they are from one another."""
+        Args:
+            theta: (B, N).
+            rng: draws the noise.
+            estimated: a replica starts where the recording's own start would lie if the replica's noise were what its
+                estimate is off by, so that a recording is as far from its replicas as they are from one another.
+
+        Returns:
+            B times the replicas, None where one diverges.
+        """
         noises = [self._noise(rng) for _ in theta]
         starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
         motion, count = self.simulator.replay(theta, self.trajectories, starts), len(self.trajectories)
         if self.process is not None:
             motion = self._shaken(motion, theta, rng)
-        found = []
+        replicas = []
         for b, noise in enumerate(noises):
             rows = slice(b * count, (b + 1) * count)
             states = None if motion.states is None else motion.states[rows]
-            found.append(self._measured(motion.observations[rows] + noise, motion.valid[rows], states))
-        return found
+            replicas.append(self._measured(motion.observations[rows] + noise, motion.valid[rows], states))
+        return replicas
 
     def _shaken(self, motion: Trajectories, theta: FloatArray, rng: np.random.Generator) -> Trajectories:
         """The replayed ``motion`` again, control step by control step, with process noise after each."""
@@ -90,19 +115,19 @@ class Replicas:
         assert motion.states is not None
         environment, batch = simulator.environment, len(theta)
         late = np.array([environment.derived_late and c is None for c in environment.state_columns(simulator.model)])
-        lanes, dt = np.repeat(theta, len(log), axis=0), np.tile(log.dt, batch)
+        thetas, dt = np.repeat(theta, len(log), axis=0), np.tile(log.dt, batch)
         names, goals = list(log.names or [None] * len(log)) * batch, environment.recorded_goals(log.observations[:, 0])
         goals = None if goals is None else np.tile(goals, (batch, 1))
         seen, states, valid = motion.observations.copy(), motion.states.copy(), motion.valid.copy()
         steps = states.shape[1] - 1
         for k in range(steps + 1):
             actions = np.tile(log.actions[:, min(k, steps - 1)], (batch, 1))[:, None]
-            step = simulator.rollout(lanes, actions, states[:, k], dt, names, goals=goals)
+            step = simulator.rollout(thetas, actions, states[:, k], dt, names, goals=goals)
             assert step.states is not None
             seen[:, k, ~late] = step.observations[:, 0, ~late]
             valid[:, k] &= step.valid[:, 0]
             if k < steps:
-                white = rng.standard_normal((len(lanes), len(self.process)))
+                white = rng.standard_normal((len(thetas), len(self.process)))
                 ends = np.where(step.valid[:, 1, None], step.states[:, 1], states[:, 0])
                 states[:, k + 1] = moved(simulator.model, ends, self.process * white)
                 seen[:, k + 1, late] = step.observations[:, 1, late]
@@ -110,9 +135,7 @@ class Replicas:
         inside = np.arange(steps + 1) <= motion.length[:, None]
         return replace(motion, observations=np.where(inside[..., None], seen, np.nan), states=states, valid=valid)
 
-    def _measured(
-        self, observations: FloatArray, valid: NDArray[np.bool_], states: FloatArray | None
-    ) -> Trajectories | None:
+    def _measured(self, observations: FloatArray, valid: BoolArray, states: FloatArray | None) -> Trajectories | None:
         """Observations (R, T+1, O) where the recording has samples; None where one is not valid."""
         log = self.trajectories
         inside = np.arange(valid.shape[1]) <= log.length[:, None]
@@ -149,12 +172,12 @@ class Replicas:
     def _beginnings(self) -> list[tuple[Trajectory, FloatArray]]:
         """The first moments of every recording, and the start that they tell."""
         assert isinstance(self.simulator, Simulator)
-        found = []
+        beginnings = []
         for recorded in self.trajectories:
             steps = min(len(recorded), max(_LEAST_STEPS, math.ceil(_BEGINNING / recorded.dt)))
             begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
-            found.append((begin, estimate_states(self.simulator, begin)[0]))
-        return found
+            beginnings.append((begin, estimate_states(self.simulator, begin)[0]))
+        return beginnings
 
     def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
         """Noise (count, O) of samples dt seconds apart."""
@@ -169,7 +192,7 @@ class Replicas:
 
 
 def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
-    """Starting states (R, S); where they are not recorded, a delayed actuator's commands before the log are its first ones."""
+    """Starting states (R, S); not recorded ones with a delayed actuator commanded as at first before the log."""
     starts = first_states(simulator, trajectories)
     if isinstance(simulator, CallableSimulator) or trajectories.states is not None:
         return starts

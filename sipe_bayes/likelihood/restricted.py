@@ -27,9 +27,13 @@ _SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part
 class Pulls:
     """What besides the data pulls at the linearisation point.
 
-    prior (N, N) and prior_pull (N,): precision of theta's prior and its negative gradient; start_precision (D,) and
-    start_pull (W, D) likewise; free (N,): parameters that may move. One held at a bound against its pull is no
-    unknown of the linear model: with it the residuals would be credited with an optimum that is not allowed.
+    Args:
+        prior: (N, N), precision of theta's prior.
+        prior_pull: (N,), its negative gradient.
+        start_precision: (D,), of the starts' prior.
+        start_pull: (W, D), its negative gradient.
+        free: (N,), parameters that may move. One held at a bound against its pull is no unknown of the linear model:
+            with it the residuals would be credited with an optimum that is not allowed.
     """
 
     prior: FloatArray
@@ -122,10 +126,19 @@ def _restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Fl
 
 
 def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray]:
-    """Restricted log-likelihood and its derivatives (C,) by log sd and by log tau.
+    """Restricted log-likelihood and its derivatives.
 
     With A the precision of all unknowns u = (theta, starts), v_w = (u_w, -1) and dM_w the change of the products of
-    window w, -2 dl = d log|V| + sum_w <A^-1 of that window + v_w v_w', dM_w>."""
+    window w, -2 dl = d log|V| + sum_w <A^-1 of that window + v_w v_w', dM_w>.
+
+    Args:
+        moments: of the linearisation.
+        noise: where it is evaluated.
+        pulls: what holds theta and the starts besides the data.
+
+    Returns:
+        The value up to a constant, and its derivatives (C,) by log sd and by log tau.
+    """
     value, move, covariance, solved = _restricted(moments, noise, pulls)
     n, d, windows = moments.num_theta, moments.num_start, moments.windows
     size = n + 2 * d
@@ -158,11 +171,18 @@ def estimate_noise(
     shortest: float,
     longest: float,
 ) -> Noise:
-    """Noise that maximises the restricted likelihood, started from ``noise``.
+    """Noise that maximises the restricted likelihood.
 
-    fixed_sd (C,): given sds, NaN where to be estimated. coloured: whether tau is estimated, from a tenth of
-    ``shortest`` to ``longest`` seconds. (log innovation sd, log tau) of all channels are searched, whose information
-    is all but diagonal.
+    (log innovation sd, log tau) of all channels are searched, whose information is all but diagonal.
+
+    Args:
+        moments: of the linearisation.
+        noise: where to begin.
+        pulls: what holds theta and the starts besides the data.
+        fixed_sd: (C,), given sds, NaN where to be estimated.
+        coloured: whether tau is estimated.
+        shortest: seconds, of which tau is a tenth at least.
+        longest: seconds, which tau is at most.
     """
     channels, estimated = len(noise.sd), np.isnan(fixed_sd)
 
@@ -172,15 +192,15 @@ def estimate_noise(
         return Noise(np.where(estimated, np.exp(x[:channels]) / np.sqrt(innovation), fixed_sd), tau)
 
     def loss(x: FloatArray) -> tuple[float, FloatArray]:
-        here = unpack(x)
+        tried = unpack(x)
         try:
-            value, by_sd, by_tau = restricted_slopes(moments, here, pulls)
+            value, by_sd, by_tau = restricted_slopes(moments, tried, pulls)
         except np.linalg.LinAlgError:
             return 1e12, np.zeros_like(x)
         by_sd = np.where(estimated, by_sd, 0.0)
         slope = by_sd
         if coloured:
-            ratio = shortest / here.tau
+            ratio = shortest / tried.tau
             a = np.exp(-ratio)
             slope = np.concatenate([by_sd, by_tau + by_sd * a**2 * ratio / (1 - a**2)])
         return (-value, -slope) if np.isfinite(value) and np.isfinite(slope).all() else (1e12, np.zeros_like(x))

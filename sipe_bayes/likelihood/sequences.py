@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
 _LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
 
@@ -24,16 +22,25 @@ class Sequence:
     index: IntArray
     previous: IntArray
     window: IntArray
-    crosses: NDArray[np.bool_]
+    crosses: BoolArray
     gap: IntArray
     gaps: FloatArray
 
 
-def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
-    """One Sequence per channel. observed (W, L, C): samples that count; sample (W, L): their number within the log;
-    log (W,): the log of each window; dt (W,): seconds per sample."""
+def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
+    """Put the observed samples of each channel in order.
+
+    Args:
+        observed: (W, L, C), samples that count.
+        sample: (W, L), their number within the log.
+        log: (W,), of each window.
+        dt: (W,), seconds per sample.
+
+    Returns:
+        One Sequence per channel.
+    """
     _, length, channels = observed.shape
-    found = []
+    ordered = []
     for c in range(channels):
         index = np.flatnonzero(observed[:, :, c].ravel())
         window, number = index // length, sample.ravel()[index]
@@ -45,5 +52,5 @@ def sequences(observed: NDArray[np.bool_], sample: IntArray, log: IntArray, dt: 
         seconds = np.where(linked, steps * dt[window], np.inf)
         gaps, gap = np.unique(np.asarray(np.round(seconds, 12), np.float64), return_inverse=True)
         crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
-        found.append(Sequence(index, previous, window, crosses, gap, gaps))
-    return found
+        ordered.append(Sequence(index, previous, window, crosses, gap, gaps))
+    return ordered

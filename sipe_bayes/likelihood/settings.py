@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,9 +18,19 @@ class BudgetTooSmall(ValueError):
     """A budget that ran out before there was anything to estimate from."""
 
 
-def checked(fit: Any, noise_sd: Any, zero: bool = True) -> None:
-    """Raises ValueError for settings of a likelihood that are no names of channels, or no sds. zero: whether an sd may be."""
-    if fit is not None and (isinstance(fit, str) or not len(fit) or not all(isinstance(n, str) for n in fit)):
+def checked(fit: object, noise_sd: object, zero: bool = True) -> None:
+    """Check what the likelihoods have in common.
+
+    Args:
+        fit: names of channels.
+        noise_sd: sds.
+        zero: whether one may be zero.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    named = isinstance(fit, tuple | list | np.ndarray) and len(fit) and all(isinstance(n, str) for n in fit)
+    if fit is not None and not named:
         raise ValueError(f"fit: expected names of channels, such as ('angle',), got {fit!r}; None for all")
     if noise_sd is None:
         return
@@ -40,11 +50,14 @@ def checked(fit: Any, noise_sd: Any, zero: bool = True) -> None:
 class Segments:
     """Multiple shooting with white or autoregressive noise.
 
-    window: seconds, or None for each log as one window; ``windows`` overrides it for logs by name. noise: "ar1", "white", or "sandwich"
-    (the optimum of white noise with the width of "ar1"; ``laplace`` only). fit: names of the channels whose
-    residuals count, default all. noise_sd: given sd per channel in its unit, None where estimated. starts: "estimated" with
-    theta, or "recorded": the trajectories' states are exact (they come from a simulator) and each window predicts the
-    samples after its start; ``window`` = dt then compares single control steps.
+    Args:
+        window: seconds, or None for each log as one window; dt with recorded starts compares single control steps.
+        noise: "ar1", "white", or "sandwich" (the optimum of white noise with the width of "ar1"; ``laplace`` only).
+        fit: names of the channels whose residuals count, default all.
+        noise_sd: given sd per channel in its unit, None where estimated.
+        windows: seconds of some logs by name, in place of ``window``.
+        starts: "estimated" with theta, or "recorded": the trajectories' states are exact (they come from a simulator)
+            and each window predicts the samples after its start.
     """
 
     window: float | None = 0.5
@@ -68,9 +81,11 @@ class Segments:
 class StateSpace:
     """States unknown at every sample; measurement and process noise inferred. For ``laplace`` and ``mcmc``.
 
-    fit: names of the channels that count, default all. noise_sd: given sd per channel in its unit, None where it is
-    inferred. starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known. All other recorded states are
-    left aside.
+    Args:
+        fit: names of the channels that count, default all.
+        noise_sd: given sd per channel in its unit, None where it is inferred.
+        starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known. All other
+            recorded states are left aside.
     """
 
     fit: tuple[str, ...] | None = None

@@ -150,7 +150,7 @@ def eliminate_states(linear: ChainLinearisation, noise: ChainNoise, damping: flo
 
 
 def log_likelihood(linear: ChainLinearisation, noise: ChainNoise, solved: Eliminated) -> float:
-    """log p(y | theta), the states integrated out; exact where measurement and transition are linear in them."""
+    """Log-likelihood of theta, the states integrated out; exact where measurement and transition are linear in them."""
     first = linear.precision > 0
     scales = (linear.observed * np.log(noise.sd)).sum() + 0.5 * (
         linear.linked[:, None] * np.log(linear.jump_variance(noise))

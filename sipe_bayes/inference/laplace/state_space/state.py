@@ -67,7 +67,7 @@ class Position:
 
     @property
     def point(self) -> ChainPoint:
-        """theta and states."""
+        """Its theta and states."""
         return ChainPoint(self.theta, self.states)
 
 
@@ -219,7 +219,7 @@ def screened(problem: SearchProblem, chain: Chain) -> FloatArray:
 def evidence(
     problem: SearchProblem, here: Position, linear: ChainLinearisation, noise: ChainNoise, settled: bool
 ) -> float:
-    """log p(noise | y), states and theta integrated out, up to a constant.
+    """Evidence log p(noise | y), states and theta integrated out, up to a constant.
 
     Args:
         problem: with the prior.

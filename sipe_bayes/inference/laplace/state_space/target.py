@@ -87,7 +87,7 @@ class ChainTarget:
         return out
 
     def _marginal(self, compared: list[ChainLinearisation]) -> FloatArray:
-        """log p(y | theta) of comparisons that share the optimum's Jacobians."""
+        """Values log p(y | theta) of comparisons that share the optimum's Jacobians."""
         forces = np.stack([pull(one, self.noise).ravel() for one in compared], axis=1)
         gains = (forces * self.solved.solve(forces)).sum(0)
         solved = [replace(self.solved, explained=float(g)) for g in gains]
