@@ -32,8 +32,7 @@ FLAGS: Mapping[Code, str] = {
 }
 """Findings about single parameters, and the flag that result.json has for them."""
 NUISANCE = "nuisance"
-_LEFT_OUT = (
-    Code.RESIDUALS_LEFT_OUT,
+_PROCESS_NOISE = (
     Code.PROCESS_NOISE,
     Code.PROCESS_OUTLIERS,
     Code.PROCESS_NOISE_SMALL,
@@ -140,7 +139,9 @@ class Calibration:
     @property
     def left_out(self) -> list[str]:
         """Sentences about parts of the report that do not apply, and what there is in their place."""
-        return [item.text for item in Findings(self.findings).of(*_LEFT_OUT)]
+        findings = Findings(self.findings)
+        noise = " ".join(item.text for item in findings.of(*_PROCESS_NOISE))
+        return [item.text for item in findings.of(Code.RESIDUALS_LEFT_OUT)] + [noise] * bool(noise)
 
     def flags(self, name: str) -> tuple[str, ...]:
         """What was noticed about one parameter, in single words.
