@@ -358,7 +358,7 @@ TEXTS: dict[Code, Text] = {
         "the log is unlike every simulation: widen the bounds, or correct the model, before you trust the result",
     ),
     Code.TRAINED_ANEW: Text(
-        _NOTE, "the log's {differs} differ from what was learned before: simulated and trained anew"
+        _NOTE, "the log's {differs} differ from those that were learned for: simulated and trained anew"
     ),
     Code.ROUNDED_OUTPUTS: Text(
         _CAUTION, "x{outputs} vary by {sd:.0e} only, as rounding does; give fn's outputs in smaller units"

@@ -29,6 +29,7 @@ class Experiment:
         length: (R,) control steps.
         dt: (R,) seconds of one.
         starts: starting states (R, S) where they were recorded, else (0, 0).
+        first: (R, O), the log's first samples.
         lowest, highest: (R, O), the range of the simulations' first samples.
         goals: (R, G) of a task with goals, else (0, 0).
         names: of the logs where a parameter belongs to one of them, else none.
@@ -40,6 +41,7 @@ class Experiment:
     length: IntArray
     dt: FloatArray
     starts: FloatArray
+    first: FloatArray
     lowest: FloatArray
     highest: FloatArray
     goals: FloatArray
@@ -69,6 +71,7 @@ class Experiment:
             np.asarray(trajectories.length, np.int64),
             np.asarray(trajectories.dt, float),
             none if states is None else np.asarray(states[:, 0], float),
+            np.asarray(trajectories.observations[:, 0], float),
             np.asarray(first.min(0), float),
             np.asarray(first.max(0), float),
             _goals(simulator, trajectories),
@@ -78,20 +81,15 @@ class Experiment:
         )
 
     def other(self, trajectories: Trajectories, noise: FloatArray) -> str | None:
-        """What makes trajectories those of another experiment; None where nothing does.
+        """What makes a log that of another experiment than the simulations; None where nothing does.
 
-        Actions, lengths and seconds have to be equal. So have starting states where both are recorded; else the first
-        samples must lie within the simulated ones' range, give or take three sds of the ``noise`` (O,): velocities do
-        not show in them.
+        Actions, lengths and seconds have to be equal. So have starting states where both are recorded; else the log's
+        first samples must lie within the simulated ones' range, give or take three sds of the ``noise`` (O,):
+        velocities do not show in them.
         """
-        if not np.array_equal(self.length, trajectories.length):
-            return "number or lengths"
-        same_dt = np.allclose(self.dt, trajectories.dt, rtol=1e-9, atol=0)
-        if not (same_dt and np.allclose(self.actions, trajectories.actions, rtol=1e-9)):
-            return "actions"
-        if len(self.starts) and trajectories.states is not None:  # noise may have been added to what was observed
-            same = np.allclose(self.starts[:, 1:], trajectories.states[:, 0, 1:], rtol=1e-6, atol=1e-6)
-            return None if same else "starting states"
+        commands = self._other_commands(trajectories)
+        if commands is not None or (len(self.starts) and trajectories.states is not None):
+            return commands or self._other_states(trajectories)
         first, size = trajectories.observations[:, 0], np.maximum(np.abs(self.lowest), np.abs(self.highest))
         slack = THRESHOLDS.first_sample_sds * noise + _ROUNDING * (1 + size)
         return "starting states" if ((first < self.lowest - slack) | (first > self.highest + slack)).any() else None
@@ -99,23 +97,44 @@ class Experiment:
     def other_form(
         self, simulator: Simulator | CallableSimulator, trajectories: Trajectories, noise: FloatArray
     ) -> str | None:
-        """Why a training on this experiment is not one for these trajectories; None where it is.
+        """What makes a log one of another form than that which the training was for; None where nothing does.
 
-        They have the same form where ``other`` finds nothing, and goals, missing samples and, where a parameter
-        belongs to one of the logs, names are the same, and no channel's ``noise`` (O,) is more than twice the other's.
+        As ``other``, but first samples must be those of that log, give or take twice three sds of the noise. Goals and
+        missing samples have to be the same, names where a parameter belongs to one of the logs, and no channel's
+        ``noise`` (O,) may be more than twice the other's.
         """
-        other = self.other(trajectories, noise)
-        if other is not None:
-            return other
-        goals = _goals(simulator, trajectories)
-        if goals.shape != self.goals.shape or not np.allclose(goals, self.goals, equal_nan=True):
-            return "goals"
-        if _names(simulator, trajectories) != self.names:
-            return "names"
-        if not np.array_equal(measured(trajectories), self.measured):
-            return "missing samples"
-        ratio = THRESHOLDS.noise_ratio
-        return "noise" if ((noise > ratio * self.noise) | (self.noise > ratio * noise)).any() else None
+        commands = self._other_commands(trajectories)
+        if commands is not None:
+            return commands
+        if len(self.starts) and trajectories.states is not None:
+            starts = self._other_states(trajectories)
+        else:
+            slack = 2 * THRESHOLDS.first_sample_sds * np.maximum(noise, self.noise) + _ROUNDING * (
+                1 + np.abs(self.first)
+            )
+            far = np.abs(trajectories.observations[:, 0] - self.first) > slack
+            starts = "starting states" if far.any() else None
+        goals, ratio = _goals(simulator, trajectories), THRESHOLDS.noise_ratio
+        same_goals = goals.shape == self.goals.shape and np.allclose(goals, self.goals, equal_nan=True)
+        differs = {
+            "goals": not same_goals,
+            "names": _names(simulator, trajectories) != self.names,
+            "missing samples": not np.array_equal(measured(trajectories), self.measured),
+            "noise levels": bool(((noise > ratio * self.noise) | (self.noise > ratio * noise)).any()),
+        }
+        return starts or next((what for what, other in differs.items() if other), None)
+
+    def _other_commands(self, trajectories: Trajectories) -> str | None:
+        if not np.array_equal(self.length, trajectories.length):
+            return "number or lengths"
+        same_dt = np.allclose(self.dt, trajectories.dt, rtol=1e-9, atol=0)
+        return None if same_dt and np.allclose(self.actions, trajectories.actions, rtol=1e-9) else "actions"
+
+    def _other_states(self, trajectories: Trajectories) -> str | None:
+        """Of logs that both hold states: noise may have been added to what was observed."""
+        assert trajectories.states is not None
+        same = np.allclose(self.starts[:, 1:], trajectories.states[:, 0, 1:], rtol=1e-6, atol=1e-6)
+        return None if same else "starting states"
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ trains, and ``rollouts`` is 0. Of the same form are trajectories with
 
 - the same number, lengths, channels and seconds of a control step,
 - the same commands, to nine digits,
-- the same starting states, to six digits, where both logs hold states; else first samples within the range of the
-  simulations' own, give or take three sds of the noise (velocities do not show in them),
+- the same starting states, to six digits, where both logs hold states; else first samples that differ by no more than
+  six sds of the noise (velocities do not show in them),
 - the same goals, for a task that has goals; the same names, where a parameter belongs to one log alone,
 - the same samples missing,
 - a noise level, of each channel, at most twice or half as high: stated by ``likelihood.noise_sd``, else zero where
-  states are recorded, else as estimated from the log.
+  states are recorded, else as estimated from the log. Estimates of coarsely sampled logs differ by more: state it.
 
 So of logs that share commands and starts only observations differ. With trajectories of another form, or where a
 setting of the estimator was changed, ``fit`` simulates and trains anew and notes why; ``fit(..., retrain=True)`` does

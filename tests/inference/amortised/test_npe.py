@@ -1,5 +1,8 @@
-"""Neural posterior estimation and its flow, against exact posteriors. Networks are small, so tolerances are those of
-networks of 1,500 simulations: half an sd; a wrong posterior is off by far more."""
+"""Neural posterior estimation and its flow, against exact posteriors.
+
+Networks are small, so tolerances are those of networks of 1,500 simulations: half an sd; a wrong posterior is off by far
+more.
+"""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from tests.problems.linear_map import MATRIX, SPACE, TRUTH
 
 
 def fitted(unit: np.ndarray | float = 1.0, **settings: float) -> tuple[Regression, np.ndarray]:
-    """x = unit M theta: the estimator and its estimate, in physical units."""
+    """Of x = unit M theta the estimator and its estimate, in physical units."""
     simulator = sipe.CallableSimulator(lambda v: unit * (v @ MATRIX.T), SPACE, name="linear")
     method = Regression(simulator, budget=300, **settings)
     return method, SPACE.values(method.fit(unit * (MATRIX @ TRUTH)).mean.numpy())

@@ -192,8 +192,11 @@ def test_bayessim_narrows_around_the_truth(settings: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("truncated", "count"), [(1e-2, 500), (1e-4, 500), (1e-4, 5000)])
 def test_proposals_of_a_tiny_region_have_the_priors_density(truncated: float, count: int) -> None:
-    """A posterior of sd 0.002: uniform over the ellipse, whose squared radius is uniform then: its mean within 5 standard errors
-    of half the largest, of as many as are different. Weighted draws without replacement are not (measured: 0.36 and 0.26 at 1e-4)."""
+    """A posterior of sd 0.002: uniform over the ellipse, whose squared radius is uniform then.
+
+    Its mean is within 5 standard errors of half the largest, of as many as are different. Weighted draws without
+    replacement are not (measured: 0.36 and 0.26 at 1e-4).
+    """
     simulator = pendulum()
     found = GaussianMixture([0.0], [[0.5, 0.5]], [0.002**2 * np.eye(2)], simulator.space)
     estimator = get_estimator(simulator, "bayessim", rounds=2, truncated=truncated)
