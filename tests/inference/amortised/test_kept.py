@@ -94,7 +94,7 @@ def test_recorded_starting_states_are_compared_exactly() -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_second_fit_conditions(name: str) -> None:
-    """No simulations but those of maml's test time, what conditioning by hand gives, and what a fit of its own would."""
+    """No simulations but those of maml's test time, and what conditioning by hand and a fit of its own give."""
     simulator = Counting()
     estimator = made(simulator, name)
     estimator.fit(states_log(simulator, 5))
@@ -171,7 +171,8 @@ def test_coarse_logs_with_stated_noise_are_of_one_form() -> None:
     """Of a benchmark's task at 20 Hz, whose start the smoothing of noisy samples misses by many sds."""
     simulator = sipe.Simulator(sipe.make_task("Pendulum"), num_threads=1)
     whole = sipe.demonstrations(simulator, "random", variant="in_distribution", count=1, steps=30)
-    motion = simulator.replay(np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.5]])[:, : len(simulator.space)], whole)
+    theta = np.random.default_rng(1).random((3, len(simulator.space)))
+    motion = simulator.replay(theta, whole)
     sd, rng = 0.01 * whole.observations[0].std(0), np.random.default_rng(0)
     noisy = motion.observations + sd * rng.standard_normal(motion.observations.shape)
     logs = replace(motion, observations=noisy, states=None, rewards=None)

@@ -1,7 +1,7 @@
 """Neural posterior estimation and its flow, against exact posteriors.
 
-Networks are small, so tolerances are those of networks of 1,500 simulations: half an sd; a wrong posterior is off by far
-more.
+Networks are small, so tolerances are those of networks of 1,500 simulations: half an sd; a wrong posterior is off by
+far more.
 """
 
 from __future__ import annotations
