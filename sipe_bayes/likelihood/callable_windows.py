@@ -9,7 +9,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import sequences
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows, fitted_channels
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
@@ -44,25 +44,21 @@ class CallableWindows(Windows):
 
     @property
     def starts_measured(self) -> bool:
-        """There is nothing to measure."""
+        """There are none."""
         return True
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
-        """Zero (N,): a function takes any difference."""
+        """Zero (N,): fn is smooth as far as is known."""
         return np.zeros(self.num_theta)
 
     def states(self, starts: FloatArray) -> FloatArray:
-        """The starts (..., 0) themselves."""
+        """The starts (..., W, 0) themselves."""
         return starts
 
     def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Predictions (B, W, 2, C) of theta (B, N), and which are finite (B,); raises BudgetExhausted."""
+        """As of ``Windows``: what ``fn`` gives as the second sample."""
         batch, count = len(theta), len(self.trajectories)
-        if self.rollouts + batch * count > self.budget:
-            raise BudgetExhausted(
-                f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {batch * count}"
-            )
-        self.rollouts += batch * count
+        self.spend(batch)
         made = self.simulator.replay(theta, self.trajectories).observations
         predicted = made.reshape(batch, count, 2, -1)[..., self.channels]
         return predicted, np.asarray(np.isfinite(predicted).all(axis=(1, 2, 3)))

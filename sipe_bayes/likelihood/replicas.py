@@ -22,7 +22,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.windows import estimate_states, first_states, moved
+from sipe_bayes.likelihood.starts import estimate_states, first_states, moved
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 

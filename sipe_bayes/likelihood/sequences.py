@@ -15,8 +15,13 @@ _LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
 class Sequence:
     """The observed samples of one channel in order of time: rows of the flattened (W * L) samples.
 
-    index (n,), previous (n,; -1 begins a sequence), window (n,), gap (n,) an index into ``gaps`` seconds
-    (ascending; inf where a sequence begins).
+    Args:
+        index: (n,), the rows.
+        previous: (n,), the row before; -1 begins a sequence.
+        window: (n,), to which a row belongs.
+        crosses: (n,), whether the row before belongs to another window.
+        gap: (n,), since the row before, as an index into ``gaps``.
+        gaps: seconds, ascending; infinite where a sequence begins.
     """
 
     index: IntArray
@@ -28,19 +33,19 @@ class Sequence:
 
 
 def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
-    """Put the observed samples of each channel in order.
+    """The observed samples of each channel in order of time.
 
     Args:
         observed: (W, L, C), samples that count.
         sample: (W, L), their number within the log.
-        log: (W,), of each window.
+        log: (W,), the log of each window.
         dt: (W,), seconds per sample.
 
     Returns:
-        One Sequence per channel.
+        One Sequence for each of the C channels.
     """
     _, length, channels = observed.shape
-    ordered = []
+    by_channel = []
     for c in range(channels):
         index = np.flatnonzero(observed[:, :, c].ravel())
         window, number = index // length, sample.ravel()[index]
@@ -52,5 +57,5 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
         seconds = np.where(linked, steps * dt[window], np.inf)
         gaps, gap = np.unique(np.asarray(np.round(seconds, 12), np.float64), return_inverse=True)
         crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
-        ordered.append(Sequence(index, previous, window, crosses, gap, gaps))
-    return ordered
+        by_channel.append(Sequence(index, previous, window, crosses, gap, gaps))
+    return by_channel

@@ -17,78 +17,33 @@ import math
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
-import mujoco
 import numpy as np
-import scipy.signal
-from numpy.typing import NDArray
 
-from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
-
-FloatArray = NDArray[np.float64]
 
 _THETA_STEP = (1e-5, 1e-3)  # finite differences, of the unit cube: least, and for windows of one control step
 _START_STEP = 1e-5  # rad or m, rad/s or m/s
 START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
 _ROUNDING = 1e-7  # of a channel's size: what the tolerance of MuJoCo's contact solver leaves, in its rare worst steps
-_SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
-
-
-def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
-    """A first guess of the states (T+1, S) along a log: recorded ones, else measured ones.
-
-    Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
-    the slopes of the positions; what no channel measures stays at the model's reset state. The search starts here,
-    and so do the windows of held-out logs."""
-    if trajectory.states is not None:
-        return trajectory.states
-    model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
-    columns = simulator.environment.state_columns(model)
-    measured: dict[int, FloatArray] = {}
-    for channel, column in enumerate(columns):
-        series = trajectory.observations[:, channel]
-        there = np.flatnonzero(np.isfinite(series))
-        if column is not None and len(there):
-            measured[column] = np.interp(np.arange(len(series)), there, series[there])
-    for joint in range(model.njnt):
-        if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            position, velocity = (
-                1 + int(model.jnt_qposadr[joint]),
-                1 + model.nq + int(model.jnt_dofadr[joint]),
-            )
-            if position in measured and velocity not in measured:
-                states[:, velocity] = smoothed(measured[position], trajectory.dt, 1)
-    if measured:
-        states[:, list(measured)] = smoothed(np.stack(list(measured.values()), axis=1), trajectory.dt)
-    return states
-
-
-def first_states(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
-    """Starting states (R, S) of R recorded trajectories: recorded, else estimated from the measurements."""
-    if isinstance(simulator, CallableSimulator):
-        return np.empty((len(trajectories), 0))
-    return np.stack([estimate_states(simulator, t)[0] for t in trajectories])
-
-
-def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
-    """Local quadratics over ``_SMOOTHING`` seconds, at least 5 samples, along the first axis."""
-    span = min(max(5, 2 * round(_SMOOTHING / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
-    if span < 3:
-        return np.gradient(series, dt, axis=0) if derivative else series
-    return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
 
 
 def chosen_channels(
     simulator: Simulator | CallableSimulator, trajectories: Trajectories, fit: tuple[str, ...] | None
 ) -> list[int]:
-    """Which channels ``fit`` names, default all; raises ValueError for unknown ones and for trajectories of other sizes."""
+    """Which channels ``fit`` names, default all.
+
+    Raises:
+        ValueError: for unknown ones and for trajectories of other sizes.
+    """
     environment = simulator.environment
     if trajectories.observations.shape[2] != len(environment.channels):
         raise ValueError(
@@ -111,36 +66,6 @@ def fitted_channels(names: SequenceOf[str], fit: tuple[str, ...] | None) -> list
     return [list(names).index(n) for n in fit]
 
 
-def moved(model: Any, states: FloatArray, tangent: FloatArray) -> FloatArray:
-    """States (..., S) moved by tangents (..., 2 nv + na); either may have fewer leading dimensions."""
-    shape = np.broadcast_shapes(states.shape[:-1], tangent.shape[:-1])
-    out = np.broadcast_to(states, (*shape, states.shape[-1])).copy()
-    tangent = np.broadcast_to(tangent, (*shape, tangent.shape[-1]))
-    nq, nv = model.nq, model.nv
-    if nq == nv:
-        out[..., 1 : 1 + nq] += tangent[..., :nv]
-    else:
-        flat, turns = out.reshape(-1, out.shape[-1]), tangent.reshape(-1, tangent.shape[-1])
-        for state, turn in zip(flat, turns, strict=True):
-            position = state[1 : 1 + nq].copy()
-            mujoco.mj_integratePos(model, position, np.ascontiguousarray(turn[:nv]), 1.0)
-            state[1 : 1 + nq] = position
-    out[..., 1 + nq : 1 + nq + nv + model.na] += tangent[..., nv:]
-    return out
-
-
-def past_commands(
-    simulator: Simulator, trajectories: Trajectories, log: NDArray[np.int64], start: NDArray[np.int64], dt: FloatArray
-) -> list[FloatArray]:
-    """The commands before each (log, start sample), one row a physics step; before the log its first command."""
-    past = []
-    for k, first, seconds in zip(log, start, dt, strict=True):
-        skip = simulator.physics_steps(float(seconds))[0]
-        rows = trajectories.actions[k, max(0, first - 2000) : first]
-        past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
-    return past
-
-
 @dataclass(frozen=True)
 class Linearisation:
     """residual (W, L, C) = measured - predicted; jacobian (W, L, C, N + D) of the prediction; valid: all simulated."""
@@ -151,7 +76,16 @@ class Linearisation:
 
 
 class Windows:
-    """Recorded trajectories cut into W windows of at most L samples and C fitted channels, with D start unknowns."""
+    """Recorded trajectories cut into W windows of at most L samples and C fitted channels, with D start unknowns.
+
+    Args:
+        settings: of the likelihood.
+        simulator: what is calibrated.
+        trajectories: the logs.
+
+    Raises:
+        ValueError: for logs that do not fit the simulator or the settings.
+    """
 
     def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
@@ -218,8 +152,10 @@ class Windows:
         return np.array([self.simulator.physics_steps(float(d))[1] for d in self.dt])
 
     def every_other(self) -> Windows:
-        """Every other window, for a rough search; the windows themselves where a log has fewer than four. Its rollouts are
-        counted by themselves, as if whole."""
+        """Every other window, for a rough search; the windows themselves where a log has fewer than four.
+
+        Its rollouts are counted by themselves, as if whole.
+        """
         if np.bincount(self.log).min() < 4:
             return self
         if self._subset is None:
@@ -268,10 +204,12 @@ class Windows:
 
     @property
     def num_windows(self) -> int:
+        """W."""
         return len(self.log)
 
     @property
     def num_theta(self) -> int:
+        """N."""
         return len(self.simulator.space)
 
     def no_starts(self) -> FloatArray:
@@ -284,28 +222,42 @@ class Windows:
             return np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
         return moved(self.simulator.model, self.reference, starts)
 
-    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Predictions (B, W, L, C) of theta (B, N) and starts (B, W, D), and which of the B stayed valid throughout.
+    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Simulate every window.
 
-        A prediction is NaN from the sample on at which its window diverged."""
+        Args:
+            theta: (B, N).
+            starts: (B, W, D).
+
+        Returns:
+            Predictions (B, W, L, C), NaN from the sample on at which a window diverged; and which of the B (B,) stayed
+            valid throughout.
+
+        Raises:
+            BudgetExhausted: instead of simulating beyond the budget.
+        """
         batch = len(theta)
-        cost = batch * len(self.trajectories)
-        if self.rollouts + cost > self.budget:
-            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost}")
-        self.rollouts += cost
-        lanes = np.repeat(theta, self.num_windows, axis=0)
+        self.spend(batch)
+        thetas = np.repeat(theta, self.num_windows, axis=0)
         states = self.states(starts).reshape(batch * self.num_windows, -1)
         actions = np.tile(self.actions, (batch, 1, 1))
         goals = None if self.goals is None else np.tile(self.goals, (batch, 1))
         dt, names = np.tile(self.dt, batch), self.names * batch
-        result = self.simulator.rollout(lanes, actions, states, dt, names, goals=goals)
+        result = self.simulator.rollout(thetas, actions, states, dt, names, goals=goals)
         shape = (batch, self.num_windows)
         good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
         predicted = np.where(good[..., None], predicted, np.nan)
         return predicted, np.asarray((good | ~self.owned).all(axis=(1, 2)))
 
-    def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def spend(self, batch: int) -> None:
+        """Count the rollouts of ``batch`` thetas; raises BudgetExhausted where there are too few left."""
+        cost = batch * len(self.trajectories)
+        if self.rollouts + cost > self.budget:
+            raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost}")
+        self.rollouts += cost
+
+    def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Measured minus predicted (B, W, L, C), zero where nothing was measured, and which of the B are valid."""
         predicted, valid = self.predict(theta, starts)
         with np.errstate(invalid="ignore"):
@@ -333,11 +285,20 @@ class Windows:
         residual: FloatArray | None = None,
         theta_step: float | FloatArray | None = None,
     ) -> Linearisation:
-        """Residual and Jacobian at theta (N,), starts (W, D): one batch of N + D + 1 simulations of the logs.
+        """Residual and Jacobian: one batch of N + D + 1 simulations of the logs.
 
-        with_theta, with_starts: whether the Jacobian holds these columns. residual (W, L, C): that of a valid simulation
-        at this very point, which spares the one. theta_step: of the finite differences, default ``self.theta_step``, or where that is too
-        short ``least_steps``."""
+        Args:
+            theta: (N,), where.
+            starts: (W, D), where.
+            with_theta: whether the Jacobian holds the columns of theta.
+            with_starts: whether it holds those of the starts.
+            residual: (W, L, C), of a valid simulation at this very point, which spares the one.
+            theta_step: of the finite differences, of the cube; default ``self.theta_step``, or where that is too short
+                ``least_steps``.
+
+        Raises:
+            BudgetExhausted: instead of simulating beyond the budget.
+        """
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
         default = np.maximum(self.theta_step, self.least_steps(theta))
         size = default if theta_step is None else np.broadcast_to(theta_step, theta.shape)
@@ -350,11 +311,12 @@ class Windows:
         if residual is None:
             predicted, valid = self.predict(thetas, all_starts)
         else:
-            there = np.where(self.observed, self.measured - residual, np.nan)
+            here = np.where(self.observed, self.measured - residual, np.nan)
             predicted, valid = self.predict(thetas[1:], all_starts[1:])
-            predicted, valid = np.concatenate([there[None], predicted]), np.append(True, valid)
+            predicted, valid = np.concatenate([here[None], predicted]), np.append(True, valid)
         wrong = [j for j in range(n) if not valid[j + 1]]
-        if wrong and valid[0]:  # a step across a physical limit: look the other way
+        # a step across a physical limit: look the other way
+        if wrong and valid[0]:
             sign[wrong] = -sign[wrong]
             again = np.tile(theta, (len(wrong), 1))
             again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
@@ -368,8 +330,12 @@ class Windows:
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
 
     def moments(self, lin: Linearisation, white: bool = False) -> Moments:
-        """Products of the linearised rows, from which every noise model's normal equations follow; ``white``: for white
-        noise alone."""
+        """Products of the linearised rows, from which every noise model's normal equations follow.
+
+        Args:
+            lin: a linearisation.
+            white: for white noise alone.
+        """
         n = lin.jacobian.shape[-1] - self.num_start
         return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
 

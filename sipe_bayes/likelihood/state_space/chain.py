@@ -34,7 +34,8 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import chosen_sd
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
-from sipe_bayes.likelihood.windows import START_SD, chosen_channels, estimate_states, moved, past_commands
+from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands
+from sipe_bayes.likelihood.windows import START_SD, chosen_channels
 from sipe_bayes.simulation.simulator import Simulator
 
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known, beyond rounding: position, velocity, activation
