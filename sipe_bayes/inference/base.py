@@ -62,13 +62,13 @@ class Estimator(ABC, Generic[S]):
         progress: called along the way.
         **options: the fields of the method's ``options_type``.
 
-    **Adding a method** takes one file and one line in ``inference.registry.ESTIMATORS``. Write a frozen dataclass of its
-    state with a field ``done``, and three functions; the base class checks, seeds, counts the budget, keeps the
+    **Adding a method** takes one file and one line in ``inference.registry.ESTIMATORS``. Write a frozen dataclass of
+    its state with a field ``done``, and three functions; the base class checks, seeds, counts the budget, keeps the
     checkpoint and resumes:
 
     - ``start(trajectories) -> State``.
-    - ``step(state, trajectories) -> State``: a new state, one affordable piece of work further; ``done=True`` ends. When
-      the budget runs out in mid-step, BudgetExhausted ends the fit with the last whole state.
+    - ``step(state, trajectories) -> State``: a new state, one affordable piece of work further; ``done=True`` ends.
+      When the budget runs out in mid-step, BudgetExhausted ends the fit with the last whole state.
     - ``posterior(state, trajectories) -> Posterior``: of any state, without simulating.
 
     Arguments of its own are the fields of a frozen dataclass of ``core.options``, set as ``options_type``. The simplest
@@ -111,7 +111,8 @@ class Estimator(ABC, Generic[S]):
             def posterior(self, state, trajectories):
                 lost = int(np.isinf(state.cost).sum())
                 if lost:
-                    self.find(Code.DIVERGED_COUNT_AS_WORST, count=lost, total=len(state.cost), failure=self.simulator.failure)
+                    failure = self.simulator.failure
+                    self.find(Code.DIVERGED_COUNT_AS_WORST, count=lost, total=len(state.cost), failure=failure)
                 return Dirac(state.theta[state.cost.argmin()], self.space)
 
     ``find`` notes a finding, whose code and text stand in ``core.finding_texts``.
@@ -143,8 +144,8 @@ class Estimator(ABC, Generic[S]):
         self.options = self.options_type.of(options, self.name)
         if not isinstance(simulator, Simulator | CallableSimulator):
             raise ValueError(
-                f"simulator: expected a Simulator or a CallableSimulator, got {simulator!r}; sipe.get_estimator takes the "
-                "name of an environment as well"
+                f"simulator: expected a Simulator or a CallableSimulator, got {simulator!r}; sipe.get_estimator takes "
+                "the name of an environment as well"
             )
         if prior is not None and not isinstance(prior, Posterior):
             raise ValueError(f"prior: expected a posterior with a density, such as load_posterior(path), got {prior!r}")
@@ -177,7 +178,8 @@ class Estimator(ABC, Generic[S]):
         self._observed: Trajectory | None = None
         if self.searches and isinstance(simulator, CallableSimulator) and simulator.noise_sd is None:
             raise ValueError(
-                f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
+                f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or "
+                "use npe"
             )
         self.prepare()
 
@@ -292,7 +294,7 @@ class Estimator(ABC, Generic[S]):
         return self._finished(self._last.state, self._given.stack(self._recorded(trajectories)))
 
     def _resumed(self, trajectories: Trajectories, fingerprint: str) -> Snapshot[S] | None:
-        """Where a fit goes on: at its checkpoint, if there is one; amortised methods also where an earlier fit ended."""
+        """Where a fit goes on: at its checkpoint; amortised methods also where an earlier fit ended."""
         if self.checkpoint is None or not self.checkpoint.exists():
             return None
         return load_state(self.checkpoint, Snapshot[self.state_type], fingerprint)  # type: ignore[name-defined]

@@ -1,14 +1,19 @@
 """Whether a posterior is the normal that Laplace's method makes of it, and what it is where it is not.
 
-``normal``: along each parameter's direction, two of its sds to either side of the optimum, the log posterior should fall by two nats.
-Where it falls by less than half or more than twice as much, draws take the normal's place: adaptive multiple importance sampling (J.-M. Cornuet, J.-M. Marin, A.
-Mira, C. Robert 2012, "Adaptive Multiple Importance Sampling", Scand. J. Stat. 39, https://arxiv.org/abs/0907.1254). The first
-batch comes in equal parts from the widened normal and from the prior; later ones from a normal with the weighted draws' moments, widened, and to a fifth from the
-prior, which keeps the weights bounded (T. Hesterberg 1995, "Weighted Average Importance Sampling and Defensive Mixture Distributions", Technometrics 37). A
-draw's weight is the posterior's density by that of all batches together. They end with enough effective draws, and become a mixture of
-kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M. West 1993, "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
+``is_normal``: along each parameter's direction, two of its sds to either side of the optimum, the log posterior should
+fall by two nats. Where it falls by less than half or more than twice as much, draws take the normal's place: adaptive
+multiple importance sampling (J.-M. Cornuet, J.-M. Marin, A. Mira, C. Robert 2012, "Adaptive Multiple Importance
+Sampling", Scand. J. Stat. 39, https://arxiv.org/abs/0907.1254).
 
-Deviation: the batches' covariance is drawn towards the first normal's by the effective draws there are, so that few do not make it singular.
+The first batch comes in equal parts from the widened normal and from the prior; later ones from a normal with the
+weighted draws' moments, widened, and to a fifth from the prior, which keeps the weights bounded (T. Hesterberg 1995,
+"Weighted Average Importance Sampling and Defensive Mixture Distributions", Technometrics 37). A draw's weight is the
+posterior's density by that of all batches together. They end with enough effective draws, and become a mixture of
+kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M. West 1993,
+"Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
+
+Deviation: the batches' covariance is drawn towards the first normal's by the effective draws there are, so that few do
+not make it singular.
 """
 
 from __future__ import annotations

@@ -1,16 +1,20 @@
-"""Markov chain Monte Carlo over theta, noise and starts integrated out: emcee on the windowed likelihood.
+"""Markov chain Monte Carlo over theta, noise and starts integrated out: emcee on the likelihood.
 
-D. Foreman-Mackey et al. 2013, "emcee: The MCMC Hammer", PASP 125 (https://arxiv.org/abs/1202.3665). Moves: an independent
-Metropolis-Hastings proposal from the widened ``laplace`` posterior (all walkers in one batch, nearly independent draws
-where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008), which finds its way where it is not.
+D. Foreman-Mackey et al. 2013, "emcee: The MCMC Hammer", PASP 125 (https://arxiv.org/abs/1202.3665). Moves: an
+independent Metropolis-Hastings proposal from the widened ``laplace`` posterior (all walkers in one batch, nearly
+independent draws where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008), which finds its way
+where it is not.
 
-The target is that of ``window_target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes first and also places the
-walkers; that saves D of D + 1 simulations. How far a fresh Jacobian would move the target is measured on some of the first walkers and reported as
-``linearisation_error`` (sd in nats; NaN where it would cost more than a tenth of the budget). With ``StateSpace`` the target is that of
-``state_space.target``, with the noise of the ``laplace`` fit.
+The target is that of ``window_target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes
+first and also places the walkers; that saves D of D + 1 simulations. How far a fresh Jacobian would move the target is
+measured on some of the first walkers and reported as ``linearisation_error`` (sd in nats; NaN where it would cost more
+than a tenth of the budget). With ``StateSpace`` the target is that of ``state_space.target``, with the noise of the
+``laplace`` fit.
 
-Deviations: R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do;
-walkers share information, so R-hat is an optimistic diagnostic.
+Deviations:
+
+- R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do; walkers share
+  information, so R-hat is an optimistic diagnostic.
 """
 
 from __future__ import annotations
@@ -220,7 +224,7 @@ class MCMC(Estimator[MCMCState]):
         return WindowFit.at(windows, optimum)
 
     def _target(self, windows: Windows | Chain, fit: WindowFit | ChainFit) -> WindowTarget | ChainTarget:
-        """log p(theta | y) of walkers, of either likelihood."""
+        """The target of either likelihood: log p(theta | y) of walkers."""
         if isinstance(windows, Chain):
             assert isinstance(fit, ChainFit)
             return ChainTarget(self.prior, windows, fit)

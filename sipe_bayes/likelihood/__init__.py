@@ -1,1 +1,1 @@
-"""log p(trajectory | theta): windows and chains of states, their noise, and the algebra that integrates starts out."""
+"""log p(trajectory | theta): windows of logs (multiple shooting), chains of states, their noise and their algebra."""

@@ -1,4 +1,4 @@
-"""What a likelihood makes of a simulator and its logs: ``Windows`` of ``Segments``, a ``Chain`` of a ``StateSpace``."""
+"""What a likelihood's settings make of a simulator and its logs: ``Windows``, or the ``Chain`` of a ``StateSpace``."""
 
 from __future__ import annotations
 

@@ -1,13 +1,10 @@
 """The cost of a theta: how far what it simulates is from what was recorded.
 
-Recorded trajectories are cut into windows (``likelihood.Segments``), each replayed from its own recorded or estimated
-starting state with the recorded actions. ``Segments(window=None)`` replays whole trajectories, as the SiPE paper does
-(Mehta, Handa, Fox, Ramos 2020, section 2.3).
-
-Deviations:
-
-- The default window is half a second: over a whole trajectory contact and chaos hide the parameters (half-cheetah, 200
-  steps: least squares is no better than the prior mean).
+Recorded trajectories are cut into windows (``likelihood.settings.Segments``), each replayed from its own recorded or
+estimated starting state with the recorded actions. ``Segments(window=None)`` replays whole trajectories, as the SiPE
+paper does (Mehta, Handa, Fox, Ramos 2020, section 2.3). The default, half a second, is a deviation from it: over a
+whole trajectory contact and chaos hide the parameters (half-cheetah, 200 steps: least squares is no better than the
+prior mean).
 """
 
 from __future__ import annotations
@@ -24,13 +21,13 @@ _ROUNDING = 1e-7  # of a function's output: outputs that differ by less are equa
 
 
 class StateDifference:
-    """Mean squared difference between simulated and recorded channels, each in units of its scale.
-
-    Deviation from the SiPE paper: it sums plain squares, so that its metres and radians per second weigh alike.
+    """Mean squared difference between simulated and recorded channels.
 
     Args:
-        windows: of the recording.
-        scale: (C,), see ``channel_scale``.
+        windows: the recorded logs.
+        scale: (C,), the channels' units, of ``channel_scale``.
+
+    Deviation from the SiPE paper: it sums plain squares, so that its metres and radians per second weigh alike.
     """
 
     def __init__(self, windows: Windows, scale: FloatArray) -> None:
@@ -48,12 +45,11 @@ class StateDifference:
 def channel_scale(windows: Windows, first: FloatArray) -> FloatArray:
     """What a channel's differences are divided by, so that nothing depends on the channels' units.
 
-    Its recorded spread; of channels that hardly move as much as a thousandth of the median channel's. One observed x of
-    a function has no spread: it is that of the first simulations there, and the channel's magnitude where they do not
-    differ.
+    Its recorded spread, of channels that hardly move a thousandth of the median channel's. One observed x of a function
+    has no spread: there it is that of the first simulations, and the channel's magnitude where they do not differ.
 
     Args:
-        windows: of the recording.
+        windows: the recorded logs.
         first: (B, W, L, C), simulations.
 
     Returns:
@@ -80,14 +76,14 @@ def _simulated_scale(windows: CallableWindows, first: FloatArray) -> FloatArray:
 
 
 def simulate(windows: Windows, theta: FloatArray) -> FloatArray:
-    """Simulate theta from the windows' own starts.
+    """Predictions from the windows' own starts.
 
     Args:
-        windows: of the recording.
+        windows: the logs.
         theta: (B, N).
 
     Returns:
-        Predictions (B, W, L, C).
+        (B, W, L, C).
 
     Raises:
         BudgetExhausted: instead of simulating beyond the budget.

@@ -1,4 +1,4 @@
-"""How uncertain an estimate of the noise is, and what that leaves uncertain in theta: noise values, the sandwich."""
+"""How uncertain an estimate of the noise is, and what that leaves uncertain in theta: weighted values, the sandwich."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from sipe_bayes.likelihood.noise import Noise, coefficients
 from sipe_bayes.likelihood.restricted import Pulls, restricted, restricted_slopes
 from sipe_bayes.likelihood.sequences import Sequence
 
+_DIFFERENCE = 1e-3  # of a logarithm, in finite differences of slopes
+_CURVATURE = (1.0, 1e4)  # of the log likelihood: what is less known than a factor e, or better than a percent
+
 
 def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArray) -> FloatArray:
-    """Uncertainty of estimated noise: the inverse curvature of the restricted likelihood, sds held between 0.01 and 1.
+    """Inverse curvature of the restricted likelihood, sds held between 0.01 and 1.
 
     Args:
-        moments: of the linearisation.
-        noise: the estimate.
-        pulls: what holds theta and the starts besides the data.
-        free: which of (log sd (C), log tau (C)) were estimated (F,).
+        moments: of a linearisation.
+        noise: where the curvature is taken.
+        pulls: priors and bounds.
+        free: (F,), entries of (log sd (C), log tau (C)) that are unknown.
 
     Returns:
-        Covariance (F, F) of the logarithms.
+        Covariance (F, F) of those.
     """
     if not len(free):
         return np.zeros((0, 0))
@@ -33,10 +36,10 @@ def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArra
         _, by_sd, by_tau = restricted_slopes(moments, _from_logs(logs, noise), pulls)
         return np.concatenate([by_sd, by_tau])[free]
 
-    h, here = 1e-3, slopes(np.zeros(len(free)))
+    h, here = _DIFFERENCE, slopes(np.zeros(len(free)))
     curvature = np.array([(here - slopes(step)) / h for step in h * np.eye(len(free))])
     eigenvalues, axes = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    return (axes / np.clip(eigenvalues, 1.0, 1e4)) @ axes.T
+    return (axes / np.clip(eigenvalues, *_CURVATURE)) @ axes.T
 
 
 def _from_logs(logs: FloatArray, like: Noise) -> Noise:
@@ -54,14 +57,14 @@ def noise_cloud(
     against its normal approximation.
 
     Args:
-        moments: of the linearisation.
-        noise: the estimate.
-        pulls: what holds theta and the starts besides the data.
-        free: which of (log sd (C), log tau (C)) were estimated (F,).
+        moments: of a linearisation.
+        noise: the best one.
+        pulls: priors and bounds.
+        free: (F,), entries of (log sd (C), log tau (C)) that are unknown.
         longest: correlation time at most, in seconds.
 
     Returns:
-        Weights, which sum to one, and noises.
+        Weights, which sum to one, and noise values.
     """
     if not len(free):
         return [(1.0, noise)]
@@ -84,15 +87,15 @@ def noise_cloud(
 
 
 def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
-    """X' V X of rows X of one channel, V its residual covariance.
+    """X' V X of the rows X of one channel, V its residual covariance.
 
     With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion.
 
     Args:
         rows: (n, N).
-        sequence: the channel's samples in order.
-        sd: of its noise.
-        tau: correlation time in seconds.
+        sequence: the channel's samples.
+        sd: in the channel's unit.
+        tau: in seconds.
 
     Returns:
         (N, N).
@@ -112,13 +115,13 @@ def sandwich(
 ) -> FloatArray:
     """The middle of the sandwich covariance H^-1 M H^-1 of plain least squares under coloured noise.
 
-    Huber 1967, "The behavior of maximum likelihood estimates under nonstandard conditions", Berkeley Symposium 5.
+    P. Huber 1967, "The behavior of maximum likelihood estimates under nonstandard conditions", Berkeley Symposium 5.
 
     Args:
         jacobian: (W, L, C, N + D).
         slope: (W, D, N), how the starts answer to theta.
-        white: (C,), the sds by which least squares weighs the channels.
-        all_sequences: the samples of each channel in order.
+        white: (C,), sds by which least squares weighs the channels.
+        all_sequences: of the C channels.
         noise: what the residuals really look like.
 
     Returns:

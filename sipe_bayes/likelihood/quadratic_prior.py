@@ -35,5 +35,5 @@ class QuadraticPrior:
 
 
 def free_to_move(theta: FloatArray, force: FloatArray) -> BoolArray:
-    """Which parameters (N,) may move: all that a force (N,) does not press against a bound at which theta (N,) is."""
+    """Which parameters (N,) may move: all but those that a force (N,) presses against a bound of theta (N,)."""
     return ~(((theta <= 0) & (force < 0)) | ((theta >= 1) & (force > 0)))

@@ -3,16 +3,16 @@
 Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white
 or first-order autoregressive in each channel, and where the recording has process noise, each state after a control
 step is moved by some. The commands are replayed open loop: where a feedback law kept the machine on its course, a
-replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta.
+replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta
+only.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.signal
@@ -30,14 +30,14 @@ _BEGINNING, _LEAST_STEPS = 0.2, 4  # s and steps of a log on which the estimate 
 
 
 def observation_noise(
-    diagnostics: Mapping[str, Any], trajectories: Trajectories, likelihood: Segments | StateSpace
+    diagnostics: Mapping[str, Sequence[float]], trajectories: Trajectories, likelihood: Segments | StateSpace
 ) -> Noise:
     """Noise of all O channels.
 
     Args:
-        diagnostics: of an estimator, which say it of the channels that it fitted.
-        trajectories: the logs, whose ``noise_level`` the others have, as white.
-        likelihood: which channels were fitted.
+        diagnostics: of an estimator, which say ``noise_sd`` and ``noise_tau`` of the channels that it fitted.
+        trajectories: the logs; ``noise_level`` tells of the other channels, as white.
+        likelihood: its settings, which say what was fitted.
     """
     sd = noise_level(trajectories, likelihood)
     tau = np.zeros(len(sd))
@@ -50,14 +50,14 @@ def observation_noise(
 
 
 class Replicas:
-    """Makes replicas of recorded trajectories.
+    """Makes replicas.
 
     Args:
-        simulator: of the machine.
-        trajectories: the recording.
-        noise: of all O channels.
-        process: (D,), sd of the process noise in the tangent coordinates of ``StateSpace``, default none; outliers are
-            not repeated.
+        simulator: what they are made with.
+        trajectories: the recordings.
+        noise: of the O channels.
+        process: (D,), sd of the process noise in the tangent coordinates of ``StateSpace``, whose outliers are not
+            repeated; default none.
     """
 
     def __init__(
@@ -75,25 +75,22 @@ class Replicas:
         """One replica of every trajectory, with states where the recording has them.
 
         Args:
-            theta: (N,).
-            rng: draws the noise.
+            theta: (N,), the truth.
+            rng: of the noise.
 
         Returns:
-            The replicas, None where one diverges.
+            None where one diverges.
         """
         return self.many(theta[None], rng)[0]
 
     def many(self, theta: FloatArray, rng: np.random.Generator, estimated: bool = False) -> list[Trajectories | None]:
-        """What ``make`` gives for several theta, simulated in one batch.
+        """What ``make`` gives for several truths, simulated in one batch.
 
         Args:
             theta: (B, N).
-            rng: draws the noise.
+            rng: of the noise.
             estimated: a replica starts where the recording's own start would lie if the replica's noise were what its
                 estimate is off by, so that a recording is as far from its replicas as they are from one another.
-
-        Returns:
-            B times the replicas, None where one diverges.
         """
         noises = [self._noise(rng) for _ in theta]
         starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
@@ -192,7 +189,7 @@ class Replicas:
 
 
 def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
-    """Starting states (R, S); not recorded ones with a delayed actuator commanded as at first before the log."""
+    """Starting states (R, S); where not recorded, a delayed actuator's commands before the log are its first ones."""
     starts = first_states(simulator, trajectories)
     if isinstance(simulator, CallableSimulator) or trajectories.states is not None:
         return starts

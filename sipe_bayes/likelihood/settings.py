@@ -18,19 +18,20 @@ class BudgetTooSmall(ValueError):
     """A budget that ran out before there was anything to estimate from."""
 
 
-def checked(fit: object, noise_sd: object, zero: bool = True) -> None:
-    """Check what the likelihoods have in common.
+def check_settings(fit: object, noise_sd: object, zero: bool = True) -> None:
+    """Hold what two likelihoods take against what it may be.
 
     Args:
-        fit: names of channels.
-        noise_sd: sds.
-        zero: whether one may be zero.
+        fit: names of channels, or None.
+        noise_sd: an sd or None for each channel, or None.
+        zero: whether an sd may be zero.
 
     Raises:
         ValueError: for anything else.
     """
-    named = isinstance(fit, tuple | list | np.ndarray) and len(fit) and all(isinstance(n, str) for n in fit)
-    if fit is not None and not named:
+    if fit is not None and (
+        not isinstance(fit, tuple | list | np.ndarray) or not len(fit) or not all(isinstance(n, str) for n in fit)
+    ):
         raise ValueError(f"fit: expected names of channels, such as ('angle',), got {fit!r}; None for all")
     if noise_sd is None:
         return
@@ -51,13 +52,16 @@ class Segments:
     """Multiple shooting with white or autoregressive noise.
 
     Args:
-        window: seconds, or None for each log as one window; dt with recorded starts compares single control steps.
+        window: seconds, or None for each log as one window.
         noise: "ar1", "white", or "sandwich" (the optimum of white noise with the width of "ar1"; ``laplace`` only).
         fit: names of the channels whose residuals count, default all.
         noise_sd: given sd per channel in its unit, None where estimated.
-        windows: seconds of some logs by name, in place of ``window``.
+        windows: (name, seconds) of logs for which ``window`` is another.
         starts: "estimated" with theta, or "recorded": the trajectories' states are exact (they come from a simulator)
-            and each window predicts the samples after its start.
+            and each window predicts the samples after its start; ``window`` = dt then compares single control steps.
+
+    Raises:
+        ValueError: for any other setting.
     """
 
     window: float | None = 0.5
@@ -74,7 +78,7 @@ class Segments:
             raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
-        checked(self.fit, self.noise_sd)
+        check_settings(self.fit, self.noise_sd)
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,9 @@ class StateSpace:
         noise_sd: given sd per channel in its unit, None where it is inferred.
         starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known. All other
             recorded states are left aside.
+
+    Raises:
+        ValueError: for any other setting.
     """
 
     fit: tuple[str, ...] | None = None
@@ -96,7 +103,7 @@ class StateSpace:
     def __post_init__(self) -> None:
         if self.starts not in ("estimated", "recorded"):
             raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
-        checked(self.fit, self.noise_sd, zero=False)
+        check_settings(self.fit, self.noise_sd, zero=False)
 
 
 Likelihood = Segments | StateSpace

@@ -109,8 +109,8 @@ class Windows:
             steps = len(trajectory) if window is None else max(1, round(window / trajectory.dt))
             if window is not None and steps > len(trajectory):
                 raise ValueError(
-                    f"log {trajectory.name!r}: lasts {len(trajectory) * trajectory.dt:.3g} s, shorter than one window of "
-                    f"{window:g} s; use a shorter window"
+                    f"log {trajectory.name!r}: lasts {len(trajectory) * trajectory.dt:.3g} s, shorter than one window "
+                    f"of {window:g} s; use a shorter window"
                 )
             for start in range(0, len(trajectory), steps):
                 pieces.append((k, start, min(steps, len(trajectory) - start)))
@@ -182,7 +182,7 @@ class Windows:
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """Noise sd (C,) below which finite differences are mostly rounding: what was simulated cannot be fitted closer."""
+        """Noise sd (C,) below which finite differences are mostly rounding: no fit comes closer."""
         size = np.sqrt(np.nanmean(np.where(self.observed, self.measured, np.nan) ** 2, axis=(0, 1)))
         moving = size[size > 0]
         return _ROUNDING * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
@@ -194,7 +194,7 @@ class Windows:
 
     @property
     def theta_step(self) -> float:
-        """Of the finite differences: the longer a window, the more a small change grows, and the less smooth its effect."""
+        """Of the finite differences: the longer a window, the less smooth the effect of a change."""
         least, most = _THETA_STEP
         return max(least, most / int(self.steps.max()))
 

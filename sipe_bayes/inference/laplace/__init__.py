@@ -17,8 +17,8 @@ and the noise maximises its restricted likelihood, in which theta and x are inte
     p(\theta \mid y) \approx \mathcal N\bigl(\theta;\ \hat\theta + H^{-1} g,\ H^{-1}\bigr)\ \text{on}\ [0, 1]^N,
     \qquad H = A_{\theta\theta} - A_{\theta x} A_{xx}^{-1} A_{x\theta} + P,
 
-with A = J' V^{-1} J + diag(0, P_x) and g what still pulls on theta: where a parameter sits at a bound, the normal's mean
-lies beyond it, and the truncated density is right up to the bound.
+with A = J' V^{-1} J + diag(0, P_x) and g what still pulls on theta: where a parameter sits at a bound, the normal's
+mean lies beyond it, and the truncated density is right up to the bound.
 
 **Steps** (``estimator.Laplace``):
 
@@ -29,8 +29,8 @@ lies beyond it, and the truncated density is right up to the bound.
 4. Look around (``pattern_search``) and go on from a better place, or from the middle of a ridge.
 5. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
-6. Probe whether a single optimum's normal is the posterior (``inference.importance``); where it is not, importance draws
-   and kernels on them take its place.
+6. Probe whether a single optimum's normal is the posterior (``inference.importance``); where it is not, importance
+   draws and kernels on them take its place.
 
 **Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::
 
@@ -68,10 +68,10 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
 - The uncertainty of the noise widens the normal (not with ``StateSpace``).
 - Residuals below what the simulation's own rounding leaves are no independent evidence: such a channel counts as one
   sample, not as many.
-- With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from autoregressive noise
-  (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts the
-  misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what predicts
-  best.
+- With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from autoregressive
+  noise (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts
+  the misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what
+  predicts best.
 - Whether the posterior is normal is not asked where starts are estimated or states inferred, where there are several
   optima, where residuals are as small as the simulation's rounding or intervals as small as the search resolves, where
   the intervals are guessed, or where the budget has no room left for draws (2 N + 1 rollouts to ask, and some hundreds

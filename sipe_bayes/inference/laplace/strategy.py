@@ -1,8 +1,9 @@
 """What ``laplace`` asks of a search for optima, and what it gives it.
 
-A ``Strategy`` is a class for one kind of likelihood: ``WindowSearch`` (windows of the logs), ``StateSpaceSearch`` (every
-sample's state is unknown) and ``KnownStartSearch`` (the first states are known). It is made of a ``SearchProblem`` and of
-the logs bound to their likelihood, writes ``start`` and ``step`` over its own frozen state, and hands over ``Optimum``s.
+A ``Strategy`` is a class for one kind of likelihood: ``WindowSearch`` (windows of the logs), ``StateSpaceSearch``
+(every sample's state is unknown) and ``KnownStartSearch`` (the first states are known). It is made of a
+``SearchProblem`` and of the logs bound to their likelihood, writes ``start`` and ``step`` over its own frozen state,
+and hands over ``Optimum``s.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The energy of theta and the windows' starts, -log of likelihood x prior, and the noise that it is for.
 
 For given noise it is half the whitened squares of the residuals plus the priors; its normal equations are an arrow, of
-which the starts are eliminated (``sipe_bayes.likelihood.restricted``). The noise itself is given, of the size of present
-residuals, or maximises the restricted likelihood.
+which the starts are eliminated (``sipe_bayes.likelihood.restricted``). The noise itself is given, of the size of
+present residuals, or maximises the restricted likelihood.
 """
 
 from __future__ import annotations
@@ -92,7 +92,10 @@ class LinearisedWindows:
 
 
 def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
-    """Priors and bounds at theta (N,) and starts (W, D); force (N,): the data's on theta, which may press it to a bound."""
+    """Priors and bounds at theta (N,) and starts (W, D).
+
+    force (N,): that of the data on theta, which may press it against a bound.
+    """
     pull = prior.pull(theta)
     flat = FLAT_PRECISION * np.eye(len(theta))
     start_pull = -windows.start_precision * starts

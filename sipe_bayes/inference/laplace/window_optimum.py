@@ -1,4 +1,4 @@
-"""What is made of the place where a search over windows ended: a normal in theta, its evidence, and what is around it."""
+"""What is made of where a search over windows ended: a normal in theta, its evidence, and what is around it."""
 
 from __future__ import annotations
 
@@ -125,7 +125,11 @@ def _sandwiched(solved: Eliminated, middle: FloatArray) -> tuple[FloatArray, Flo
 def surroundings(
     problem: SearchProblem, windows: Windows, theta: FloatArray, noise: Noise, covariance: FloatArray
 ) -> Surroundings | None:
-    """What a pattern search sees around an optimum; None where starts are searched too, or the budget leaves no room."""
+    """What a pattern search sees around an optimum.
+
+    Returns:
+        None where starts are searched too, or the budget leaves no room.
+    """
     tuning = problem.options.tuning.pattern
     if windows.num_start:
         return None

@@ -13,16 +13,17 @@ An optimum at which differences have been too short to see what a parameter does
 searched on with longer ones.
 
 Where the starts are recorded and theta alone is searched, points around each optimum are tried as well
-(``pattern_search``), and the search goes on from a better one, with finite differences no longer than the way there. The
-normal that is left is no narrower than the shortest of these ways, and holds the points that fit as well as the optimum,
-whatever the curvature says; one that fits as well but lies beyond worse ones becomes a further starting point. Where
-already the shortest way leads to a far worse fit, the optimum is a stroke of luck: then its neighbours say how large the
-noise is and what fits as well, and a finding says so.
+(``pattern_search``), and the search goes on from a better one, with finite differences no longer than the way there.
+The normal that is left is no narrower than the shortest of these ways, and holds the points that fit as well as the
+optimum, whatever the curvature says; one that fits as well but lies beyond worse ones becomes a further starting point.
+Where already the shortest way leads to a far worse fit, the optimum is a stroke of luck: then its neighbours say how
+large the noise is and what fits as well, and a finding says so.
 
-Where theta alone is searched and the budget ends before the first optimum, what is kept of it is spent on such a look at
-the best point so far. Of that, of an optimum where no step found the gain that its linearisation foretold, and of one
-that is a stroke of luck, the normal says nothing; its sd is guessed: the way from the starting point (root mean square
-over theta), times the share of the first misfit that is left, as a misfit that is theta's shrinks with the distance.
+Where theta alone is searched and the budget ends before the first optimum, what is kept of it is spent on such a look
+at the best point so far. Of that, of an optimum where no step found the gain that its linearisation foretold, and of
+one that is a stroke of luck, the normal says nothing; its sd is guessed: the way from the starting point (root mean
+square over theta), times the share of the first misfit that is left, as a misfit that is theta's shrinks with the
+distance.
 """
 
 from __future__ import annotations
@@ -125,8 +126,10 @@ class WindowSearch:
     # ------------------------------------------------------------------ phases
 
     def _subset(self, state: WindowState) -> WindowState:
-        """A step of theta alone, the starts as the log tells them, on every other window; near the optimum the search
-        goes on with all."""
+        """A step of theta alone, the starts as the log tells them, on every other window.
+
+        Near the optimum the search goes on with all.
+        """
         windows, here, tuning = self.windows, state.here, self._tuning.windows
         view = windows.every_other()
         before, starts = view.rollouts, view.no_starts()
@@ -327,8 +330,7 @@ class WindowSearch:
         return not self.windows.num_start and not state.optima
 
     def _leaves_no_room(self) -> bool:
-        """Whether the budget has no room for another step; or, where a look around takes less than half of it, for that
-        as well."""
+        """Whether the budget has no room for another step, and where it takes less than half of it, a look around."""
         windows, tuning = self.windows, self._tuning
         each = len(windows.trajectories)
         step = (windows.num_theta + tuning.windows.trials) * each
@@ -353,8 +355,8 @@ def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
 def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
     """Starting points (R, N): the model as given and the best candidates, by their plain residuals.
 
-    From many candidates on, only the first ones are drawn from the prior, the others in generations from a normal around
-    the best ones so far: the cross-entropy method, which finds the narrow valleys that contact leaves.
+    From many candidates on, only the first ones are drawn from the prior, the others in generations from a normal
+    around the best ones so far: the cross-entropy method, which finds the narrow valleys that contact leaves.
 
     Raises:
         ValueError: when every one of the first diverges.

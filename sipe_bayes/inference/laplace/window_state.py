@@ -154,8 +154,10 @@ class WindowState:
 
     @property
     def known(self) -> bool:
-        """Whether the search has come to one of the optima found earlier: in each principal direction of its normal
-        within one sd, or within a tenth of the way that it had to come."""
+        """Whether the search has come to one of the optima recorded earlier.
+
+        In each principal direction of its normal within one sd, or within a tenth of the way that it had to come.
+        """
         begin = self.points[self.point]
         for optimum in self.optima:
             eigenvalues, axes = np.linalg.eigh(optimum.covariance)

@@ -9,8 +9,8 @@ the starts' Jacobian,
 The starts are integrated out exactly where the prediction is linear in them over their (narrow) conditional posterior:
 x(theta) = x_hat - S (theta - theta_hat) and J_x are those of the ``laplace`` optimum. The noise is integrated out by
 Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations for Posterior Moments and Marginal Densities",
-J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at the optimum hardly depends on theta;
-exact for white noise of one channel whose starts are known.
+J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at the optimum hardly depends on
+theta; exact for white noise of one channel whose starts are known.
 """
 
 from __future__ import annotations
