@@ -123,8 +123,6 @@ class WindowSearch:
         }
         return phases[state.here.phase](state)
 
-    # ------------------------------------------------------------------ phases
-
     def _subset(self, state: WindowState) -> WindowState:
         """A step of theta alone, the starts as the log tells them, on every other window.
 
@@ -144,8 +142,7 @@ class WindowSearch:
         tolerance = max(tuning.rough_tolerance * linearised.energy, tuning.tolerance)
         fit = descend(linearised, here.damping, tolerance, self._tuning.damping)
         if view is not windows:
-            share = view.steps.sum() / windows.steps.sum()
-            windows.rollouts += int(np.ceil((view.rollouts - before) * share))
+            windows.rollouts += int(np.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum())))
         point = fit.point or point
         least = tuning.subset_gain if foretold(fit, tuning) else tuning.subset_gain_unforetold
         again = not fit.converged and fit.gained > least * linearised.energy
@@ -199,8 +196,6 @@ class WindowSearch:
         # where theta does not move for the noise that is best there, both are
         settled = converged and (not step.fit.gained or same_noise(noise, here.noise))
         return self._continued(state, step, Phase.NOISE if converged else Phase.DESCEND, settled)
-
-    # ------------------------------------------------------- parts of a phase
 
     def _linearise(self, here: Position) -> tuple[Linearisation, bool, float]:
         """Linearisation at the point, whether part of it is of an earlier one, and the drift of that part."""
