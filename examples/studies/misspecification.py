@@ -31,7 +31,7 @@ from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misspecification import SIMULATED, misfit
+from sipe_bayes.diagnostics.misspecification import MISFIT, misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -155,7 +155,7 @@ def main() -> None:
         "command": "python examples/studies/misspecification.py",
         "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
         "level": THRESHOLDS.misfit,
-        "simulated": SIMULATED,
+        "simulated": MISFIT.simulated,
     }
     whole = given.seeds is None and given.cells == list(SIZES)
     name = "misspecification.json" if whole else "misspecification_part.json"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,13 +13,22 @@ from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.grid import Grid, Recording, gaps
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
 
-_CLIPPED_RUN = 5  # samples in a row at the extreme value that count as saturation
-_CLIPPED_SHARE = 0.01  # of the samples, above which that is worth a note: dry friction holds a turning joint for a few
-_LEVELS = 10  # different values: a signal with fewer is switched, not clipped
-_QUANTA = 2.5  # smallest steps: a signal that comes from as far was cut off, one from nearer turned round
+
+@dataclass(frozen=True)
+class Saturation(Options):
+    """When samples at an extreme value count as cut off."""
+
+    run: int = option(5, "in a row at the extreme value", "samples", least=2)
+    share: float = option(0.01, "worth a note: dry friction holds a turning joint for a few", "of the samples", above=0)
+    levels: int = option(10, "different values: a signal with fewer is switched, not clipped", least=2)
+    quanta: float = option(2.5, "from as far it was cut off, from nearer it turned round", "smallest steps", above=0)
+
+
+_SATURATION = Saturation()
 
 
 def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, trajectory: Trajectory) -> LogReport:
@@ -36,7 +46,7 @@ def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, traject
     signals = [*raw.measurements, *raw.commands]
     missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
     clipped = {name: count_clipped(values) for name, values in zip(names, signals, strict=True)}
-    saturated = {name: n for name, n in clipped.items() if n > _CLIPPED_SHARE * len(raw.time)}
+    saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
     blank = {c.target: int((~np.isfinite(y[:-1])).sum()) for c, y in zip(config.commands, raw.commands, strict=True)}
     holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
     jitter = _jitter(raw.time)
@@ -88,11 +98,11 @@ def count_clipped(values: FloatArray) -> int:
     its smallest step. Switched and constant signals have none.
     """
     values = values[np.isfinite(values)]
-    if len(np.unique(values)) < _LEVELS:
+    if len(np.unique(values)) < _SATURATION.levels:
         return 0
     low, high = float(values.min()), float(values.max())
     steps = np.abs(np.diff(values))
-    far = _QUANTA * float(steps[steps > 1e-6 * (high - low)].min())
+    far = _SATURATION.quanta * float(steps[steps > 1e-6 * (high - low)].min())
     return sum(_stuck(values, extreme, far) for extreme in (low, high))
 
 
@@ -102,5 +112,5 @@ def _stuck(values: FloatArray, extreme: float, far: float) -> int:
     return sum(
         int(stop - start)
         for start, stop in zip(edges[::2], edges[1::2], strict=True)
-        if stop - start >= _CLIPPED_RUN and max(away[start], away[stop + 3]) >= far
+        if stop - start >= _SATURATION.run and max(away[start], away[stop + 3]) >= far
     )

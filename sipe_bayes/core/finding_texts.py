@@ -25,7 +25,6 @@ class Code(StrEnum):
     AT_BOUND = auto()  # a median
     NOT_MIXED = auto()
     SEARCH_SPREAD = auto()
-    REMARK = auto()  # until every sentence has a code of its own
 
     # searches and Bayesian optimisation
     PRIOR_HARDLY_USED = auto()
@@ -146,7 +145,6 @@ TEXTS: dict[Code, Text] = {
         "the spread of {method} is that of its search, not an uncertainty: use laplace or mcmc, or in Python "
         "sipe.Recalibrated",
     ),
-    Code.REMARK: Text(_CAUTION, "{text}"),
     # searches and Bayesian optimisation
     Code.PRIOR_HARDLY_USED: Text(_CAUTION, "{method} searches within the bounds and {use}; bayesopt and npe count it"),
     Code.DIVERGED_COUNT_AS_WORST: Text(

@@ -25,12 +25,12 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 _BUDGET = 5000  # rollouts for each log
-_UNIFORM = 12.0  # information of a uniform prior: directions with less are not tested
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
 def _root(information: FloatArray) -> FloatArray:
     """Rows r (R, N) with r' r the information in the R directions of which it says more than a uniform prior."""
     eigenvalues, axes = np.linalg.eigh(information)
-    determined = eigenvalues > _UNIFORM
+    determined = eigenvalues > UNIFORM_PRECISION
     return np.asarray(np.sqrt(eigenvalues[determined])[:, None] * axes[:, determined].T)
 
 
@@ -198,10 +198,10 @@ def _scatter(roots: list[FloatArray], sought: list[FloatArray], own: int | None 
         at += len(root)
     target = np.concatenate(sought)
     eigenvalues, axes = np.linalg.eigh(rows.T @ rows)
-    weak = eigenvalues <= _UNIFORM
+    weak = eigenvalues <= UNIFORM_PRECISION
     low = np.where(weak, np.minimum(axes, 0).sum(0), -np.inf)
     high = np.where(weak, np.maximum(axes, 0).sum(0), np.inf)
     solution = axes @ scipy.optimize.lsq_linear(rows @ axes, target, (low, high), tol=1e-12).x
-    sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + _UNIFORM * np.eye(rows.shape[1]))))
+    sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + UNIFORM_PRECISION * np.eye(rows.shape[1]))))
     q = float(((rows @ solution - target) ** 2).sum())
     return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], sd[len(common) :]))

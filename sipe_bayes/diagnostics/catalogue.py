@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TypedDict
 
-from sipe_bayes.diagnostics.sensitivity import LEVELS, Sensitivity, sensitivity
+from sipe_bayes.diagnostics.identifiability import GRID
+from sipe_bayes.diagnostics.sensitivity import Sensitivity, sensitivity
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Task
 from sipe_bayes.simulation.simulator import Simulator
@@ -74,7 +75,7 @@ def describe(name: str) -> TaskDescription:
     return {
         "task": _row(task),
         "observation": list(task.channels),
-        "sensitivity_at_theta": list(LEVELS),
+        "sensitivity_at_theta": list(GRID),
         "parameters": [_parameter(task, j, measured) for j in range(len(task.space))],
         "variants": {v: task.theta(v).round(6).tolist() for v in VARIANTS},
         "changes_nothing": measured.dead,

@@ -33,7 +33,7 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.identifiability import ridges
+from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION, ridges
 from sipe_bayes.diagnostics.records import Ridge
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -44,7 +44,6 @@ from sipe_bayes.simulation.simulator import Simulator
 
 _IDLE = 1e-6  # contraction of a uniform prior below which the experiment does not touch a parameter
 _FLAT_PRECISION = 0.01  # sd 10 in units of the cube
-_UNIFORM = 12.0  # precision of a uniform prior
 _DRAWS = 4000  # of the normal that is left, among which ridges are looked for
 
 
@@ -149,7 +148,7 @@ def _of_shared(plain: FloatArray, space: ParameterSpace) -> FloatArray:
     for k, members in enumerate(own.values()):
         design[members, len(shared) + k] = 1.0
     joint, count = design.T @ plain @ design, len(shared)
-    cross, inner = joint[:count, count:], joint[count:, count:] + _UNIFORM * np.eye(len(own))
+    cross, inner = joint[:count, count:], joint[count:, count:] + UNIFORM_PRECISION * np.eye(len(own))
     marginal = np.zeros_like(plain)
     marginal[np.ix_(shared, shared)] = joint[:count, :count] - cross @ np.linalg.solve(inner, cross.T)
     return marginal
@@ -218,14 +217,14 @@ def expect(
             f"plan: {plan.name!r} diverges at all {draws} draws; make its commands smaller, or narrow the bounds"
         )
     precision, middle = knowledge(known), np.median(thetas, axis=0)
-    gain, remaining = contraction(precision, gains), 1 - _afterwards(precision, gains) * np.sqrt(_UNIFORM)
+    gain, remaining = contraction(precision, gains), 1 - _afterwards(precision, gains) * np.sqrt(UNIFORM_PRECISION)
     centre = information(simulator, likelihood, plan, noise, middle)
     centre = gains[0] if centre is None else centre
     covariance = np.asarray(np.linalg.inv(precision + centre), np.float64)
     open_covariance = np.linalg.inv(centre + _FLAT_PRECISION * np.eye(len(middle)))
     normal = GaussianMixture([0.0], middle[None], open_covariance[None], known.space)
     values = normal.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
-    names, excited = known.space.names, np.mean([np.diag(one) for one in gains], axis=0) / (2 * _UNIFORM)
+    names, excited = known.space.names, np.mean([np.diag(one) for one in gains], axis=0) / (2 * UNIFORM_PRECISION)
     return Expectation(
         names,
         gain,

@@ -17,7 +17,8 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Ridge
 from sipe_bayes.likelihood.windows import Windows
 
-GRID = (0.0, 0.25, 0.5, 0.75, 1.0)
+GRID = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta, where parameters are tried
+UNIFORM_PRECISION = 12.0  # of theta under a uniform prior
 
 
 def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:

@@ -35,6 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.probes import probe_effects
@@ -46,12 +47,21 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
 
-SIMULATED = 199  # draws of the null: p resolves half a percent
-_PIECES = 10  # of a log, among which the largest mean square is looked for
-_LAGS = (1, 2, 3, 5, 8, 13, 21, 34)  # samples: each channel's memory at every scale
 _FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
 _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
-_AT_ONCE = 16  # draws of the null whose products are formed together
+
+
+@dataclass(frozen=True)
+class MisfitOptions(Options):
+    """What residuals are asked, and how the null is simulated."""
+
+    simulated: int = option(199, "draws of the null: p resolves half a percent", least=1)
+    pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
+    lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
+    batch: int = option(16, "draws of the null whose products are formed together", least=1)
+
+
+MISFIT = MisfitOptions()
 
 
 def misfit(
@@ -63,7 +73,7 @@ def misfit(
     sd: FloatArray | None = None,
     prior: QuadraticPrior | None = None,
     seed: int = 0,
-    simulated: int = SIMULATED,
+    simulated: int = MISFIT.simulated,
 ) -> Misfit:
     """How odd the residuals of fitted windows are; costs a linearisation and a rollout for each probe.
 
@@ -156,7 +166,7 @@ class _Residuals:
     def null(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated."""
         draws, rows = self.drawn(rng, simulated), []
-        for part in np.array_split(np.arange(simulated), max(1, simulated // _AT_ONCE)):
+        for part in np.array_split(np.arange(simulated), max(1, simulated // MISFIT.batch)):
             for s, (plain, probed) in zip(part, self.moments(draws[..., part]), strict=True):
                 noise = self._estimated(plain)
                 rows.append(self.solved(draws[..., s], probed, noise).statistics)
@@ -232,7 +242,9 @@ class _Residuals:
         left = self._left(residual, base, arrow.blocks(base))
         white = [self._white(left, c, noise) for c in range(len(noise.sd))]
         whiteness = [_autocorrelation(z) for z in white]
-        pieces = [max((float((p**2).mean()) for p in np.array_split(z, _PIECES) if len(p)), default=0.0) for z in white]
+        pieces = [
+            max((float((p**2).mean()) for p in np.array_split(z, MISFIT.pieces) if len(p)), default=0.0) for z in white
+        ]
         statistics = np.cbrt(np.concatenate([gradient**2 / information, whiteness, pieces]))
         return _Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
 
@@ -276,8 +288,8 @@ class _Residuals:
             remedy = coloured if self.coloured else f'use noise = "ar1"; then {coloured}'
         else:
             gains[c] = white[c] ** 2
-            most = max(float(piece.sum()) for piece in np.array_split(gains[c], _PIECES))
-            share[c] = most / gains[c].sum() - 1 / _PIECES
+            most = max(float(piece.sum()) for piece in np.array_split(gains[c], MISFIT.pieces))
+            share[c] = most / gains[c].sum() - 1 / MISFIT.pieces
             cause = "noise that is larger for a while"
             remedy = "look at what happened there; leave that span out if it was a disturbance"
         return self._placed(p, cause, remedy, gains, np.maximum(share, 0.0), {})
@@ -298,7 +310,7 @@ class _Residuals:
         seconds = (windows.start[window] + place) * windows.dt[window]
         log, best, where = windows.log[window], -np.inf, np.zeros(1, int)
         for k in np.unique(log):
-            for piece in np.array_split(np.flatnonzero(log == k), _PIECES):
+            for piece in np.array_split(np.flatnonzero(log == k), MISFIT.pieces):
                 if len(piece) and gains[channel][piece].sum() > best:
                     best, where = float(gains[channel][piece].sum()), piece
         name = windows.trajectories.names[int(log[where[0]])]
@@ -319,8 +331,8 @@ def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
 
 
 def _foretold(z: FloatArray) -> FloatArray:
-    """What least squares on the samples before, at ``_LAGS``, says of z (n,)."""
-    lags = [lag for lag in _LAGS if lag < len(z) // 4]
+    """What least squares on the samples before, at ``MISFIT.lags``, says of z (n,)."""
+    lags = [lag for lag in MISFIT.lags if lag < len(z) // 4]
     if not lags:
         return np.zeros_like(z)
     before = np.stack([np.concatenate([np.zeros(lag), z[:-lag]]) for lag in lags], axis=1)
@@ -330,5 +342,5 @@ def _foretold(z: FloatArray) -> FloatArray:
 def _autocorrelation(z: FloatArray) -> float:
     z = z - z.mean()
     square = max(float(z @ z), 1e-300)
-    lags = [lag for lag in _LAGS if lag < len(z) // 4]
+    lags = [lag for lag in MISFIT.lags if lag < len(z) // 4]
     return float(len(z) * sum((z[lag:] @ z[:-lag] / square) ** 2 for lag in lags))

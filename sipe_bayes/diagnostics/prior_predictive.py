@@ -15,6 +15,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
@@ -22,10 +23,18 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
-_SIMULATIONS = 59  # one more makes the largest of them a p-value of 1/60
-_PER_BATCH = 10  # of them in memory at a time
-_SAMPLES = 50  # of a log: more are correlated, and distances in many dimensions alike
-_NEIGHBOURS = 20  # of the local outlier factor, as its authors advise
+
+@dataclass(frozen=True)
+class PredictiveOptions(Options):
+    """How the prior is simulated and a log held against it."""
+
+    simulations: int = option(59, "with the log the largest of them has a p-value of 1/60", least=1)
+    batch: int = option(10, "of them in memory at a time", least=1)
+    samples: int = option(50, "of a log: more are correlated, and distances in many dimensions alike", least=1)
+    neighbours: int = option(20, "of the local outlier factor, as its authors advise", least=1)
+
+
+_OPTIONS = PredictiveOptions()
 
 
 @dataclass(frozen=True)
@@ -77,9 +86,10 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
         ValueError: where more than half of the simulations diverge.
     """
     logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
-    if len(made) < _SIMULATIONS // 2:
+    if len(made) < _OPTIONS.simulations // 2:
         raise ValueError(
-            f"prior: {len(made)} of {_SIMULATIONS} simulations did not diverge, half are needed; narrow the bounds"
+            f"prior: {len(made)} of {_OPTIONS.simulations} simulations did not diverge, half are needed; narrow the "
+            "bounds"
         )
     far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
     farthest = np.zeros((len(logs), len(windows.channels)))
@@ -88,7 +98,7 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
             known = np.flatnonzero(np.isfinite(log.observations[:, c]))
             if not len(known):
                 continue
-            kept = known[np.linspace(0, len(known) - 1, min(_SAMPLES, len(known))).round().astype(int)]
+            kept = known[np.linspace(0, len(known) - 1, min(_OPTIONS.samples, len(known))).round().astype(int)]
             simulated = np.stack([one[k, kept, c] for one in made])
             far[k, i] = _outlier_factors(simulated, log.observations[kept, c])
             gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(simulated.std(0), 1e-12)
@@ -106,8 +116,8 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
 def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
     """Observations (R, T+1, O) of the logs at draws of the prior."""
     replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
-    thetas = prior.sample((_SIMULATIONS,), generator=torch.Generator().manual_seed(seed)).numpy()
-    batches = np.array_split(thetas, max(1, _SIMULATIONS // _PER_BATCH))
+    thetas = prior.sample((_OPTIONS.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()
+    batches = np.array_split(thetas, max(1, _OPTIONS.simulations // _OPTIONS.batch))
     return [
         one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
     ]
@@ -121,5 +131,5 @@ def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:
     varies = sd > 1e-12
     if not varies.any():
         return np.zeros(len(every))
-    factor = LocalOutlierFactor(n_neighbors=min(_NEIGHBOURS, len(simulated) - 1))
+    factor = LocalOutlierFactor(n_neighbors=min(_OPTIONS.neighbours, len(simulated) - 1))
     return np.asarray(-factor.fit(every[:, varies] / sd[varies]).negative_outlier_factor_)

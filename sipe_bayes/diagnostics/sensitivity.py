@@ -14,14 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.identifiability import GRID
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
 
-LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta
-_CHANGE = 0.1  # of the value: large against rounding, small against what is not linear
-_EPISODES, _STEPS = 8, 25  # short: contacts multiply any change in the long run
-_LEAST_SPREAD = 1e-3  # m, rad, m/s, N, ...
+
+@dataclass(frozen=True)
+class SensitivityOptions(Options):
+    """The episodes in which parameters are changed."""
+
+    change: float = option(0.1, "large against rounding, small against what is not linear", "of the value", above=0)
+    episodes: int = option(8, "starts and random actions", least=1)
+    steps: int = option(25, "of an episode: contacts multiply any change in the long run", least=1)
+    least_spread: float = option(1e-3, "of a channel that hardly varies", "m, rad, m/s, N, ...", above=0)
+
+
+_OPTIONS = SensitivityOptions()
 
 
 @dataclass(frozen=True)
@@ -29,7 +39,7 @@ class Sensitivity:
     """How much each parameter moves what is observed.
 
     Args:
-        moved: (5, N) at theta = LEVELS the change of the observations that a 10 % change of each parameter makes, in
+        moved: (5, N) at theta = GRID the change of the observations that a 10 % change of each parameter makes, in
             units of their spread.
         names: (N,) of the parameters.
     """
@@ -53,7 +63,7 @@ class Sensitivity:
         for name, column in zip(self.names, self.moved.T, strict=True):
             if (column < THRESHOLDS.sensitivity).any() and not (column < THRESHOLDS.sensitivity).all():
                 dead[name] = [
-                    level for level, moved in zip(LEVELS, column, strict=True) if moved < THRESHOLDS.sensitivity
+                    level for level, moved in zip(GRID, column, strict=True) if moved < THRESHOLDS.sensitivity
                 ]
         return dead
 
@@ -72,30 +82,30 @@ def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:
     if not isinstance(task, Task):
         raise ValueError(f"sensitivity: expected a task of `sipe envs`, got {type(task).__name__}")
     rng = np.random.default_rng(seed)
-    n, steps = len(task.space), min(_STEPS, task.episode_steps)
-    starts, goals = task.initial_states(rng, _EPISODES)
-    actions = rng.uniform(task.action_low, task.action_high, (_EPISODES, steps, task.num_actions))
+    n, steps = len(task.space), min(_OPTIONS.steps, task.episode_steps)
+    starts, goals = task.initial_states(rng, _OPTIONS.episodes)
+    actions = rng.uniform(task.action_low, task.action_high, (_OPTIONS.episodes, steps, task.num_actions))
 
     def observe(theta: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Observations (L, episodes, steps, O) of theta (L, N) and where they are valid."""
-        batch = np.repeat(theta, _EPISODES, axis=0)
+        batch = np.repeat(theta, _OPTIONS.episodes, axis=0)
         tile = len(theta)
         targets = None if goals is None else np.tile(goals, (tile, 1))
         motion = simulator.rollout(
             batch, np.tile(actions, (tile, 1, 1)), np.tile(starts, (tile, 1)), goals=targets, allow_outside=True
         )
-        shape = (tile, _EPISODES, steps + 1)
+        shape = (tile, _OPTIONS.episodes, steps + 1)
         return motion.observations.reshape(*shape, -1)[:, :, 1:], motion.valid.reshape(shape)[:, :, 1:]
 
     middle, _ = observe(np.full((1, n), 0.5))
-    spread = np.maximum(middle[0].std(axis=(0, 1)), _LEAST_SPREAD)
-    moved = np.empty((len(LEVELS), n))
-    for row, level in enumerate(LEVELS):
+    spread = np.maximum(middle[0].std(axis=(0, 1)), _OPTIONS.least_spread)
+    moved = np.empty((len(GRID), n))
+    for row, level in enumerate(GRID):
         given, changed = np.full((n, n), 0.5), np.full((n, n), 0.5)
         for j, parameter in enumerate(task.space):
             given[j, j] = level
-            sign = -1.0 if level == LEVELS[-1] else 1.0
-            changed[j, j] = parameter.normalise(float(parameter.value(level)) * (1 + sign * _CHANGE))
+            sign = -1.0 if level == GRID[-1] else 1.0
+            changed[j, j] = parameter.normalise(float(parameter.value(level)) * (1 + sign * _OPTIONS.change))
         (a, good_a), (b, good_b) = observe(given), observe(changed)
         change = np.minimum(np.abs(b - a) / spread, 1.0)
         change = np.where((good_a & good_b)[..., None], change, np.nan)

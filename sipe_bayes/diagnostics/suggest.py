@@ -25,6 +25,7 @@ import scipy.signal
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
@@ -32,9 +33,18 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
 KINDS = ("chirp up", "chirp down", "noise", "sines")
-_SIZES = (1.0, 0.5, 0.25)  # of the limits
-_MOST_SINES = 10
-_EDGE = 0.05  # of the duration, at either end
+
+
+@dataclass(frozen=True)
+class SequenceOptions(Options):
+    """How command sequences are made."""
+
+    sizes: tuple[float, ...] = option((1.0, 0.5, 0.25), "in turn", "of the limits")
+    sines: int = option(10, "at most, in a sum", least=1)
+    edge: float = option(0.05, "at either end, over which it begins and ends", "of the duration", above=0)
+
+
+_OPTIONS = SequenceOptions()
 
 
 @dataclass(frozen=True)
@@ -165,10 +175,10 @@ def generate(
         )
     rng = np.random.default_rng(seed)
     time = np.asarray(np.arange(steps) * dt, np.float64)
-    edge = np.clip(np.minimum(time, time[-1] - time) / (_EDGE * duration), 0.0, 1.0)
+    edge = np.clip(np.minimum(time, time[-1] - time) / (_OPTIONS.edge * duration), 0.0, 1.0)
     plans = []
     for number in range(count):
-        kind, size = KINDS[number % len(KINDS)], _SIZES[number // len(KINDS) % len(_SIZES)]
+        kind, size = KINDS[number % len(KINDS)], _OPTIONS.sizes[number // len(KINDS) % len(_OPTIONS.sizes)]
         waves = np.stack([_wave(kind, time, low, high, rng) for _ in bounds], axis=1)
         middle, half = bounds.mean(1), np.diff(bounds, axis=1)[:, 0] / 2
         rest = np.clip(0.0, bounds[:, 0], bounds[:, 1])
@@ -193,7 +203,7 @@ def _wave(kind: str, time: FloatArray, low: float, high: float, rng: np.random.G
         multiples = np.arange(np.ceil(low * time[-1]), np.floor(high * time[-1]) + 1)
         if not len(multiples):  # a narrow band
             multiples = np.array([np.sqrt(low * high) * time[-1]])
-        chosen = rng.choice(multiples, min(_MOST_SINES, len(multiples)), replace=False) / time[-1]
+        chosen = rng.choice(multiples, min(_OPTIONS.sines, len(multiples)), replace=False) / time[-1]
         wave = np.sin(2 * np.pi * chosen * time[:, None] + rng.uniform(0, 2 * np.pi, len(chosen))).sum(1)
     return np.asarray(wave / np.abs(wave).max())
 

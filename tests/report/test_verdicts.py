@@ -186,7 +186,7 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert judged.parameter_verdict(good, doubts).tone == "fair"
 
 
-def doubt(text: str, code: Code = Code.REMARK) -> Finding:
+def doubt(text: str, code: Code = Code.SEARCH_SPREAD) -> Finding:
     return noticed(code, severity=Severity.BLOCKING, text=text)
 
 
