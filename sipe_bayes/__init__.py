@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sipe_bayes.core.trajectory import Trajectory as Trajectory
     from sipe_bayes.datasets.demonstrations import demonstrations as demonstrations
     from sipe_bayes.datasets.minari_data import from_minari as from_minari
-    from sipe_bayes.envs.mjcf import Channel as Channel
+    from sipe_bayes.envs.channels import Channel as Channel
     from sipe_bayes.envs.mjcf import MjcfEnvironment as MjcfEnvironment
     from sipe_bayes.envs.registry import make_task as make_task
     from sipe_bayes.inference import get_estimator as get_estimator

@@ -19,7 +19,8 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.diagnostics.records import LogReport
-from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
+from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator

@@ -1,27 +1,29 @@
 """The Environment contract: what a simulator needs to know about a robot, and nothing that it does.
 
 An Environment is an immutable, picklable description. It compiles a MuJoCo model, says how theta is written into it
-in place, how actions become controls and how states become observations. The engine (``sipe_bayes.simulation.simulator``) owns
-batching, threads, model pools and the flagging of diverged rollouts.
+in place, how actions become controls and how states become observations. The engine
+(``sipe_bayes.simulation.simulator``) owns batching, threads, model pools and the flagging of diverged rollouts.
 
 To add one: subclass, set ``space``, ``channels`` and ``num_actions``, and define the abstract methods below as pure
 functions of their arguments. ``derived`` is MuJoCo's sensordata, aligned by the engine with the state it belongs to;
-an environment that reproduces a published one may have it ``late``. The benchmark's tasks add rewards, goals and starting
-states (``sipe_bayes.envs.task``).
+an environment that reproduces a published one may have it ``late``. The benchmark's tasks add rewards, goals and
+starting states (``sipe_bayes.envs.task``).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 
-FloatArray = NDArray[np.float64]
+if TYPE_CHECKING:
+    import mujoco
+
 _CONTROL = 1 << 6  # mjSTATE_CTRL, without importing mujoco here
 
 
@@ -32,15 +34,11 @@ class Environment(ABC):
     channels: tuple[str, ...]
     num_actions: int
     needs_derived: bool = False
-    data_fields: tuple[
-        str, ...
-    ] = ()  # MjData arrays that are derived in place of sensordata, for what no sensor returns
+    data_fields: tuple[str, ...] = ()  # MjData arrays derived in place of sensordata, for what no sensor returns
     derived_late: bool = False  # derived belongs to the state before the last physics step, as Gymnasium reads it
     frame_skip: int = 1  # physics steps of a control step where no dt is given
     stepwise: bool = False  # control needs the state: control steps are simulated one by one
-    kinematic: bool = (
-        False  # a stepwise environment's sensors feel no forces: they are read without contacts and constraints
-    )
+    kinematic: bool = False  # a stepwise environment's sensors feel no forces: read without contacts and constraints
     memory_size: int = 0  # M, columns of a stepwise environment's states behind MuJoCo's own
     goal_size: int = 0  # G
 
@@ -50,15 +48,21 @@ class Environment(ABC):
         return _CONTROL
 
     @abstractmethod
-    def compile(self) -> Any:
+    def compile(self) -> mujoco.MjModel:
         """A fresh mujoco.MjModel at the default parameters."""
 
     @abstractmethod
-    def write(self, model: Any, values: FloatArray, log: str | None = None) -> bool:
-        """Write ``values`` (N,) in physical units into a model in place, as they hold in the log ``log``.
+    def write(self, model: mujoco.MjModel, values: FloatArray, log: str | None = None) -> bool:
+        """Write parameters into a model in place. The engine refreshes derived constants where ``needs_constants``.
 
-        Returns whether they are physical; an unphysical model is never simulated. Derived constants are refreshed by
-        the engine when ``needs_constants``."""
+        Args:
+            model: a copy of the compiled one.
+            values: (N,), in physical units.
+            log: the log that they are to hold in.
+
+        Returns:
+            Whether they are physical; an unphysical model is never simulated.
+        """
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Least changes (N,) of theta (N,) that finite differences can be taken over; zero for all that is smooth."""
@@ -70,14 +74,24 @@ class Environment(ABC):
         return True
 
     @abstractmethod
-    def control(self, model: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
+    def control(self, model: mujoco.MjModel, states: FloatArray, actions: FloatArray) -> FloatArray:
         """Controls (..., U) of actions (..., A), and of states (..., S) where the environment is ``stepwise``."""
 
     @abstractmethod
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
-        """Observations (..., O) of states (..., S), sensordata (..., D) and goals (..., G), without sensor bias."""
+        """What is observed, without sensor bias.
+
+        Args:
+            model: the compiled one.
+            states: (..., S).
+            derived: (..., D), where the environment ``needs_derived``.
+            goals: (..., G), of a task that has them.
+
+        Returns:
+            Observations (..., O).
+        """
 
     def recorded_goals(self, observations: FloatArray) -> FloatArray | None:
         """Goals (..., G) that observations (..., O) were made with; None of an environment without goals."""
@@ -86,16 +100,34 @@ class Environment(ABC):
     def rewards(
         self, states: FloatArray, derived: FloatArray | None, actions: FloatArray, goals: FloatArray | None
     ) -> FloatArray | None:
-        """Rewards (B, T) of states (B, T+1, S), sensordata (B, T+1, D), actions (B, T, A), goals (B, G); None without."""
+        """What whole rollouts earn; by default nothing.
+
+        Args:
+            states: (B, T+1, S).
+            derived: (B, T+1, D) or None.
+            actions: (B, T, A).
+            goals: (B, G) or None.
+
+        Returns:
+            Rewards (B, T), or None without any.
+        """
         return None
 
-    def settle(self, model: Any, states: FloatArray) -> FloatArray:
+    def settle(self, model: mujoco.MjModel, states: FloatArray) -> FloatArray:
         """States (B, S) as a stepwise environment edits them after each control step."""
         return states
 
-    def probe(self, model: Any, before: FloatArray, states: FloatArray) -> FloatArray:
-        """The states (B, S) whose sensordata a stepwise environment reads: of those after a control step and those one
-        physics step ``before``."""
+    def probe(self, model: mujoco.MjModel, before: FloatArray, states: FloatArray) -> FloatArray:
+        """The states whose sensordata a stepwise environment reads after a control step.
+
+        Args:
+            model: the compiled one.
+            before: states (B, S) one physics step before its end.
+            states: (B, S) at its end.
+
+        Returns:
+            States (B, S).
+        """
         return states
 
     def remember(self, derived: FloatArray) -> FloatArray:
@@ -103,16 +135,25 @@ class Environment(ABC):
         return derived[:, :0]
 
     def bias(self, values: FloatArray, log: str | None = None) -> FloatArray:
-        """Sensor bias (O,) added to every observation."""
+        """Sensor bias (O,) added to every observation, of parameters (N,) in physical units as they hold in ``log``."""
         return np.zeros(len(self.channels))
 
     @abstractmethod
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
         """For each channel the column of the physics state that it measures directly, if it does."""
 
     def history(
-        self, model: Any, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
+        self, model: mujoco.MjModel, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
     ) -> FloatArray:
-        """States (L, S) whose command history holds the ``actions`` ((n, A), one row a physics step, newest last)
-        that came before each of them. Without delayed actuators the states are returned as they are."""
+        """Fill the command history, which is part of the state; without delayed actuators there is none.
+
+        Args:
+            model: the compiled one.
+            states: (B, S).
+            actions: for each state those that came before it, (n, A), one row a physics step, the newest last.
+            timestep: (B,) seconds of a physics step.
+
+        Returns:
+            States (B, S).
+        """
         return states

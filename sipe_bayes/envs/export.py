@@ -7,20 +7,17 @@ field before it gets its name, so what is written is what was calibrated.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
 
-FloatArray = NDArray[np.float64]
-
-_INERTIA_FROM_GEOMS, _INERTIA_AUTO = 1, 2
-_RELATIVE = 1e-4  # of what a six-digit file may change in derived fields
+_INERTIA_FROM_GEOMS, _INERTIA_AUTO = 1, 2  # mjtInertiaFromGeom, which Python does not have
+_SIX_DIGITS = {"rtol": 1e-4, "atol": 1e-10}  # what a file of six digits may change in derived fields
 
 
 class ExportError(RuntimeError):
@@ -28,8 +25,19 @@ class ExportError(RuntimeError):
 
 
 def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Path) -> list[str]:
-    """Write the MJCF at ``values`` (N,) to ``path``; returns remarks in words. Parameters that differ between logs
-    take their mean; sensor biases have no place in a model and are named. Raises ExportError."""
+    """Write the MJCF at some values of its parameters. Those that differ between logs take their mean.
+
+    Args:
+        environment: whose MJCF.
+        values: (N,), in physical units.
+        path: the file.
+
+    Returns:
+        Remarks in words: sensor biases have no place in a model and are named.
+
+    Raises:
+        ExportError: where the written model would not be the calibrated one.
+    """
     model = environment.compile()
     environment.write(model, values)
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -58,19 +66,19 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
     ]
 
 
-def differing_fields(a: Any, b: Any) -> list[str]:
+def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
     """Names of the numeric fields in which two models differ by more than six digits explain."""
-    found = []
+    differing = []
     for name in sorted(n for n in dir(a) if not n.startswith(("_", "bvh", "oct", "tex", "name", "path"))):
         x, y = getattr(a, name), getattr(b, name)
         if isinstance(x, np.ndarray) and x.dtype.kind == "f" and x.size:
             scale = float(np.abs(x).max())
-            if x.shape != y.shape or not np.allclose(x, y, rtol=_RELATIVE, atol=1e-5 * scale + 1e-10):
-                found.append(name)
-    return found
+            if x.shape != y.shape or not np.allclose(x, y, _SIX_DIGITS["rtol"], 1e-5 * scale + _SIX_DIGITS["atol"]):
+                differing.append(name)
+    return differing
 
 
-def _absolute_assets(spec: Any, source: str) -> None:
+def _absolute_assets(spec: mujoco.MjSpec, source: str) -> None:
     """Let the written file find meshes and textures from any folder."""
     if source.lstrip().startswith("<"):
         return
@@ -80,7 +88,7 @@ def _absolute_assets(spec: Any, source: str) -> None:
             setattr(spec, attribute, str(folder / getattr(spec, attribute)))
 
 
-def _copy(spec: Any, model: Any, target: str) -> None:
+def _copy(spec: mujoco.MjSpec, model: mujoco.MjModel, target: str) -> None:
     kind, name, attribute = split(target)
     if kind == "body":
         _copy_inertial(spec, model, name)
@@ -96,7 +104,7 @@ def _copy(spec: Any, model: Any, target: str) -> None:
         spec.option.density, spec.option.viscosity = model.opt.density, model.opt.viscosity
 
 
-def _copy_inertial(spec: Any, model: Any, name: str) -> None:
+def _copy_inertial(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> None:
     compiler = spec.compiler
     everything = compiler.inertiafromgeom == _INERTIA_FROM_GEOMS or compiler.settotalmass > 0
     if everything:  # both would overrule an inertial that is written down
@@ -111,7 +119,7 @@ def _copy_inertial(spec: Any, model: Any, name: str) -> None:
             body.fullinertia[:] = np.nan
 
 
-def _copy_joint(spec: Any, model: Any, name: str, attribute: str) -> None:
+def _copy_joint(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str, attribute: str) -> None:
     joint, index = spec.joint(name), model.joint(name).id
     dof = int(model.jnt_dofadr[index])
     if attribute == "damping":
@@ -126,7 +134,7 @@ def _copy_joint(spec: Any, model: Any, name: str, attribute: str) -> None:
         setattr(joint, attribute, float(getattr(model, f"dof_{attribute}")[dof]))
 
 
-def _copy_actuator(spec: Any, model: Any, name: str) -> None:
+def _copy_actuator(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> None:
     actuator, index = spec.actuator(name), model.actuator(name).id
     actuator.gear[:] = model.actuator_gear[index]
     actuator.gainprm[:] = model.actuator_gainprm[index]

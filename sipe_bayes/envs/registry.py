@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from typing import TYPE_CHECKING
+
+from sipe_bayes.core.validation import nearest_name
 
 if TYPE_CHECKING:
     from sipe_bayes.envs.task import Task
@@ -29,9 +30,8 @@ TASKS = {
 def make_task(name: str) -> Task:
     """The task called ``name``; raises ValueError that suggests the nearest."""
     if name not in TASKS:
-        close = difflib.get_close_matches(name, TASKS, 1, 0.5)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(TASKS)}"
-        raise ValueError(f"environment: no {name!r}; {hint}")
+        hint = nearest_name(name, TASKS, 0.5) or f"; known: {', '.join(TASKS)}"
+        raise ValueError(f"environment: no {name!r}{hint}")
     module, function = TASKS[name]
     task: Task = getattr(importlib.import_module(module), function)()
     return task

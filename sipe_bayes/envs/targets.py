@@ -1,5 +1,4 @@
-"""What a parameter may change in a MuJoCo model: targets such as ``"body:rod.mass"``, read and written in
-place.
+"""What a parameter may change in a MuJoCo model: targets such as ``"body:rod.mass"``, read and written in place.
 
 A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's options). ``bind`` looks it up in a
 compiled model and returns a ``Target`` that knows its unit, its present value and how to write another one
@@ -12,16 +11,19 @@ other two. Several inertia components of a body compose, each leaving the others
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 
-Writer = Callable[[Any, float], None]
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.validation import nearest_name
+
+Writer = Callable[[mujoco.MjModel, float], None]
+Maker = Callable[[mujoco.MjModel, str, int, str], "Target"]
+Index = int | tuple[int, int]
 
 _PATTERN = re.compile(r"^(?:(body|joint|actuator|geom):(.+)|(option))\.([a-z0-9_]+)$")
 _OBJECTS = {
@@ -33,6 +35,7 @@ _OBJECTS = {
 }
 _COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nactuator", "geom": "ngeom", "sensor": "nsensor"}
 _AXES = ("x", "y", "z")
+_ROUNDING = 1e-9  # relative, of principal moments that diagonalising leaves
 
 
 class TargetError(ValueError):
@@ -41,9 +44,19 @@ class TargetError(ValueError):
 
 @dataclass(frozen=True)
 class Target:
-    """One number of a compiled model. ``order``: writes with a smaller order come first. ``constants``:
-    MuJoCo's derived constants depend on it, so mj_setConst follows a write. ``minimum``: the smallest
-    physical value. ``step``: the least change that a finite difference can be taken over, from values below it."""
+    """One number of a compiled model.
+
+    Args:
+        spec: how it is named.
+        unit: of its value.
+        value: in the model that it is bound to.
+        write: writes another one into a copy of that model.
+        order: writes with a smaller order come first.
+        constants: MuJoCo's derived constants depend on it, so mj_setConst follows a write.
+        minimum: the smallest physical value.
+        physical: whether it is a property of the machine that a report may compare with the model's.
+        step: the least change that a finite difference can be taken over, from values below it.
+    """
 
     spec: str
     unit: str
@@ -56,15 +69,14 @@ class Target:
     step: float = 0.0
 
 
-def named(model: Any, kind: str, name: str, where: str) -> int:
+def named(model: mujoco.MjModel, kind: str, name: str, where: str) -> int:
     """Id of an object of ``kind``; raises TargetError that lists what there is."""
     index = mujoco.mj_name2id(model, _OBJECTS[kind], name)
     if index < 0:
         names = [mujoco.mj_id2name(model, _OBJECTS[kind], i) for i in range(getattr(model, _COUNTS[kind]))]
         known = [n for n in names if n]
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"the model has {known}"
-        raise TargetError(f"{where}: the model has no {kind} {name!r}; {hint}")
+        hint = nearest_name(name, known) or f"; the model has {known}"
+        raise TargetError(f"{where}: the model has no {kind} {name!r}{hint}")
     return index
 
 
@@ -79,37 +91,46 @@ def split(spec: str) -> tuple[str, str, str]:
     return (option or kind, name or "", attribute)
 
 
-def bind(model: Any, spec: str) -> Target:
+def bind(model: mujoco.MjModel, spec: str) -> Target:
     """The target ``spec`` of ``model``; raises TargetError naming what is unknown."""
     kind, name, attribute = split(spec)
-    legal = _ATTRIBUTES[kind]
+    legal = ATTRIBUTES[kind]
     if attribute not in legal:
-        article, close = "an" if kind[0] in "ao" else "a", difflib.get_close_matches(attribute, legal, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(sorted(legal))}"
-        raise TargetError(f"target {spec!r}: {article} {kind} has no attribute {attribute!r}; {hint}")
+        article = "an" if kind[0] in "ao" else "a"
+        hint = nearest_name(attribute, legal) or f"; known: {', '.join(sorted(legal))}"
+        raise TargetError(f"target {spec!r}: {article} {kind} has no attribute {attribute!r}{hint}")
     index = 0 if kind == "option" else named(model, kind, name, f"target {spec!r}")
     return legal[attribute](model, spec, index, attribute)
 
 
-def _array_target(spec: str, unit: str, field: str, index: Any, model: Any, **kwargs: Any) -> Target:
-    def write(other: Any, value: float) -> None:
+def _array_target(
+    spec: str,
+    unit: str,
+    field: str,
+    index: Index,
+    model: mujoco.MjModel,
+    constants: bool = False,
+    minimum: float = -np.inf,
+    order: int = 0,
+) -> Target:
+    def write(other: mujoco.MjModel, value: float) -> None:
         getattr(other, field)[index] = value
 
-    return Target(spec, unit, float(getattr(model, field)[index]), write, **kwargs)
+    return Target(spec, unit, float(getattr(model, field)[index]), write, order, constants, minimum)
 
 
-def _hinge(model: Any, joint: int) -> bool:
+def _hinge(model: mujoco.MjModel, joint: int) -> bool:
     return int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 
 
-def _scalar_joint(model: Any, joint: int, spec: str) -> int:
+def _scalar_joint(model: mujoco.MjModel, joint: int, spec: str) -> int:
     if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
         raise TargetError(f"target {spec!r}: only hinge and slide joints have this attribute")
     return int(model.jnt_dofadr[joint])
 
 
-def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) -> Callable[..., Target]:
-    def make(model: Any, spec: str, joint: int, attribute: str) -> Target:
+def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, joint: int, attribute: str) -> Target:
         start = int(model.jnt_dofadr[joint])
         size = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(
             int(model.jnt_type[joint]), 1
@@ -117,7 +138,7 @@ def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) 
         unit = hinge_unit if _hinge(model, joint) else slide_unit
         value = float(getattr(model, field)[start])
 
-        def write(other: Any, number: float) -> None:
+        def write(other: mujoco.MjModel, number: float) -> None:
             getattr(other, field)[start : start + size] = number
 
         return Target(spec, unit, value, write, constants=constants, minimum=0.0)
@@ -125,42 +146,42 @@ def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) 
     return make
 
 
-def _joint_stiffness(model: Any, spec: str, joint: int, attribute: str) -> Target:
+def _joint_stiffness(model: mujoco.MjModel, spec: str, joint: int, attribute: str) -> Target:
     unit = "N m/rad" if _hinge(model, joint) else "N/m"
     return _array_target(spec, unit, "jnt_stiffness", joint, model, minimum=0.0)
 
 
-def _joint_springref(model: Any, spec: str, joint: int, attribute: str) -> Target:
+def _joint_springref(model: mujoco.MjModel, spec: str, joint: int, attribute: str) -> Target:
     _scalar_joint(model, joint, spec)
     unit = "rad" if _hinge(model, joint) else "m"
     return _array_target(spec, unit, "qpos_spring", int(model.jnt_qposadr[joint]), model)
 
 
-def _actuator_gear(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_gear(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
     return _array_target(spec, "1", "actuator_gear", (actuator, 0), model, constants=True)
 
 
-def _fixed_gain(model: Any, actuator: int, spec: str) -> None:
+def _fixed_gain(model: mujoco.MjModel, actuator: int, spec: str) -> None:
     if int(model.actuator_gaintype[actuator]) != int(mujoco.mjtGain.mjGAIN_FIXED):
         raise TargetError(f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)")
 
 
-def _affine_bias(model: Any, actuator: int, spec: str) -> None:
+def _affine_bias(model: mujoco.MjModel, actuator: int, spec: str) -> None:
     legal = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
     if int(model.actuator_biastype[actuator]) not in legal:
         raise TargetError(f"target {spec!r}: needs an actuator whose bias is none or affine")
 
 
-def _actuator_gain(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_gain(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
     _fixed_gain(model, actuator, spec)
     return _array_target(spec, "force/command", "actuator_gainprm", (actuator, 0), model)
 
 
-def _actuator_bias(slot: int, unit: str) -> Callable[..., Target]:
-    def make(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_bias(slot: int, unit: str) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
         _affine_bias(model, actuator, spec)
 
-        def write(other: Any, value: float) -> None:
+        def write(other: mujoco.MjModel, value: float) -> None:
             other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
             other.actuator_biasprm[actuator, slot] = value
 
@@ -169,7 +190,7 @@ def _actuator_bias(slot: int, unit: str) -> Callable[..., Target]:
     return make
 
 
-def _actuator_kp(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_kp(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
     _fixed_gain(model, actuator, spec)
     _affine_bias(model, actuator, spec)
     gain, position = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_biasprm[actuator, 1])
@@ -179,7 +200,7 @@ def _actuator_kp(model: Any, spec: str, actuator: int, attribute: str) -> Target
             f"{gain:g}; give gain and bias_position instead"
         )
 
-    def write(other: Any, value: float) -> None:
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
         other.actuator_gainprm[actuator, 0] = value
         other.actuator_biasprm[actuator, 1] = -value
@@ -187,84 +208,85 @@ def _actuator_kp(model: Any, spec: str, actuator: int, attribute: str) -> Target
     return Target(spec, "force/position", gain, write, minimum=0.0)
 
 
-def _actuator_kv(model: Any, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_kv(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
     _affine_bias(model, actuator, spec)
 
-    def write(other: Any, value: float) -> None:
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
         other.actuator_biasprm[actuator, 2] = -value
 
     return Target(spec, "force/velocity", -float(model.actuator_biasprm[actuator, 2]), write, minimum=0.0)
 
 
-def _actuator_offset(model: Any, spec: str, actuator: int, attribute: str) -> Target:
-    """A constant added to the command behind its limits and dynamics: gain * offset joins the model's bias
-    force."""
+def _actuator_offset(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
+    """A constant added to the command behind its limits and dynamics: gain * offset joins the model's bias force."""
     _fixed_gain(model, actuator, spec)
     _affine_bias(model, actuator, spec)
     base = float(model.actuator_biasprm[actuator, 0])
 
-    def write(other: Any, value: float) -> None:
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
         other.actuator_biasprm[actuator, 0] = base + other.actuator_gainprm[actuator, 0] * value
 
     return Target(spec, "command", 0.0, write, order=2, physical=False)
 
 
-def _actuator_delay(model: Any, spec: str, actuator: int, attribute: str) -> Target:
-    """MuJoCo reads a delayed command before it stores the present one: any delay above zero up to one physics
-    step acts as one physics step, and zero as none; beyond one step it is interpolated between steps. A difference over less than two steps sees
-    either nothing or the whole first one."""
+def _actuator_delay(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
+    """MuJoCo reads a delayed command before it stores the present one.
 
-    def write(other: Any, value: float) -> None:
+    Any delay above zero up to one physics step acts as one physics step, and zero as none; beyond one step it is
+    interpolated between steps. A difference over less than two steps sees either nothing or the whole first one.
+    """
+
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.actuator_delay[actuator] = value
 
     present, step = float(model.actuator_delay[actuator]), 2 * float(model.opt.timestep)
     return Target(spec, "s", present, write, minimum=0.0, physical=False, step=step)
 
 
-def _geom_friction(slot: int, unit: str) -> Callable[..., Target]:
-    def make(model: Any, spec: str, geom: int, attribute: str) -> Target:
+def _geom_friction(slot: int, unit: str) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, geom: int, attribute: str) -> Target:
         return _array_target(spec, unit, "geom_friction", (geom, slot), model, minimum=0.0)
 
     return make
 
 
-def _body_mass(model: Any, spec: str, body: int, attribute: str) -> Target:
+def _body_mass(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> Target:
     mass, inertia = float(model.body_mass[body]), model.body_inertia[body].copy()
     axes = model.body_iquat[body].copy()
     if mass <= 0:
         raise TargetError(f"target {spec!r}: the body has no mass of its own to scale; give it one in the MJCF")
 
-    def write(other: Any, value: float) -> None:
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.body_mass[body] = value
         other.body_inertia[body], other.body_iquat[body] = inertia * (value / mass), axes
 
     return Target(spec, "kg", mass, write, constants=True, minimum=0.0)
 
 
-def _body_com(axis: int) -> Callable[..., Target]:
-    def make(model: Any, spec: str, body: int, attribute: str) -> Target:
+def _body_com(axis: int) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> Target:
         return _array_target(spec, "m", "body_ipos", (body, axis), model, order=1, constants=True)
 
     return make
 
 
-def _rotation(quaternion: Any) -> Any:
+def _rotation(quaternion: FloatArray) -> FloatArray:
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)
 
 
-def body_frame_inertia(model: Any, body: int) -> Any:
+def body_frame_inertia(model: mujoco.MjModel, body: int) -> FloatArray:
     """Inertia (3, 3) in kg m^2 about the centre of mass, in the axes of the body's frame."""
     rotation = _rotation(model.body_iquat[body])
     return rotation @ np.diag(model.body_inertia[body]) @ rotation.T
 
 
-def _body_inertia(row: int, column: int) -> Callable[..., Target]:
-    def make(model: Any, spec: str, body: int, attribute: str) -> Target:
-        def write(other: Any, value: float) -> None:
+def _body_inertia(row: int, column: int) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> Target:
+        def write(other: mujoco.MjModel, value: float) -> None:
             matrix = body_frame_inertia(other, body)
             matrix[row, column] = matrix[column, row] = value
             moments, quaternion = np.diag(matrix).copy(), np.array([1.0, 0, 0, 0])
@@ -279,7 +301,7 @@ def _body_inertia(row: int, column: int) -> Callable[..., Target]:
     return make
 
 
-def restore_inertia(model: Any, original: Any, bodies: list[int]) -> None:
+def restore_inertia(model: mujoco.MjModel, original: mujoco.MjModel, bodies: list[int]) -> None:
     """Give the bodies the inertia that they have in the model ``original``."""
     model.body_inertia[bodies], model.body_iquat[bodies] = (
         original.body_inertia[bodies],
@@ -287,15 +309,15 @@ def restore_inertia(model: Any, original: Any, bodies: list[int]) -> None:
     )
 
 
-def check_inertia(model: Any, bodies: list[int]) -> bool:
+def check_inertia(model: mujoco.MjModel, bodies: list[int]) -> bool:
     """Whether the principal moments of the bodies are ones a rigid body can have: positive, A + B >= C."""
     moments = np.sort(model.body_inertia[bodies], axis=1)
-    return bool((moments[:, 0] >= 0).all() and (moments[:, 2] <= moments[:, :2].sum(1) * (1 + 1e-9)).all())
+    return bool((moments[:, 0] >= 0).all() and (moments[:, 2] <= moments[:, :2].sum(1) * (1 + _ROUNDING)).all())
 
 
-def _option(field: str, slot: int | None, unit: str) -> Callable[..., Target]:
-    def make(model: Any, spec: str, index: int, attribute: str) -> Target:
-        def write(other: Any, value: float) -> None:
+def _option(field: str, slot: int | None, unit: str) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, index: int, attribute: str) -> Target:
+        def write(other: mujoco.MjModel, value: float) -> None:
             if slot is None:
                 setattr(other.opt, field, value)
             else:
@@ -307,7 +329,7 @@ def _option(field: str, slot: int | None, unit: str) -> Callable[..., Target]:
     return make
 
 
-_ATTRIBUTES: dict[str, dict[str, Callable[..., Target]]] = {
+ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds it
     "body": {
         "mass": _body_mass,
         **{f"com_{a}": _body_com(i) for i, a in enumerate(_AXES)},

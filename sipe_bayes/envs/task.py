@@ -15,28 +15,37 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
+import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.targets import Target, bind
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Variant = Literal["default", "in_distribution", "out_of_distribution"]
 VARIANTS: tuple[Variant, ...] = ("default", "in_distribution", "out_of_distribution")
 
-_INSIDE = (0.1, 0.4)  # how far from 0.5 an in-distribution theta lies
-_OUTSIDE = (0.05, 0.2)  # how far beyond the bounds an out-of-distribution theta lies
+_VARIANT_DISTANCES = {  # least and greatest
+    "in_distribution": (0.1, 0.4),  # of theta from 0.5
+    "out_of_distribution": (0.05, 0.2),  # of theta from the bounds
+}
 
 
 @dataclass(frozen=True)
 class Transition:
-    """Control steps of any leading shape (...,): states (..., S), derived (..., D) or None, actions (..., A), what
-    followed, and goals (..., G) or None."""
+    """Control steps of any leading shape (...,), and what followed.
+
+    Args:
+        states: (..., S).
+        derived: (..., D) or None.
+        actions: (..., A).
+        next_states: (..., S).
+        next_derived: (..., D) or None.
+        goals: (..., G) or None.
+    """
 
     states: FloatArray
     derived: FloatArray | None
@@ -48,8 +57,12 @@ class Transition:
 
 @dataclass(frozen=True)
 class Solved:
-    """When a task counts as solved: the mean return of an episode, or the share of successful ones, at or above
-    ``threshold``."""
+    """When a task counts as solved.
+
+    Args:
+        measure: the mean return of an episode, or the share of successful ones.
+        threshold: what it has to reach.
+    """
 
     measure: Literal["return", "success"]
     threshold: float
@@ -59,10 +72,17 @@ class Solved:
 class Task(Environment):
     """One of the benchmark's environments. Immutable and picklable.
 
-    parameters: theta = 0.5 is the model as published. episode_steps: control steps of an episode. solved: its threshold.
-    action_low, action_high: bounds of each action, the same for all. reference: the published environment that
-    theta = 0.5 reproduces. outside_sign: per parameter -1 or 1, the side on which the out-of-distribution variant
-    lies; default by a seed of the name.
+    Args:
+        name: as in the registry.
+        parameters: theta = 0.5 is the model as published.
+        summary: one sentence.
+        episode_steps: control steps of an episode.
+        solved: its threshold.
+        reference: the published environment that theta = 0.5 reproduces.
+        action_low: least value of each action.
+        action_high: greatest value of each action.
+        outside_sign: per parameter -1 or 1, the side on which the out-of-distribution variant lies; default by a seed
+            of the name.
     """
 
     name: str
@@ -77,6 +97,7 @@ class Task(Environment):
 
     @property
     def space(self) -> ParameterSpace:  # type: ignore[override]
+        """The parameters."""
         return self.parameters
 
     @abstractmethod
@@ -85,11 +106,12 @@ class Task(Environment):
 
     @abstractmethod
     def reward(self, step: Transition) -> FloatArray:
-        """(...,)."""
+        """What each of the steps earns, (...,)."""
 
     def rewards(
         self, states: FloatArray, derived: FloatArray | None, actions: FloatArray, goals: FloatArray | None
     ) -> FloatArray:
+        """``reward`` of every control step, (B, T)."""
         before, after = (None, None) if derived is None else (derived[:, :-1], derived[:, 1:])
         targets = None if goals is None else goals[:, None]
         return self.reward(Transition(states[:, :-1], before, actions, states[:, 1:], after, targets))
@@ -99,7 +121,7 @@ class Task(Environment):
         return np.zeros(step.actions.shape[:-1], bool)
 
     def hopeless(self, states: FloatArray) -> BoolArray:
-        """(...,) of states (..., S): whether a training may end an episode that the task goes on with; by default never."""
+        """Whether a training may end an episode that the task goes on with, (...,) of states (..., S); never by default."""
         return np.zeros(states.shape[:-1], bool)
 
     def success(self, step: Transition) -> BoolArray | None:
@@ -107,7 +129,15 @@ class Task(Environment):
         return None
 
     def excitation(self, observations: FloatArray, rng: np.random.Generator) -> FloatArray | None:
-        """Actions (B, A) that show the task's parameters from observations (B, O), where smooth random ones would not."""
+        """Actions that show the task's parameters where smooth random ones would not.
+
+        Args:
+            observations: (B, O).
+            rng: where their noise comes from.
+
+        Returns:
+            (B, A), or None where smooth random ones do.
+        """
         return None
 
     def achieved_goals(self, states: FloatArray, derived: FloatArray | None) -> FloatArray | None:
@@ -118,15 +148,16 @@ class Task(Environment):
         """(...,) of achieved and desired goals (..., G), for hindsight relabelling."""
         raise ValueError(f"goals: {self.name} has none; take the rewards of its steps")
 
-    def control(self, model: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
+    def control(self, model: mujoco.MjModel, states: FloatArray, actions: FloatArray) -> FloatArray:
+        """By default the actions themselves."""
         return actions
 
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
         """By default no channel is known to be a column of the state."""
         return (None,) * len(self.channels)
 
     @cached_property
-    def published(self) -> Any:
+    def published(self) -> mujoco.MjModel:
         """The mujoco.MjModel at theta = 0.5; not to be written to."""
         return self.compile()
 
@@ -145,9 +176,11 @@ class Task(Environment):
 
     @property
     def needs_constants(self) -> bool:
+        """Whether MuJoCo's derived constants depend on any of the parameters."""
         return any(target.constants for _, _, target in self._writes)
 
-    def write(self, model: Any, values: FloatArray, log: str | None = None) -> bool:
+    def write(self, model: mujoco.MjModel, values: FloatArray, log: str | None = None) -> bool:
+        """Write all targets of the parameters; see ``Environment.write``."""
         physical = True
         for j, multiplier, target in self._writes:
             value = multiplier * float(values[j])
@@ -165,22 +198,30 @@ class Task(Environment):
         if variant == "default":
             return np.full(n, 0.5)
         rng = np.random.default_rng(zlib.crc32(f"{self.name}/{variant}".encode()))
-        sign = rng.choice((-1.0, 1.0), n)
+        sign, distances = rng.choice((-1.0, 1.0), n), _VARIANT_DISTANCES[variant]
         if variant == "in_distribution":
-            return 0.5 + sign * rng.uniform(*_INSIDE, n)
+            return 0.5 + sign * rng.uniform(*distances, n)
         sign = sign if self.outside_sign is None else np.array(self.outside_sign, float)
-        return 0.5 + sign * (0.5 + rng.uniform(*_OUTSIDE, n))
+        return 0.5 + sign * (0.5 + rng.uniform(*distances, n))
 
     def states(self, qpos: FloatArray, qvel: FloatArray) -> FloatArray:
-        """Physics states (B, S) at time 0 of positions (B, nq) and velocities (B, nv), activations and memory zero."""
+        """States at time 0, activations and memory zero.
+
+        Args:
+            qpos: (B, nq).
+            qvel: (B, nv).
+
+        Returns:
+            (B, S).
+        """
         model, count = self.published, len(qpos)
         rest = np.zeros((count, model.na + model.nhistory + self.memory_size))
         return np.concatenate([np.zeros((count, 1)), qpos, qvel, rest], axis=1)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
 
 
@@ -193,7 +234,17 @@ def scaled(
     low: float = 0.5,
     high: float = 1.5,
 ) -> Parameter:
-    """A parameter between ``low`` and ``high`` times the published value, which is theta = 0.5."""
+    """A parameter whose published value is theta = 0.5.
+
+    Args:
+        name: its name.
+        default: the published value.
+        targets: what it writes.
+        unit: of the value.
+        description: what it does to the motion, and what it trades off against.
+        low: lower bound, times the published value.
+        high: upper bound, times the published value.
+    """
     return Parameter(
         name, low * default, high * default, default, unit, targets=tuple(targets), description=description
     )

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.envs.assets import gymnasium_asset
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Transition
-from sipe_bayes.envs.tasks.half_cheetah import gymnasium_asset
 from sipe_bayes.envs.tasks.hopper import Hopper
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.lengthened import compiled, differences, edited

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sipe_bayes.envs.assets import gymnasium_asset
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.targets import body_frame_inertia
-from sipe_bayes.envs.tasks.humanoid import Humanoid, humanoid_file
+from sipe_bayes.envs.tasks.humanoid import Humanoid
 from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
@@ -152,7 +153,7 @@ def test_every_parameter_moves_it(simulator: Simulator) -> None:
 
 def edited(task: Humanoid, theta: FloatArray) -> Any:
     """The model compiled from humanoid.xml with theta written into its text."""
-    root = ElementTree.parse(humanoid_file()).getroot()
+    root = ElementTree.parse(gymnasium_asset("humanoid.xml")).getroot()
     factors = {p.name: v / p.default for p, v in zip(task.space, task.space.values(theta), strict=True)}
     {"HumanoidLinks": edit_links, "HumanoidJoints": edit_joints}[task.name](root, factors)
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, "unicode"))

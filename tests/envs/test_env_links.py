@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.envs.assets import gymnasium_asset
 from sipe_bayes.envs.targets import TargetError
-from sipe_bayes.envs.tasks.half_cheetah import gymnasium_asset
 from sipe_bayes.envs.tasks.links import Links
 from tests.problems.lengthened import compiled, differences, edited, read
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment, ModelError
+from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.simulation.simulator import Simulator
 

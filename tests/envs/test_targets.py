@@ -208,7 +208,7 @@ def test_writing_in_place_is_compiling_the_edited_model(target: str, value: floa
 
 def test_the_table_covers_every_attribute() -> None:
     covered = {(targets.split(c[0])[0], targets.split(c[0])[2]) for c in CASES}
-    every = {(kind, attribute) for kind, legal in targets._ATTRIBUTES.items() for attribute in legal}
+    every = {(kind, attribute) for kind, legal in targets.ATTRIBUTES.items() for attribute in legal}
     alike = {  # the same lines with another index
         *(("body", f"com_{a}") for a in "xyz"),
         *(("option", f"{f}_{a}") for f in ("gravity", "wind") for a in "xyz"),

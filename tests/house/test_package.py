@@ -32,7 +32,7 @@ from sipe_bayes.calibration.config_tables import (
 from sipe_bayes.calibration.tables import READERS
 from sipe_bayes.core.units import UNITS
 from sipe_bayes.diagnostics.catalogue import tasks
-from sipe_bayes.envs.targets import _ATTRIBUTES
+from sipe_bayes.envs.targets import ATTRIBUTES
 from sipe_bayes.inference import ESTIMATORS, estimator_class
 
 ROOT = Path(__file__).parents[2]
@@ -178,7 +178,7 @@ def rows(heading: str) -> dict[str, str]:
 def target_words() -> list[str]:
     return [
         f"{kind}.{attribute}" if kind == "option" else f"{kind}:NAME.{attribute}"
-        for kind, attributes in _ATTRIBUTES.items()
+        for kind, attributes in ATTRIBUTES.items()
         for attribute in attributes
     ]
 

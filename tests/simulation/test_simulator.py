@@ -17,7 +17,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.mjcf import Channel, MjcfEnvironment
+from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.simulation.engine import Engine
 from sipe_bayes.simulation.simulator import Memory, Simulator
 

@@ -21,33 +21,54 @@ radius above 4 cm is on the table.
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.envs.assets import robotics_asset
 from sipe_bayes.envs.targets import Target, named
 from sipe_bayes.envs.task import Solved, Task, Transition, scaled
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
-_FOLDER = "envs/assets/adroit_hand"
 _FINGERS = ("FFJ3", "FFJ2", "FFJ1", "FFJ0", "MFJ3", "MFJ2", "MFJ1", "MFJ0", "RFJ3", "RFJ2", "RFJ1", "RFJ0")
 _HAND = ("WRJ1", "WRJ0", *_FINGERS, "LFJ4", "LFJ3", "LFJ2", "LFJ1", "LFJ0", "THJ4", "THJ3", "THJ2", "THJ1", "THJ0")
 _PALM = "S_grasp"
 
-_DOOR_POSITION = (-0.25, 0.3, 0.301)  # of the frame in m, the middle of the published class's box
-_AJAR, _WIDE, _OPEN, _STOP = 0.2, 1.0, 1.35, 1.57  # angles of the door hinge in rad
 
-_LIFTED = 0.04  # height of the ball's centre in m
-_NEAR, _AT_TARGET = 0.1, 0.05  # of ball and target, m
+@dataclass(frozen=True)
+class _Door:
+    """AdroitHandDoor-v1's numbers; angles of the hinge in rad, each with what is paid beyond it."""
+
+    position: tuple[float, float, float] = (-0.25, 0.3, 0.301)  # of the frame in m, the middle of the published box
+    ajar: float = 0.2
+    wide: float = 1.0
+    open: float = 1.35
+    stop: float = 1.57
+    ajar_reward: float = 2.0
+    wide_reward: float = 8.0
+    open_reward: float = 10.0
+    distance_reward: float = 0.1  # per m
+    closed_cost: float = 0.1  # per rad^2
+    speed_cost: float = 1e-5
+
+
+@dataclass(frozen=True)
+class _Relocate:
+    """AdroitHandRelocate-v1's numbers, lengths in m."""
+
+    lifted: float = 0.04  # height of the ball's centre
+    near: float = 0.1  # of ball and target
+    at_target: float = 0.05  # likewise
+    near_reward: float = 10.0
+    at_target_reward: float = 20.0
+    distance_reward: float = 0.1  # per m
+
+
+_DOOR, _RELOCATE = _Door(), _Relocate()
 
 
 def _xyz(name: str) -> tuple[str, ...]:
@@ -68,16 +89,19 @@ class Adroit(Task):
     derived_late = True
     scene_file: ClassVar[str]
     observed: ClassVar[tuple[str, ...]]  # joints whose position comes first in an observation
-    places: ClassVar[tuple[tuple[str, Any], ...]]  # (name, mjOBJ) of what the sensordata holds the positions of
+    places: ClassVar[
+        tuple[tuple[str, mujoco.mjtObj], ...]
+    ]  # (name, mjOBJ) of what the sensordata holds the positions of
 
-    def compile(self) -> Any:
+    def compile(self) -> mujoco.MjModel:
+        """The simulated model: what is measured, without what is only seen."""
         return self._simulated(self._spec()).compile()
 
-    def scene(self) -> Any:
+    def scene(self) -> mujoco.MjModel:
         """The same model with its meshes and textures, to draw; its state is that of the simulated one."""
         return self._spec().compile()
 
-    def _simulated(self, spec: Any) -> Any:
+    def _simulated(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
         """The spec without what is only seen, measuring what is observed."""
         spec.compiler.discardvisual = True
         for sensor in list(spec.sensors):
@@ -86,13 +110,11 @@ class Adroit(Task):
             spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=kind, objname=name)
         return spec
 
-    def _spec(self) -> Any:
-        found = importlib.util.find_spec("gymnasium_robotics")  # found, not imported: that is slow
-        if found is None or found.origin is None:
-            raise ModuleNotFoundError(f"{self.name}: its model is part of gymnasium-robotics; install that package")
-        return mujoco.MjSpec.from_file(str(Path(found.origin).parent / _FOLDER / self.scene_file))
+    def _spec(self) -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_file(str(robotics_asset(f"adroit_hand/{self.scene_file}")))
 
-    def control(self, model: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
+    def control(self, model: mujoco.MjModel, states: FloatArray, actions: FloatArray) -> FloatArray:
+        """Joint positions: the actions, clipped, over the actuators' ranges."""
         middle, reach = self._command_range
         return middle + np.clip(actions, -1.0, 1.0) * reach
 
@@ -100,7 +122,8 @@ class Adroit(Task):
         """The one fixed start: every joint at zero and at rest."""
         return self.states(np.zeros((count, self.published.nq)), np.zeros((count, self.published.nv))), None
 
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
+        """Joint angles."""
         joints: list[int | None] = [self._position(name) for name in self.observed]
         return (*joints, *[None] * (len(self.channels) - len(joints)))
 
@@ -111,7 +134,7 @@ class Adroit(Task):
         return (low + high) / 2, (high - low) / 2
 
     @cached_property
-    def _observed_columns(self) -> NDArray[np.int64]:
+    def _observed_columns(self) -> IntArray:
         return np.array([self._position(name) for name in self.observed])
 
     def _position(self, joint: str) -> int:
@@ -131,21 +154,22 @@ class Door(Adroit):
     places = ((_PALM, mujoco.mjtObj.mjOBJ_SITE), ("S_handle", mujoco.mjtObj.mjOBJ_SITE))
     channels = (*observed, *_xyz("palm"), *_xyz("handle"), *_xyz("palm_minus_handle"), "door_open")
 
-    def _spec(self) -> Any:
+    def _spec(self) -> mujoco.MjSpec:
         spec = super()._spec()
-        spec.body("frame").pos[:] = _DOOR_POSITION
+        spec.body("frame").pos[:] = _DOOR.position
         spec.joint("latch").damping[0] = self.latch_damping
         return spec
 
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
+        """Joint angles, palm, handle, what is between them, and whether the door is open."""
         assert derived is not None
         observations = np.empty((*states.shape[:-1], len(self.channels)))
         observations[..., :29] = states[..., self._observed_columns]
         observations[..., 29:35] = derived
         np.subtract(derived[..., :3], derived[..., 3:], out=observations[..., 35:38])
-        observations[..., 38] = np.where(observations[..., 28] > _WIDE, 1.0, -1.0)
+        observations[..., 38] = np.where(observations[..., 28] > _DOOR.wide, 1.0, -1.0)
         return observations
 
     def reward(self, step: Transition) -> FloatArray:
@@ -153,12 +177,14 @@ class Door(Adroit):
         assert step.next_derived is not None
         hinge, palm, handle = self._hinge(step), step.next_derived[..., :3], step.next_derived[..., 3:]
         speed = step.next_states[..., 1 + self.published.nq :]
-        reward = 0.1 * _distance(palm, handle) - 0.1 * (hinge - _STOP) ** 2
-        reward -= 1e-5 * np.einsum("...i,...i->...", speed, speed)
-        return reward + 2.0 * (hinge > _AJAR) + 8.0 * (hinge > _WIDE) + 10.0 * (hinge > _OPEN)
+        reward = _DOOR.distance_reward * _distance(palm, handle) - _DOOR.closed_cost * (hinge - _DOOR.stop) ** 2
+        reward -= _DOOR.speed_cost * np.einsum("...i,...i->...", speed, speed)
+        reward = reward + _DOOR.ajar_reward * (hinge > _DOOR.ajar) + _DOOR.wide_reward * (hinge > _DOOR.wide)
+        return reward + _DOOR.open_reward * (hinge > _DOOR.open)
 
     def success(self, step: Transition) -> BoolArray:
-        return self._hinge(step) >= _OPEN
+        """Open."""
+        return self._hinge(step) >= _DOOR.open
 
     def _hinge(self, step: Transition) -> FloatArray:
         return step.next_states[..., self._observed_columns[28]]
@@ -179,8 +205,9 @@ class Relocate(Adroit):
     channels = (*observed, *_xyz("palm_minus_ball"), *_xyz("palm_minus_target"), *_xyz("ball_minus_target"))
 
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
+        """Joint angles, and what is between palm, ball and target."""
         assert derived is not None
         observations = np.empty((*states.shape[:-1], len(self.channels)))
         observations[..., :30] = states[..., self._observed_columns]
@@ -196,25 +223,31 @@ class Relocate(Adroit):
         palm, ball, target = (step.next_derived[..., i : i + 3] for i in (0, 3, 6))
         gap = _distance(ball, target)
         lifted = 1.0 - 0.5 * _distance(palm, target) - 0.5 * gap
-        reward = 0.1 * _distance(palm, ball) + np.where(ball[..., 2] > _LIFTED, lifted, 0.0)
-        return reward + 10.0 * (gap < _NEAR) + 20.0 * (gap < _AT_TARGET)
+        reward = _RELOCATE.distance_reward * _distance(palm, ball)
+        reward = reward + np.where(ball[..., 2] > _RELOCATE.lifted, lifted, 0.0)
+        reward = reward + _RELOCATE.near_reward * (gap < _RELOCATE.near)
+        return reward + _RELOCATE.at_target_reward * (gap < _RELOCATE.at_target)
 
     def success(self, step: Transition) -> BoolArray:
+        """The ball near its target."""
         assert step.next_derived is not None
-        return _distance(step.next_derived[..., 3:6], step.next_derived[..., 6:]) < _NEAR
+        return _distance(step.next_derived[..., 3:6], step.next_derived[..., 6:]) < _RELOCATE.near
 
     def bind(self, target: str) -> Target:
+        """As every task's, and ``ball:radius``."""
         return _ball_radius(self.published, target) if target == "ball:radius" else super().bind(target)
 
 
-def _ball_radius(model: Any, spec: str) -> Target:
-    """The radius at an unchanged mass: a solid sphere's inertia 2/5 m r^2 goes with its square. Written after the mass,
-    whose scale of the inertia is kept."""
+def _ball_radius(model: mujoco.MjModel, spec: str) -> Target:
+    """The radius at an unchanged mass: a solid sphere's inertia 2/5 m r^2 goes with its square.
+
+    Written after the mass, whose scale of the inertia is kept.
+    """
     geom, body = named(model, "geom", "sphere", spec), named(model, "body", "Object", spec)
     radius, mass = float(model.geom_size[geom, 0]), float(model.body_mass[body])
     inertia = model.body_inertia[body].copy()
 
-    def write(other: Any, value: float) -> None:
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.geom_size[geom, 0] = value
         other.body_inertia[body] = inertia * (other.body_mass[body] / mass * (value / radius) ** 2)
 

@@ -6,8 +6,8 @@ https://doi.org/10.1109/TSMC.1983.6313077), as MuJoCo models, one physics step a
 
 - There is friction: viscous damping at the pendulum's hinge and between cart and track. Without it the motion is the
   published one.
-- MuJoCo steps velocity first (semi-implicit Euler): so does Pendulum-v1, and CartPole-v1 where its ``kinematics_integrator``
-  is set so; by default that one steps forward (explicit Euler).
+- MuJoCo steps velocity first (semi-implicit Euler): so does Pendulum-v1, and CartPole-v1 where its
+  ``kinematics_integrator`` is set so; by default that one steps forward (explicit Euler).
 - The pendulum's speed has no limit; Pendulum-v1's is 8 rad/s.
 - The cart's action is a force between -10 and 10 N in units of 10 N; CartPole-v1 knows the two ends only.
 
@@ -18,15 +18,15 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.envs.base import FloatArray
 from sipe_bayes.envs.targets import Target, TargetError, named
-from sipe_bayes.envs.task import BoolArray, Solved, Task, Transition, scaled
+from sipe_bayes.envs.task import Solved, Task, Transition, scaled
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -60,22 +60,39 @@ CART_POLE = """
 </mujoco>
 """
 _ROD = re.compile(r"^rod:(.+)\.length$")
-_TORQUE = 2.0  # N m
-_HANGING = (np.pi, 1.0)  # the pendulum starts anywhere, at up to 1 rad/s
-_BALANCED = 0.05  # half-width of the cart's and the pole's starting states
-_TRACK, _FALLEN = 2.4, np.radians(12.0)  # m and rad, beyond which an episode ends
 
 
-def rod_length(model: Any, spec: str) -> Target:
-    """The target ``rod:NAME.length`` (m): a body NAME that is a uniform rod along z from its joint, drawn as the capsule
-    of that name. Its mass stays. Raises TargetError."""
+@dataclass(frozen=True)
+class _Published:
+    """Pendulum-v1's and CartPole-v1's numbers."""
+
+    torque: float = 2.0  # N m
+    hanging: tuple[float, float] = (np.pi, 1.0)  # the pendulum starts anywhere, at up to 1 rad/s
+    balanced: float = 0.05  # half-width of the cart's and the pole's starting states
+    track: float = 2.4  # m, beyond which an episode ends
+    fallen: float = float(np.radians(12.0))  # likewise
+
+
+_PUBLISHED = _Published()
+
+
+def rod_length(model: mujoco.MjModel, spec: str) -> Target:
+    """The target ``rod:NAME.length`` (m); the rod's mass stays.
+
+    Args:
+        model: in which the body NAME is a uniform rod along z from its joint, drawn as the capsule of that name.
+        spec: the target.
+
+    Raises:
+        TargetError: for another form, or a name that the model does not have.
+    """
     match = _ROD.match(spec)
     if not match:
         raise TargetError(f"target {spec!r}: expected rod:BODY.length")
     body, geom = (named(model, kind, match.group(1), f"target {spec!r}") for kind in ("body", "geom"))
     length, per_mass = 2 * float(model.body_ipos[body, 2]), model.body_inertia[body] / model.body_mass[body]
 
-    def write(other: Any, value: float) -> None:
+    def write(other: mujoco.MjModel, value: float) -> None:
         other.body_ipos[body, 2] = other.geom_pos[geom, 2] = other.geom_size[geom, 1] = value / 2
         other.body_inertia[body] = per_mass * other.body_mass[body] * (value / length) ** 2
 
@@ -90,10 +107,12 @@ class Classic(Task):
     num_actions = 1
     source: ClassVar[str]
 
-    def compile(self) -> Any:
+    def compile(self) -> mujoco.MjModel:
+        """The model of ``source``."""
         return mujoco.MjModel.from_xml_string(self.source)
 
     def bind(self, target: str) -> Target:
+        """As every task's, and ``rod:NAME.length``."""
         return rod_length(self.published, target) if target.startswith("rod:") else super().bind(target)
 
 
@@ -105,22 +124,25 @@ class Pendulum(Classic):
     channels = ("cos_angle", "sin_angle", "angular_velocity")
 
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
+        """Cosine and sine of the angle, and the speed."""
         angle = states[..., 1]
         return np.stack([np.cos(angle), np.sin(angle), states[..., 2]], axis=-1)
 
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
+        """The speed is measured directly."""
         return (None, None, 2)
 
     def reward(self, step: Transition) -> FloatArray:
         """Minus the squared angle from upright, with less for speed and torque, of the state that was acted in."""
         angle = (step.states[..., 1] + np.pi) % (2 * np.pi) - np.pi
-        torque = np.clip(step.actions[..., 0], -_TORQUE, _TORQUE)
+        torque = np.clip(step.actions[..., 0], -_PUBLISHED.torque, _PUBLISHED.torque)
         return np.asarray(-(angle**2 + 0.1 * step.states[..., 2] ** 2 + 0.001 * torque**2))
 
     def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, None]:
-        start = rng.uniform(-np.array(_HANGING), _HANGING, (count, 2))
+        """Uniform, about hanging and upright alike."""
+        start = rng.uniform(-np.array(_PUBLISHED.hanging), _PUBLISHED.hanging, (count, 2))
         return self.states(start[:, :1], start[:, 1:]), None
 
 
@@ -132,11 +154,13 @@ class CartPole(Classic):
     channels = ("cart_position", "cart_velocity", "pole_angle", "pole_velocity")
 
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
+        """Positions and velocities, of the cart and the pole."""
         return states[..., (1, 3, 2, 4)]
 
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
+        """All of them."""
         return (1, 3, 2, 4)
 
     def reward(self, step: Transition) -> FloatArray:
@@ -144,11 +168,13 @@ class CartPole(Classic):
         return np.ones(step.actions.shape[:-1])
 
     def terminated(self, step: Transition) -> BoolArray:
+        """Off the track, or fallen."""
         position, angle = step.next_states[..., 1], step.next_states[..., 2]
-        return np.asarray((np.abs(position) > _TRACK) | (np.abs(angle) > _FALLEN))
+        return np.asarray((np.abs(position) > _PUBLISHED.track) | (np.abs(angle) > _PUBLISHED.fallen))
 
     def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, None]:
-        start = rng.uniform(-_BALANCED, _BALANCED, (count, 4))
+        """Uniform, nearly balanced."""
+        start = rng.uniform(-_PUBLISHED.balanced, _PUBLISHED.balanced, (count, 4))
         return self.states(start[:, :2], start[:, 2:]), None
 
 
@@ -177,8 +203,8 @@ def pendulum() -> Pendulum:
         episode_steps=200,
         solved=Solved("return", -200.0),
         reference="gymnasium Pendulum-v1, damped",
-        action_low=-_TORQUE,
-        action_high=_TORQUE,
+        action_low=-_PUBLISHED.torque,
+        action_high=_PUBLISHED.torque,
     )
 
 
@@ -190,8 +216,8 @@ def cart_pole() -> CartPole:
             [
                 scaled(
                     *("pole_mass", 0.1, ["body:pole.mass"], "kg"),
-                    "How hard the pole pushes the cart about; a light one falls the same way whatever its mass, and it trades "
-                    "off against the friction.",
+                    "How hard the pole pushes the cart about; a light one falls the same way whatever its mass, and it "
+                    "trades off against the friction.",
                 ),
                 scaled(
                     *("pole_length", 1.0, ["rod:pole.length"], "m"),

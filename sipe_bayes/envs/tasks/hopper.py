@@ -2,34 +2,44 @@
 
 Model, observation, reward, starting states and ends are those of Gymnasium's Hopper-v5 (Erez, Tassa and Todorov,
 Infinite-Horizon Model Predictive Control for Periodic Tasks with Contacts, 2011,
-https://doi.org/10.15607/RSS.2011.VII.010): three motors, at most 1000 steps of 0.008 s, and an episode ends where the torso
-sinks below 0.7 m or leans by more than 0.2 rad. Velocities are observed up to 10 m/s or rad/s.
+https://doi.org/10.15607/RSS.2011.VII.010): three motors, at most 1000 steps of 0.008 s, and an episode ends where the
+torso sinks below 0.7 m or leans by more than 0.2 rad. Velocities are observed up to 10 m/s or rad/s.
 
-How a link grows is described in ``sipe_bayes.envs.tasks.links``. Lengths stay within a quarter of the published ones: on shorter
-legs the torso could not stand above 0.7 m. It starts at the same height whatever the leg: a long one begins pressed into
-the ground and pushes it up.
+How a link grows is described in ``sipe_bayes.envs.tasks.links``. Lengths stay within a quarter of the published ones:
+on shorter legs the torso could not stand above 0.7 m. It starts at the same height whatever the leg: a long one begins
+pressed into the ground and pushes it up.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.envs.base import FloatArray
-from sipe_bayes.envs.task import BoolArray, Solved, Transition, scaled
-from sipe_bayes.envs.tasks.half_cheetah import gymnasium_asset
+from sipe_bayes.envs.assets import compiled_without_visuals, gymnasium_asset
+from sipe_bayes.envs.task import Solved, Transition, scaled
 from sipe_bayes.envs.tasks.links import LinkTask
 
-_STEP = 0.008  # s, four physics steps
-_CONTROL_COST = 1e-3  # a step and squared action
-_ALIVE = 1.0  # a step
-_NOISE = 5e-3  # half-width of the starting states
-_FASTEST = 10.0  # of an observed velocity
-_LOWEST, _STEEPEST, _LARGEST = 0.7, 0.2, 100.0  # torso in m, in rad, and everything that follows in the state
+
+@dataclass(frozen=True)
+class _Published:
+    """Hopper-v5's numbers."""
+
+    step: float = 0.008  # s, four physics steps
+    control_cost: float = 1e-3  # a step and squared action
+    alive: float = 1.0  # a step
+    noise: float = 5e-3  # half-width of the starting states
+    fastest: float = 10.0  # of an observed velocity, m/s or rad/s
+    lowest: float = 0.7  # m, of the torso
+    steepest: float = 0.2  # rad, of the torso
+    largest: float = 100.0  # of everything that follows in the state
+    torso_mass: float = 3.665191429188092  # kg, of its geom at MuJoCo's density
+
+
+_PUBLISHED = _Published()
 _JOINTS = ("rootx", "rootz", "rooty", "thigh", "leg", "foot")
 _X, _Z, _PITCH, _VELOCITIES = 1, 2, 3, slice(7, 13)  # columns of the state, whose first is the time
 
@@ -42,49 +52,50 @@ class Hopper(LinkTask):
     num_actions = 3
     channels = ("torso_z", *(f"{j}_angle" for j in _JOINTS[2:]), *(f"{j}_velocity" for j in _JOINTS))
 
-    def compile(self) -> Any:
-        spec = mujoco.MjSpec.from_file(str(gymnasium_asset("hopper.xml")))
-        spec.compiler.discardvisual = True  # its textures
-        return spec.compile()
+    def compile(self) -> mujoco.MjModel:
+        """The published model."""
+        return compiled_without_visuals(gymnasium_asset("hopper.xml"))
 
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
+        """All of the state but the time and the way along the ground, velocities clipped."""
         observations = states[..., _Z : _VELOCITIES.stop].copy()
         velocities = observations[..., _VELOCITIES.start - _Z :]
-        np.clip(velocities, -_FASTEST, _FASTEST, out=velocities)
+        np.clip(velocities, -_PUBLISHED.fastest, _PUBLISHED.fastest, out=velocities)
         return observations
 
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
         """Angles and the height; a velocity is not measured beyond 10."""
         return (*range(_Z, _VELOCITIES.start), *[None] * (_VELOCITIES.stop - _VELOCITIES.start))
 
     def reward(self, step: Transition) -> FloatArray:
         """Speed forward in m/s, 1 for staying upright, less the cost of control."""
-        forward = (step.next_states[..., _X] - step.states[..., _X]) / _STEP
+        forward = (step.next_states[..., _X] - step.states[..., _X]) / _PUBLISHED.step
         effort = np.einsum("...a,...a->...", step.actions, step.actions)
-        return np.asarray(forward + _ALIVE * ~self.terminated(step) - _CONTROL_COST * effort)
+        return np.asarray(forward + _PUBLISHED.alive * ~self.terminated(step) - _PUBLISHED.control_cost * effort)
 
     def terminated(self, step: Transition) -> BoolArray:
+        """Too low, leaning too far, or out of all bounds."""
         states = step.next_states
-        upright = (states[..., _Z] > _LOWEST) & (np.abs(states[..., _PITCH]) < _STEEPEST)
-        return np.asarray(~(upright & (np.abs(states[..., _PITCH : _VELOCITIES.stop]) < _LARGEST).all(-1)))
+        upright = (states[..., _Z] > _PUBLISHED.lowest) & (np.abs(states[..., _PITCH]) < _PUBLISHED.steepest)
+        return np.asarray(~(upright & (np.abs(states[..., _PITCH : _VELOCITIES.stop]) < _PUBLISHED.largest).all(-1)))
 
     def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, None]:
+        """The published draw: uniform."""
         model = self.published
-        qpos = model.qpos0 + rng.uniform(-_NOISE, _NOISE, (count, model.nq))
-        return self.states(qpos, rng.uniform(-_NOISE, _NOISE, (count, model.nv))), None
+        qpos = model.qpos0 + rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nq))
+        return self.states(qpos, rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nv))), None
 
 
 def hopper() -> Hopper:
     """Hopper: mass of the torso, three lengths, friction of the foot, damping of the joints."""
-    mass = 3.665191429188092
     return Hopper(
         name="Hopper",
         parameters=ParameterSpace(
             [
                 scaled(
-                    *("torso_mass", mass, ["body:torso.mass"], "kg"),
+                    *("torso_mass", _PUBLISHED.torso_mass, ["body:torso.mass"], "kg"),
                     "What the leg must lift: a heavier torso jumps less far and turns less with the leg. It trades off "
                     "against the lengths, which change the mass of the leg.",
                 ),
@@ -96,14 +107,14 @@ def hopper() -> Hopper:
                 ),
                 scaled(
                     *("leg_length", 0.5, ["link:leg_geom.length"], "m"),
-                    "Distance of the ankle from the knee, with the shank's mass; in the height of the torso it trades off "
-                    "against the thigh.",
+                    "Distance of the ankle from the knee, with the shank's mass; in the height of the torso it trades "
+                    "off against the thigh.",
                     *(0.75, 1.25),
                 ),
                 scaled(
                     *("foot_length", 0.39, ["link:foot_geom.length"], "m"),
-                    "Reach of heel and toe about the ankle, which decides when the hopper tips over and how it pushes off; "
-                    "its mass trades off against the leg's.",
+                    "Reach of heel and toe about the ankle, which decides when the hopper tips over and how it pushes "
+                    "off; its mass trades off against the leg's.",
                     *(0.75, 1.25),
                 ),
                 scaled(
@@ -117,8 +128,8 @@ def hopper() -> Hopper:
                         [f"joint:{j}_joint.damping" for j in ("thigh", "leg", "foot")],
                         "N m s/rad",
                     ),
-                    "Torque against the speed of hip, knee and ankle, which slows the leg; it trades off against the torso's "
-                    "mass.",
+                    "Torque against the speed of hip, knee and ankle, which slows the leg; it trades off against the "
+                    "torso's mass.",
                 ),
             ]
         ),

@@ -18,30 +18,35 @@ begin in the ground, which throws the robot up. So the out-of-distribution varia
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.envs.assets import compiled_without_visuals, gymnasium_asset
 from sipe_bayes.envs.targets import Target, bind
 from sipe_bayes.envs.task import Solved, Transition, scaled
 from sipe_bayes.envs.tasks.links import LinkTask
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
-_STEP = 0.015  # s, five physics steps
-_NOISE = 0.01  # half-width of the starting state's uniform distribution
-_HEALTHY = (1.0, 2.0)  # heights of the torso in m that are paid for
-_UPRIGHT_REWARD, _FORWARD_REWARD, _CONTROL_COST = 5.0, 1.25, 0.1  # a step, per m/s, per squared action
-_SOLVED = 5000.0  # what 1000 upright steps earn: the robot hardly ever lies, or makes up for it by walking
+@dataclass(frozen=True)
+class _Published:
+    """Humanoid-v4's numbers."""
 
+    step: float = 0.015  # s, five physics steps
+    noise: float = 0.01  # half-width of the starting state's uniform distribution
+    healthy: tuple[float, float] = (1.0, 2.0)  # heights of the torso in m that are paid for
+    upright_reward: float = 5.0  # a step
+    forward_reward: float = 1.25  # per m/s
+    control_cost: float = 0.1  # per squared action
+    action: float = 0.4  # greatest
+    solved: float = 5000.0  # ours: what 1000 upright steps earn; it hardly ever lies, or makes up for it by walking
+
+
+_PUBLISHED = _Published()
 _HEIGHT = 3  # columns of the state
 _OBSERVED = slice(3, 48)  # qpos without x and y, qvel
 _FORCES = slice(0, 331)  # of the derived numbers: all that is observed
@@ -55,7 +60,8 @@ _TRUNK = (
     (
         "torso_width",
         "torso1",
-        "Distance of the shoulders and mass of the chest. Its mass trades off against that of the upper waist and the head.",
+        "Distance of the shoulders and mass of the chest. Its mass trades off against that of the upper waist and"
+        " the head.",
     ),
     ("head_radius", "head", "Mass at the top of the trunk. It trades off against that of the chest."),
     ("upper_waist_width", "uwaist", "Mass low in the torso. It trades off against that of the chest."),
@@ -70,27 +76,32 @@ _LIMBS = (  # once for each side
     (
         "thigh_length",
         "thigh1",
-        "Distance of the {side} knee from the hip, with the mass of the thigh. In the leg's reach it trades off against the shin.",
+        "Distance of the {side} knee from the hip, with the mass of the thigh. In the leg's reach it trades off "
+        "against the shin.",
     ),
     (
         "shin_length",
         "shin1",
-        "Distance of the {side} foot from the knee, with the mass of the shin. In the leg's reach it trades off against the thigh and the foot.",
+        "Distance of the {side} foot from the knee, with the mass of the shin. In the leg's reach it trades off "
+        "against the thigh and the foot.",
     ),
     (
         "foot_radius",
         "foot",
-        "Height of the {side} ankle above the ground and mass of the foot. In the leg's reach it trades off against the shin.",
+        "Height of the {side} ankle above the ground and mass of the foot. In the leg's reach it trades off "
+        "against the shin.",
     ),
     (
         "upper_arm_length",
         "uarm1",
-        "Distance of the {side} elbow from the shoulder, with the mass of the upper arm. In the arm's swing it trades off against the lower arm.",
+        "Distance of the {side} elbow from the shoulder, with the mass of the upper arm. In the arm's swing it "
+        "trades off against the lower arm.",
     ),
     (
         "lower_arm_length",
         "larm",
-        "Distance of the {side} hand from the elbow, with the mass of the lower arm. In the arm's swing it trades off against the hand.",
+        "Distance of the {side} hand from the elbow, with the mass of the lower arm. In the arm's swing it trades"
+        " off against the hand.",
     ),
     (
         "hand_radius",
@@ -131,7 +142,8 @@ class Humanoid(LinkTask):
     derived_late = True
     data_fields = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext", "subtree_com")
 
-    def compile(self) -> Any:
+    def compile(self) -> mujoco.MjModel:
+        """The published model."""
         return _compiled()
 
     @cached_property
@@ -151,71 +163,69 @@ class Humanoid(LinkTask):
             *(f"{body}_contact_{kind}_{a}" for body in bodies for kind in ("torque", "force") for a in _AXES),
         )
 
-    def state_columns(self, model: Any) -> tuple[int | None, ...]:
+    def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
+        """Positions and velocities."""
+        """45 of position and velocity, and 331 that MuJoCo derives."""
         observed: list[int | None] = list(range(_OBSERVED.start, _OBSERVED.stop))
         return tuple(observed + [None] * (len(self.channels) - len(observed)))
 
     def observe(
-        self, model: Any, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
+        self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
+        """Positions without x and y, velocities, and what MuJoCo derives but for the centre of mass."""
         assert derived is not None
         return np.concatenate([states[..., _OBSERVED], derived[..., _FORCES]], axis=-1)
 
     def reward(self, step: Transition) -> FloatArray:
+        """Speed of the centre of mass forward, 5 for being upright, less the cost of control."""
         assert step.derived is not None
         assert step.next_derived is not None
-        forward = (step.next_derived[..., _CENTRE] - step.derived[..., _CENTRE]) / _STEP
+        forward = (step.next_derived[..., _CENTRE] - step.derived[..., _CENTRE]) / _PUBLISHED.step
         upright = _upright(step.next_states)
         effort = np.einsum("...a,...a->...", step.actions, step.actions)
-        return np.asarray(_FORWARD_REWARD * forward + _UPRIGHT_REWARD * upright - _CONTROL_COST * effort)
+        return np.asarray(
+            _PUBLISHED.forward_reward * forward + _PUBLISHED.upright_reward * upright - _PUBLISHED.control_cost * effort
+        )
 
     def hopeless(self, states: FloatArray) -> BoolArray:
         """Fallen, as the published class ends an episode."""
         return ~_upright(states)
 
     def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
+        """The published draw: uniform."""
         model = self.published
-        qpos = model.qpos0 + rng.uniform(-_NOISE, _NOISE, (count, model.nq))
-        return self.states(qpos, rng.uniform(-_NOISE, _NOISE, (count, model.nv))), None
+        qpos = model.qpos0 + rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nq))
+        return self.states(qpos, rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nv))), None
 
     def bind(self, target: str) -> Target:
+        """As every task's; a joint without a spring gets one that stands for none."""
         return super().bind(target) if target.startswith("link:") else _bind(self.published, target)
 
 
 def _upright(states: FloatArray) -> BoolArray:
     height = states[..., _HEIGHT]
-    return np.asarray((height > _HEALTHY[0]) & (height < _HEALTHY[1]))
+    return np.asarray((height > _PUBLISHED.healthy[0]) & (height < _PUBLISHED.healthy[1]))
 
 
-def humanoid_file() -> Path:
-    """Gymnasium's humanoid.xml, found without importing Gymnasium."""
-    found = importlib.util.find_spec("gymnasium")
-    if found is None or found.origin is None:
-        raise FileNotFoundError("the humanoid's model is Gymnasium's: pip install gymnasium")
-    return Path(found.origin).parent / "envs/mujoco/assets/humanoid.xml"
-
-
-def _compiled() -> Any:
-    spec = mujoco.MjSpec.from_file(str(humanoid_file()))
-    spec.compiler.discardvisual = True  # textures, twelve times the size of the rest
-    return spec.compile()
+def _compiled() -> mujoco.MjModel:
+    return compiled_without_visuals(gymnasium_asset("humanoid.xml"))
 
 
 def _inertia_entries() -> list[str]:
     return [*(f"inertia_{m}" for m in _MOMENTS), *(f"mass_offset_{a}" for a in _AXES), "mass"]
 
 
-def _bind(model: Any, target: str) -> Target:
+def _bind(model: mujoco.MjModel, target: str) -> Target:
     """A joint without a spring gets one of 0.001 N m/rad, which stands for none."""
     bound = bind(model, target)
     return replace(bound, value=_NO_SPRING) if not bound.value and target.endswith(".stiffness") else bound
 
 
-def _parameter(model: Any, name: str, target: str, unit: str, description: str) -> Parameter:
+def _parameter(model: mujoco.MjModel, name: str, target: str, unit: str, description: str) -> Parameter:
     return scaled(name, _bind(model, target).value, [target], unit, description)
 
 
-def _joint_parameters(model: Any, joint: str) -> list[Parameter]:
+def _joint_parameters(model: mujoco.MjModel, joint: str) -> list[Parameter]:
     """Damping, stiffness and gear of a joint."""
     side, _, kind = joint.partition("_") if joint not in _MOVES else ("", "", joint)
     moves = _MOVES[kind].format(side=side)
@@ -253,10 +263,10 @@ def _humanoid(
         parameters=ParameterSpace(parameters),
         summary=summary,
         episode_steps=1000,
-        solved=Solved("return", _SOLVED),
+        solved=Solved("return", _PUBLISHED.solved),
         reference="gymnasium Humanoid-v4, never terminated",
-        action_low=-0.4,
-        action_high=0.4,
+        action_low=-_PUBLISHED.action,
+        action_high=_PUBLISHED.action,
         outside_sign=outside_sign,
     )
 

@@ -18,25 +18,25 @@ where it has none), a site where it is. Frames do not turn, the joints of the bo
 Everything moves linearly in the factors by which the links grow.
 
 Mass and inertia follow from the geoms at the density that they have in the model as compiled, with the compiler's own
-conventions: one geom gives the body its frame of inertia, several are added up and diagonalised by ``mju_eig3`` (of equal moments the axes are any two, here as there).
-MuJoCo's mj_setConst, which must follow, refreshes what else depends on them.
+conventions: one geom gives the body its frame of inertia, several are added up and diagonalised by ``mju_eig3`` (of
+equal moments the axes are any two, here as there). MuJoCo's mj_setConst, which must follow, refreshes what else depends
+on them.
 """
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.targets import Target, TargetError, bind, body_frame_inertia
-from sipe_bayes.envs.task import FloatArray, Task
+from sipe_bayes.envs.task import Task
 
 _SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _TURNING = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
@@ -49,16 +49,16 @@ _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 
 @dataclass(frozen=True)
 class _Groups:
-    """The bodies (k,) of several geoms each. rows (n,): all their geoms among the links, body by body from ``starts``
-    (k,); shape (n, 2, 9): what the moments of inertia across and along a geom's axis add to its second moments."""
+    """The bodies of several geoms each."""
 
-    bodies: list[int]
-    rows: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    shape: FloatArray
+    bodies: list[int]  # (k,)
+    rows: IntArray  # (n,), all their geoms among the links, body by body
+    starts: IntArray  # (k,), where each body's begin
+    shape: FloatArray  # (n, 2, 9), what the moments across and along a geom's axis add to its second moments
 
     @classmethod
-    def of(cls, model: Any, bodies: list[int], row: dict[int, int]) -> _Groups:
+    def of(cls, model: mujoco.MjModel, bodies: list[int], row: dict[int, int]) -> _Groups:
+        """Those of ``bodies``; row: of each geom among the links."""
         geoms = [_geoms(model, b) for b in bodies]
         starts = np.cumsum([0] + [len(g) for g in geoms])[:-1]
         flat = [int(g) for own in geoms for g in own]
@@ -82,12 +82,17 @@ class _Groups:
 
 
 class Links:
-    """The links of a compiled model's ``bodies``, by default all whose geoms are capsules and spheres.
+    """The links of a compiled model's bodies.
 
-    model: as published; it is never written to. Raises TargetError where the mass of a body is not that of its geoms.
+    Args:
+        model: as published; it is never written to.
+        bodies: which of them; by default all whose geoms are capsules and spheres.
+
+    Raises:
+        TargetError: where a geom is neither, or the mass of a body is not that of its geoms.
     """
 
-    def __init__(self, model: Any, bodies: Sequence[int] | None = None) -> None:
+    def __init__(self, model: mujoco.MjModel, bodies: Sequence[int] | None = None) -> None:
         self.model = model
         self._bodies = [b for b in range(1, model.nbody) if _linked(model, b)] if bodies is None else list(bodies)
         for body in self._bodies:
@@ -114,29 +119,33 @@ class Links:
         self._slices = _index(self._geoms), _index(self._children), _index(self._sites)
 
     def target(self, spec: str) -> Target:
-        """The target ``link:GEOM.length`` or ``link:GEOM.radius``. Its write changes the size of the geom alone:
-        ``refresh`` must follow, once for all links. Raises TargetError."""
+        """The target ``link:GEOM.length`` or ``link:GEOM.radius``.
+
+        Its write changes the size of the geom alone: ``refresh`` must follow, once for all links.
+
+        Raises:
+            TargetError: for another form, a name that is no link's, or a radius of a capsule.
+        """
         match = _TARGET.match(spec)
         if not match:
             raise TargetError(f"target {spec!r}: expected link:GEOM.length or link:GEOM.radius")
         name, attribute = match.groups()
         names = [self.model.geom(int(g)).name for g in self._geoms]
         if name not in names:
-            close = difflib.get_close_matches(name, names, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"the links are {[n for n in names if n]}"
-            raise TargetError(f"target {spec!r}: no link {name!r}; {hint}")
+            hint = nearest_name(name, names) or f"; the links are {[n for n in names if n]}"
+            raise TargetError(f"target {spec!r}: no link {name!r}{hint}")
         row = names.index(name)
         geom, slot = int(self._geoms[row]), int(self._slot[row])
         if (attribute == "radius") != (slot == 0):
             raise TargetError(f"target {spec!r}: a capsule has a length and a sphere a radius to scale")
         double = 2.0 if slot else 1.0
 
-        def write(other: Any, value: float) -> None:
+        def write(other: mujoco.MjModel, value: float) -> None:
             other.geom_size[geom, slot] = value / double
 
         return Target(spec, "m", double * float(self._size[row]), write, constants=True, minimum=1e-6)
 
-    def refresh(self, model: Any) -> None:
+    def refresh(self, model: mujoco.MjModel) -> None:
         """Let everything follow the sizes of the links in ``model``, a copy of the published one."""
         factors = model.geom_size.ravel()[self._flat] / self._size
         growth = factors - 1
@@ -167,26 +176,26 @@ class Links:
 
     def _polynomials(self) -> FloatArray:
         """Coefficients (G, 3, 5) of the ``_POWERS`` of a link's factor in its mass and moments."""
-        model, found = self.model, np.zeros((len(self._geoms), 3, len(_POWERS)))
+        model, coefficients = self.model, np.zeros((len(self._geoms), 3, len(_POWERS)))
         for i, geom in enumerate(self._geoms):
             radius, half = model.geom_size[geom, :2]
             ball = 4 / 3 * np.pi * radius**3
             if self._slot[i] == 0:
-                found[i, 0, 3], found[i, 1:, 4] = ball, 0.4 * ball * radius**2
+                coefficients[i, 0, 3], coefficients[i, 1:, 4] = ball, 0.4 * ball * radius**2
                 continue
             length, tube = 2 * half, 2 * np.pi * radius**2 * half
-            found[i, 0, :2] = ball, tube
+            coefficients[i, 0, :2] = ball, tube
             # of the tube and of its two half-balls, whose centres of mass lie 3/8 of the radius beyond its ends
-            found[i, 1, :4] = (
+            coefficients[i, 1, :4] = (
                 0.4 * ball * radius**2,
                 tube * radius**2 / 4 + ball * 3 / 8 * length * radius,
                 ball * length**2 / 4,
                 tube * length**2 / 12,
             )
-            found[i, 2, :2] = 0.4 * ball * radius**2, tube * radius**2 / 2
+            coefficients[i, 2, :2] = 0.4 * ball * radius**2, tube * radius**2 / 2
         owner, volume = model.geom_bodyid[self._geoms], np.zeros(model.nbody)
-        np.add.at(volume, owner, found[:, 0].sum(-1))
-        return np.asarray(found * (model.body_mass[owner] / volume[owner])[:, None, None])
+        np.add.at(volume, owner, coefficients[:, 0].sum(-1))
+        return np.asarray(coefficients * (model.body_mass[owner] / volume[owner])[:, None, None])
 
     def _moves(self) -> FloatArray:
         """(3 (G + children + sites), G): how far each place moves as a link's factor grows by one."""
@@ -197,14 +206,7 @@ class Links:
             axes = [_Axis.of(model, int(self._geoms[i])) for i in rows]
             stays = [axes[0].nearest(_joint(model, body)), *(axis.seat(axes[0]) for axis in axes[1:])]
 
-            def ride(
-                point: FloatArray, link: int, stays: Any = stays, rows: Any = rows, axes: Any = axes
-            ) -> FloatArray:
-                """How a point that rides on a link of this body moves (3, G)."""
-                found = np.zeros((3, number))
-                found[:, rows[link]] = (axes[link].nearest(point) - stays[link]) * axes[link].direction
-                return found if link == 0 else found + ride(axes[link].at(stays[link]), 0)
-
+            ride = partial(_ride, rows=rows, axes=axes, stays=stays, count=number)
             for link, row in enumerate(rows):
                 moves[row] = ride(model.geom_pos[self._geoms[row]], link)
             for k, child in enumerate(self._children):
@@ -240,7 +242,8 @@ class _Axis:
     half: float
 
     @classmethod
-    def of(cls, model: Any, geom: int) -> _Axis:
+    def of(cls, model: mujoco.MjModel, geom: int) -> _Axis:
+        """The axis of a geom."""
         half = 0.0 if model.geom_type[geom] == _SPHERE else float(model.geom_size[geom, 1])
         return cls(model.geom_pos[geom].copy(), _matrix(model.geom_quat[geom])[:, 2], half)
 
@@ -249,15 +252,38 @@ class _Axis:
         return float(np.clip((point - self.centre) @ self.direction, -self.half, self.half))
 
     def at(self, coordinate: float) -> FloatArray:
+        """The point (3,) at a coordinate."""
         return self.centre + coordinate * self.direction
 
     def distance(self, point: FloatArray) -> float:
+        """From ``point`` (3,)."""
         return float(np.linalg.norm(point - self.at(self.nearest(point))))
 
     def seat(self, first: _Axis) -> float:
         """Coordinate of the end nearer to another axis, or 0 where none is nearer than the centre."""
         choices = (0.0, -self.half, self.half)
         return min(choices, key=lambda c: first.distance(self.at(c)) + (_SAME if c else 0.0))
+
+
+def _ride(
+    point: FloatArray, link: int, rows: Sequence[int], axes: Sequence[_Axis], stays: Sequence[float], count: int
+) -> FloatArray:
+    """How a point that rides on a link moves as the factors grow.
+
+    Args:
+        point: (3,), in the frame of the body.
+        link: which of the body's own.
+        rows: the body's links among all.
+        axes: theirs.
+        stays: the coordinate of the point of each that stays.
+        count: G, how many links there are.
+
+    Returns:
+        (3, G).
+    """
+    move = np.zeros((3, count))
+    move[:, rows[link]] = (axes[link].nearest(point) - stays[link]) * axes[link].direction
+    return move if link == 0 else move + _ride(axes[link].at(stays[link]), 0, rows, axes, stays, count)
 
 
 class LinkTask(Task):
@@ -274,18 +300,20 @@ class LinkTask(Task):
         return Links(model, bodies) if bodies else None
 
     def bind(self, target: str) -> Target:
+        """As every task's, and links."""
         if not target.startswith("link:"):
             return bind(self.published, target)
         return (self.links or Links(self.published)).target(target)
 
-    def write(self, model: Any, values: FloatArray, log: str | None = None) -> bool:
+    def write(self, model: mujoco.MjModel, values: FloatArray, log: str | None = None) -> bool:
+        """Write all targets of the parameters, and let what depends on the links follow."""
         physical = super().write(model, values, log)
         if self.links is not None and physical:
             self.links.refresh(model)
         return physical
 
 
-def _index(ids: Sequence[int] | NDArray[np.int64]) -> Any:
+def _index(ids: Sequence[int] | IntArray) -> slice | IntArray:
     """What indexes the rows ``ids``: a slice where they follow each other, which is several times as fast."""
     ids = np.asarray(ids, int)
     if len(ids) and (np.diff(ids) == 1).all():
@@ -293,18 +321,18 @@ def _index(ids: Sequence[int] | NDArray[np.int64]) -> Any:
     return ids
 
 
-def _geoms(model: Any, body: int) -> NDArray[np.int64]:
+def _geoms(model: mujoco.MjModel, body: int) -> IntArray:
     first = int(model.body_geomadr[body])
     return np.arange(first, first + int(model.body_geomnum[body]))
 
 
-def _linked(model: Any, body: int) -> bool:
+def _linked(model: mujoco.MjModel, body: int) -> bool:
     """Whether all geoms of a body are capsules and spheres."""
     types = model.geom_type[_geoms(model, body)]
     return bool(len(types)) and bool(np.isin(types, (_SPHERE, _CAPSULE)).all())
 
 
-def _joint(model: Any, body: int) -> FloatArray:
+def _joint(model: mujoco.MjModel, body: int) -> FloatArray:
     """Where the body turns (3,): its first hinge or ball joint, or the origin of its frame."""
     first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     for joint in range(first, first + count):
@@ -318,7 +346,7 @@ def _closest(axes: Sequence[_Axis], point: FloatArray) -> int:
     return min(range(len(axes)), key=lambda i: axes[i].distance(point) + i * _SAME)
 
 
-def _matrix(quaternion: Any) -> FloatArray:
+def _matrix(quaternion: FloatArray) -> FloatArray:
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)

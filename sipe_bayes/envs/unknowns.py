@@ -1,0 +1,106 @@
+"""The user's parameters against the model: what they write, their units and defaults, and that none overrules another."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.targets import TargetError, bind
+
+_BIAS = re.compile(r"^sensor:(.+)\.bias$")
+# the numbers that a target writes, where they are not its own
+_WRITES = {"kp": ("gain", "bias_position"), "kv": ("bias_velocity",), "offset": ("bias_force",)}
+
+
+def check_conflicts(space: ParameterSpace) -> None:
+    """Raises TargetError when two targets write the same number in the same log: one would overrule the other."""
+    owners: dict[str, list[tuple[str, str | None]]] = {}
+    for parameter in space:
+        for spec in parameter.targets:
+            head, _, attribute = spec.rpartition(".")
+            if attribute == "bias":  # they add up
+                continue
+            numbers = _WRITES.get(attribute, (attribute,)) if head.startswith("actuator:") else (attribute,)
+            for number in numbers:
+                for other, log in owners.setdefault(f"{head}.{number}", []):
+                    if log is None or parameter.log is None or log == parameter.log:
+                        raise TargetError(
+                            f"parameter {parameter.name!r}: target {spec!r} writes what parameter {other!r} "
+                            "writes too; keep one"
+                        )
+                owners[f"{head}.{number}"].append((parameter.name, parameter.log))
+
+
+def shifted_channels(target: str, channels: Sequence[Channel]) -> list[int] | None:
+    """Which channels a target ``sensor:NAME.bias`` shifts; None for another kind of target.
+
+    They are those called NAME, or those that read the sensor NAME.
+    """
+    match = _BIAS.match(target)
+    if not match:
+        return None
+    name = match.group(1)
+    sensor = re.compile(rf"^sensor:{re.escape(name)}(\[\d+\])?$")
+    return [k for k, c in enumerate(channels) if c.label == name or sensor.match(c.target)]
+
+
+def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Sequence[Channel]) -> Parameter:
+    """The parameter with the unit and the default that the model gives it; raises TargetError where it gives none."""
+    if not parameter.targets:
+        raise TargetError(f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass")
+    units, values, least = [], [], -np.inf
+    for spec in parameter.targets:
+        shifted = shifted_channels(spec, channels)
+        if shifted is not None:
+            units.append(_shifted_unit(parameter, spec, channels, shifted))
+            values.append(0.0)
+            continue
+        try:
+            target = bind(model, spec)
+        except TargetError as error:
+            raise TargetError(f"parameter {parameter.name!r}: {error}") from None
+        units.append(target.unit)
+        values.append(target.value)
+        least = max(least, target.minimum)
+    if parameter.relative and parameter.default is None:
+        parameter = _absolute(parameter, values[0])
+    if parameter.low < least:
+        raise TargetError(
+            f"parameter {parameter.name!r}: bounds from {parameter.low:g} {parameter.unit or units[0]}, but "
+            f"{parameter.targets[0]} cannot be below {least:g}; raise the lower one"
+        )
+    return replace(parameter, unit=parameter.unit or units[0], default=values[0])
+
+
+def _shifted_unit(parameter: Parameter, target: str, channels: Sequence[Channel], shifted: Sequence[int]) -> str:
+    if shifted:
+        return channels[shifted[0]].unit
+    names = [c.label for c in channels]
+    hint = nearest_name(target.removeprefix("sensor:").removesuffix(".bias"), names) or f"; measured are {names}"
+    raise TargetError(f"parameter {parameter.name!r}: target {target!r} names no measured sensor or channel{hint}")
+
+
+def _absolute(parameter: Parameter, value: float) -> Parameter:
+    """A parameter that was given as a factor of the model's ``value``, in its unit."""
+    if not value:
+        raise TargetError(
+            f"parameter {parameter.name!r}: {parameter.targets[0]} is 0 in the model, so a factor of it "
+            "says nothing; give absolute bounds"
+        )
+    low, high = sorted((parameter.low * value, parameter.high * value))
+    mean, sd = parameter.prior_mean, parameter.prior_sd
+    if mean is not None and sd is not None:
+        mean, sd = mean * value, abs(sd * value)
+    return replace(parameter, low=low, high=high, prior_mean=mean, prior_sd=sd)
+
+
+def physical_targets(targets: Iterable[str]) -> list[str]:
+    """Those that write a number of the model; a sensor's bias does not."""
+    return [target for target in targets if not _BIAS.match(target)]
