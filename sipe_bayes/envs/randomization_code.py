@@ -9,7 +9,8 @@ be those of ``identified.xml``. Isaac Lab has no MjModel: its event terms take e
 of their own, or its 90 % interval where a normal would reach below zero, where an event for the target exists; what is
 lost stands in comments.
 
-Each file is compiled before it is written; sensor biases and other things without a place in a model are named in comments.
+Each file is compiled before it is written; sensor biases and other things without a place in a model are named in
+comments.
 """
 
 from __future__ import annotations
@@ -224,7 +225,7 @@ def _table(
 def _fixed(
     environment: MjcfEnvironment, draws: FloatArray
 ) -> tuple[dict[str, int], dict[str, tuple[list[int], list[int]]]]:
-    """Sizes that a model must have, and the whole numbers in which the calibrated one differs from the MJCF as it is."""
+    """Sizes that a model must have, and the whole numbers in which the calibrated one differs from the plain MJCF."""
     plain, changed = compile_spec(load_spec(environment.source), environment.source), environment.compile()
     next(values for values in draws if environment.write(changed, values))
     mujoco.mj_setConst(changed, mujoco.MjData(changed))

@@ -1,10 +1,10 @@
-"""The benchmark's tasks: an Environment with starting states, rewards, goals, variants and a documented parameter table.
+"""The benchmark's tasks: an Environment with starting states, rewards, goals, variants and documented parameters.
 
-A task is one file of a robot family plus one line in ``sipe_bayes.envs.registry``. Subclass ``Task``; define ``compile``,
-``observe``, ``initial_states`` and ``reward``, and where they apply ``control``, ``terminated``, ``success`` and ``bind``;
-all are pure functions of batches. A function in the same file returns the instance with its parameters, each of which
-describes itself: name, unit, default, bounds, the MuJoCo field it writes, what it does to the motion and what it
-trades off against.
+A task is one file of a robot family plus one line in ``sipe_bayes.envs.registry``. Subclass ``Task``; define
+``compile``, ``observe``, ``initial_states`` and ``reward``, and where they apply ``control``, ``terminated``,
+``success`` and ``bind``; all are pure functions of batches. A function in the same file returns the instance with its
+parameters, each of which describes itself: name, unit, default, bounds, the MuJoCo field it writes, what it does to the
+motion and what it trades off against.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Task(Environment):
         return np.zeros(step.actions.shape[:-1], bool)
 
     def hopeless(self, states: FloatArray) -> BoolArray:
-        """Whether a training may end an episode that the task goes on with, (...,) of states (..., S); never by default."""
+        """Whether a training may end an episode that the task does not, (...,) of states (..., S); never by default."""
         return np.zeros(states.shape[:-1], bool)
 
     def success(self, step: Transition) -> BoolArray | None:

@@ -1,4 +1,4 @@
-"""The user's parameters against the model: what they write, their units and defaults, and that none overrules another."""
+"""The user's parameters against the model: what they write, units and defaults, and that none overrules another."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""How it is simulated: engines, closed loop, any function as a simulator, the Gymnasium faces."""

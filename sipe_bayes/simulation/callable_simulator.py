@@ -1,6 +1,7 @@
-"""Any Python function in MuJoCo's place: ``sipe.CallableSimulator(fn, space)``; ``estimator.fit(x)`` takes an observed x (D,).
+"""Any Python function in MuJoCo's place: ``sipe.CallableSimulator(fn, space)``.
 
-To the estimators an x is a trajectory of one step without actions, from zeros to x.
+``estimator.fit(x)`` takes an observed x (D,). To the estimators an x is a trajectory of one step without actions, from
+zeros to x.
 """
 
 from __future__ import annotations
@@ -11,16 +12,18 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import whole
 
-FloatArray = NDArray[np.float64]
+Function = Callable[..., ArrayLike]
+"""``fn(values (B, N)) -> x (B, D)``, with a generator as well where it is noisy."""
 
 
 @dataclass(frozen=True)
@@ -32,23 +35,33 @@ class CallableEnvironment:
 
 
 class CallableSimulator:
-    """``fn(values (B, N)) -> x (B, D)``, or noisy: ``fn(values, generator) -> x``; NaN where a simulation failed.
+    """Simulates by ``fn(values (B, N)) -> x (B, D)``, or noisy: ``fn(values, generator) -> x``.
 
-    values are physical. generator: a numpy Generator, fn's only source of randomness; each theta has one of its own, from
-    ``seed`` and theta, so that the same theta give the same x. fn takes it as its second argument without a default, or as the one
-    called ``generator`` or ``rng``; other arguments with defaults are left alone. likelihood: sd of independent normal noise
-    about fn's x, one number or (D,); ``laplace`` and ``mcmc`` need it, and the others add that noise to what they simulate. name: tells
-    functions apart in checkpoints and caches; default the qualified name of a module's function. Any other fn (a lambda, a local
-    function, a partial, an object) shares its own with others and needs one there. Raises ValueError for an fn of another form.
+    Values are physical; x is NaN where a simulation failed. A noisy fn takes a numpy Generator, its only source of
+    randomness, as its second argument without a default, or as the one called ``generator`` or ``rng``; other arguments
+    with defaults are left alone. Each theta has a generator of its own, from ``seed`` and theta, so that the same theta
+    give the same x.
+
+    Args:
+        fn: the function.
+        space: its parameters.
+        likelihood: sd of independent normal noise about fn's x, one number or (D,); ``laplace`` and ``mcmc`` need it,
+            and the others add that noise to what they simulate.
+        seed: of a noisy fn.
+        name: tells functions apart in checkpoints and caches; default the qualified name of a module's function. Any
+            other fn (a lambda, a local function, a partial, an object) shares its own with others and needs one there.
+
+    Raises:
+        ValueError: for an fn of another form, or arguments that do not fit.
     """
 
     failure: ClassVar[str] = "made fn return NaN or infinity"  # what is said of simulations that are not valid
 
     def __init__(
         self,
-        fn: Callable[..., Any],
+        fn: Function,
         space: ParameterSpace,
-        likelihood: Any = None,
+        likelihood: ArrayLike | None = None,
         *,
         seed: int = 0,
         name: str | None = None,
@@ -75,7 +88,7 @@ class CallableSimulator:
         self.environment = CallableEnvironment(tuple(f"x{j}" for j in range(size)))
         self.noise_sd = None if likelihood is None else self._sds(likelihood, size)
 
-    def _sds(self, likelihood: Any, size: int) -> tuple[float, ...]:
+    def _sds(self, likelihood: ArrayLike, size: int) -> tuple[float, ...]:
         try:
             sd = np.asarray(likelihood, float)
         except (TypeError, ValueError):
@@ -89,12 +102,18 @@ class CallableSimulator:
         plain = (self.name, self.environment.channels, self.noisy, self.noise_sd, self.seed)
         return hashlib.sha256(repr(plain).encode()).hexdigest()
 
-    def trajectory(self, x: Any) -> Trajectory:
-        """An observed x (D,) as estimators see it; NaN where it was not observed. Raises ValueError for another shape, infinity,
-        or an x of which nothing was observed."""
+    def trajectory(self, x: object) -> Trajectory:
+        """An observed x as estimators see it.
+
+        Args:
+            x: (D,); NaN where it was not observed.
+
+        Raises:
+            ValueError: for another shape, infinity, or an x of which nothing was observed.
+        """
         size = len(self.environment.channels)
         try:
-            values = np.asarray(x, float)
+            values = np.asarray(cast(ArrayLike, x), float)
         except (TypeError, ValueError):
             raise ValueError(f"x: expected numbers ({size},), as fn returns, got a {type(x).__name__}") from None
         if values.shape != (size,):
@@ -105,8 +124,17 @@ class CallableSimulator:
             np.stack([np.zeros(size), values]), np.zeros((1, 0)), 1.0, name="x", channels=self.environment.channels
         )
 
-    def replay(self, theta: FloatArray, trajectories: Trajectories, starts: Any = None) -> Trajectories:
-        """As ``Simulator.replay``: B * R one-step trajectories of theta (B, N), R independent ones of each."""
+    def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:
+        """As ``Simulator.replay``.
+
+        Args:
+            theta: (B, N).
+            trajectories: R observed x.
+            starts: not used; there are no states.
+
+        Returns:
+            B * R trajectories of one step, R independent ones of each theta.
+        """
         theta, count = np.atleast_2d(np.asarray(theta, float)), len(trajectories)
         if trajectories.actions.shape[1:] != (1, 0):
             raise ValueError(f"trajectories: expected an x ({len(self.environment.channels)},), got a trajectory")
@@ -142,22 +170,23 @@ class CallableSimulator:
             x = np.asarray(self._evaluated(values, rng), float)
         except (IndexError, TypeError, ValueError) as error:
             raise ValueError(
-                f"fn: expected fn(values (B, {len(self.space)})) -> x (B, D), a row for each theta, values[:, 0] the first "
-                f"parameter; with values {values.shape} it raised {type(error).__name__}: {error}"
+                f"fn: expected fn(values (B, {len(self.space)})) -> x (B, D), a row for each theta, values[:, 0] the "
+                f"first parameter; with values {values.shape} it raised {type(error).__name__}: {error}"
             ) from error
         if x.ndim != 2 or len(x) != len(values) or not math.prod(x.shape):
             raise ValueError(
-                f"fn: expected x ({len(values)}, D) for values {values.shape}, a row for each theta, got shape {x.shape}"
+                f"fn: expected x ({len(values)}, D) for values {values.shape}, a row for each theta, got shape "
+                f"{x.shape}"
             )
         return x
 
-    def _evaluated(self, values: FloatArray, rng: np.random.Generator | None) -> Any:
+    def _evaluated(self, values: FloatArray, rng: np.random.Generator | None) -> ArrayLike:
         if self._generator is None:
             return self.fn(values)
         return self.fn(values, **{self._generator: rng}) if self._generator else self.fn(values, rng)
 
 
-def _own_name(fn: Callable[..., Any]) -> str:
+def _own_name(fn: Function) -> str:
     """Module, or script, and name of a module's function, which no other has; "" of anything else."""
     name, module = getattr(fn, "__qualname__", ""), getattr(fn, "__module__", None) or ""
     home = sys.modules.get(module)
@@ -165,7 +194,7 @@ def _own_name(fn: Callable[..., Any]) -> str:
     return f"{place}.{name}" if place and getattr(home, name, None) is fn else ""
 
 
-def _generator_parameter(fn: Callable[..., Any]) -> str | None:
+def _generator_parameter(fn: Function) -> str | None:
     """Where fn takes a generator: the parameter's name, "" for the second place, None if it takes none."""
     try:
         parameters = list(inspect.signature(fn).parameters.values())[1:]

@@ -57,21 +57,28 @@ class Stepped(Protocol):
     control_steps: int
 
     @property
-    def space(self) -> ParameterSpace: ...
+    def space(self) -> ParameterSpace:
+        """As ``Simulator``'s."""
 
     @property
-    def dt(self) -> float: ...
+    def dt(self) -> float:
+        """As ``Simulator``'s."""
 
     @property
-    def state_size(self) -> int: ...
+    def state_size(self) -> int:
+        """As ``Simulator``'s."""
 
-    def physics_steps(self, dt: float) -> tuple[int, float]: ...
+    def physics_steps(self, dt: float) -> tuple[int, float]:
+        """As ``Simulator``'s."""
 
-    def check_theta(self, theta: FloatArray, allow_outside: bool, num_envs: int | None = None) -> FloatArray: ...
+    def check_theta(self, theta: FloatArray, allow_outside: bool, num_envs: int | None = None) -> FloatArray:
+        """As ``Simulator``'s."""
 
-    def check_physical(self, theta: FloatArray) -> None: ...
+    def check_physical(self, theta: FloatArray) -> None:
+        """As ``Simulator``'s."""
 
-    def written(self, theta: FloatArray, model: mujoco.MjModel | None = None) -> mujoco.MjModel: ...
+    def written(self, theta: FloatArray, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
+        """As ``Simulator``'s."""
 
 
 class Episodes:

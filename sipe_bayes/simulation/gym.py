@@ -1,29 +1,30 @@
 """Gymnasium faces of the engine: ``gymnasium.make("sipe/FetchPush-v0")`` and ``gymnasium.make_vec``.
 
 The ids are registered when this module is imported: by ``import gymnasium, sipe_bayes`` in this order, by
-``gymnasium.register_envs(sipe_bayes.simulation.gym)`` in any. The vector environment is the engine
-itself, all lanes in one native call, not a loop of processes. ``info`` holds ``valid``, and where a task has them
+``gymnasium.register_envs(sipe_bayes.simulation.gym)`` in any. The vector environment is the engine itself, all
+sub-environments in one native call, not a loop of processes. ``info`` holds ``valid``, and where a task has them
 ``success``, ``achieved_goal`` and ``desired_goal``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.episodes import Episodes, Step
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
+Space = gymnasium.Space[FloatArray]
 Info = dict[str, Any]
+"""Gymnasium's ``info`` and ``options``: whatever goes with a step or a reset, by name."""
 
 for _name in TASKS:
     gymnasium.register(
@@ -35,32 +36,50 @@ for _name in TASKS:
 
 
 def make(name: str, variant: str = "default") -> SipeEnv:
-    """The task ``name`` as a Gymnasium environment with the parameters of a variant; raises ValueError that suggests the
-    nearest name. ``.simulator`` is its engine."""
+    """A task as a Gymnasium environment; ``.simulator`` is its engine.
+
+    Args:
+        name: the task's.
+        variant: whose parameters it has.
+
+    Raises:
+        ValueError: for an unknown task, with the nearest name, or an unknown variant.
+    """
     return SipeEnv(name, variant)
 
 
 def make_vec(name: str, num_envs: int, variant: str = "default", num_threads: int | None = None) -> SipeVectorEnv:
-    """``num_envs`` lanes of the task ``name`` as a Gymnasium vector environment on the batch engine."""
+    """A task as a Gymnasium vector environment on the batch engine.
+
+    Args:
+        name: the task's.
+        num_envs: how many sub-environments.
+        variant: whose parameters they have.
+        num_threads: native threads; default the processor's cores.
+
+    Raises:
+        ValueError: for an unknown task, with the nearest name, an unknown variant, or no sub-environment.
+    """
     return SipeVectorEnv(name, num_envs, variant, num_threads)
 
 
-def _spaces(task: Task) -> tuple[Any, Any]:
+def _spaces(task: Task) -> tuple[Space, Space]:
     """Observation and action space."""
     size = (len(task.channels),)
-    observation = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float64)
-    return observation, gymnasium.spaces.Box(task.action_low, task.action_high, (task.num_actions,), np.float32)
+    observation: Space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float64)
+    action = gymnasium.spaces.Box(task.action_low, task.action_high, (task.num_actions,), np.float32)
+    return observation, cast(Space, action)
 
 
 def _info(step: Step) -> Info:
-    """What a step says besides observation, reward and end, for all lanes."""
-    found = {
+    """What a step says besides observation, reward and end, for all sub-environments."""
+    info = {
         "valid": step.valid,
         "success": step.success,
         "achieved_goal": step.achieved_goals,
         "desired_goal": step.goals,
     }
-    return {key: value for key, value in found.items() if value is not None}
+    return {key: value for key, value in info.items() if value is not None}
 
 
 def _checked(options: Info | None, known: tuple[str, ...]) -> Info:
@@ -71,8 +90,14 @@ def _checked(options: Info | None, known: tuple[str, ...]) -> Info:
 
 
 class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
-    """One lane of a task. ``set_parameters(theta)`` changes the simulator at once, ``reset(options={"theta": ...})`` from
-    the new episode on; theta (N,) outside the unit cube only where ``options["allow_outside"]`` or the variant says."""
+    """A task as a single environment.
+
+    ``set_parameters(theta)`` changes the simulator at once, ``reset(options={"theta": ...})`` from the new episode on.
+
+    Args:
+        task: its name, or the task.
+        variant: whose parameters it has.
+    """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium declares it so)
 
@@ -84,7 +109,15 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._episodes: Episodes | None = None
 
     def set_parameters(self, theta: FloatArray, allow_outside: bool = False) -> None:
-        """Give the simulator theta (N,); raises ValueError for other shapes, NaN, or values outside [0, 1]."""
+        """Give the simulator parameters.
+
+        Args:
+            theta: (N,).
+            allow_outside: whether it may leave [0, 1].
+
+        Raises:
+            ValueError: for another shape, NaN, or values outside that are not allowed.
+        """
         theta = self.simulator.check_theta(theta, allow_outside, 1)
         if self._episodes is None:
             self.simulator.written(theta[0])  # raises for unphysical values
@@ -94,6 +127,12 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.theta = theta[0]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[FloatArray, Info]:
+        """Begin an episode.
+
+        Args:
+            seed: of the starting states and goals; default goes on with the generator.
+            options: ``theta`` (N,), and ``allow_outside`` where it may leave [0, 1].
+        """
         super().reset(seed=seed)
         options = _checked(options, ("theta", "allow_outside"))
         if "theta" in options:
@@ -106,13 +145,14 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._single(self._episodes.first())
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, Info]:
+        """One control step with an action (A,); raises ValueError before the first ``reset``."""
         if self._episodes is None:
             raise ValueError("step: nothing has begun yet; call reset first")
         step = self._episodes.step(np.asarray(action, float)[None])
         observation, info = self._single(step)
         return observation, float(step.rewards[0]), bool(step.terminated[0]), bool(step.truncated[0]), info
 
-    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: Any = None) -> FloatArray:
+    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: object = None) -> FloatArray:
         """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
         return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
 
@@ -123,7 +163,14 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 
 class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
-    """``num_envs`` lanes of a task, all in one native call a step. Autoreset: NEXT_STEP."""
+    """Sub-environments of a task, all in one native call a step. Autoreset: NEXT_STEP.
+
+    Args:
+        task: its name, or the task.
+        num_envs: how many.
+        variant: whose parameters they have.
+        num_threads: native threads; default the processor's cores.
+    """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
         "render_modes": [],
@@ -145,10 +192,18 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self._generators: list[np.random.Generator] = []
 
     def set_parameters(
-        self, theta: FloatArray, lanes: NDArray[np.int64] | None = None, allow_outside: bool = False
+        self, theta: FloatArray, lanes: IntArray | BoolArray | None = None, allow_outside: bool = False
     ) -> None:
-        """Give the ``lanes``, (L,) numbers or a mask (B,), default all, theta (L, N) or (N,); raises ValueError for what does
-        not fit, and then changes nothing."""
+        """Give sub-environments their parameters.
+
+        Args:
+            theta: (n, N) or (N,).
+            lanes: which of them, n numbers or a mask (B,); default all.
+            allow_outside: whether theta may leave [0, 1].
+
+        Raises:
+            ValueError: for what does not fit; nothing is changed then.
+        """
         chosen = self._chosen("lanes", lanes)
         theta = self.simulator.check_theta(theta, allow_outside, len(chosen))
         if self._episodes is not None:
@@ -159,23 +214,29 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
                 self.simulator.written(row)  # raises for unphysical values
         self.theta[chosen] = theta
 
-    def _chosen(self, name: str, lanes: Any) -> NDArray[np.int64]:
-        """Numbers of lanes given as numbers or as a mask; raises ValueError."""
-        given = np.arange(self.num_envs) if lanes is None else np.asarray(lanes)
+    def _chosen(self, name: str, chosen: IntArray | BoolArray | None) -> IntArray:
+        """Numbers of sub-environments given as numbers or as a mask; raises ValueError."""
+        given = np.arange(self.num_envs) if chosen is None else np.asarray(chosen)
         if given.dtype == bool and given.shape == (self.num_envs,):
             return np.flatnonzero(given)
         whole = given.ndim == 1 and np.issubdtype(given.dtype, np.integer)
         if not whole or (len(given) and not 0 <= given.min() <= given.max() < self.num_envs):
             raise ValueError(
-                f"{name}: expected a mask ({self.num_envs},) or numbers of lanes below {self.num_envs}, got {given.tolist()}"
+                f"{name}: expected a mask ({self.num_envs},) or numbers of sub-environments below {self.num_envs}, got "
+                f"{given.tolist()}"
             )
-        return given
+        return given.astype(np.int64)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
     ) -> tuple[FloatArray, Info]:
-        """options: ``reset_mask`` (B,) to begin anew in some lanes only, and for those ``theta`` (L, N) or (N,) with
-        ``allow_outside``."""
+        """Begin episodes.
+
+        Args:
+            seed: one for each, or one for the first, from which the others count up; default goes on.
+            options: ``reset_mask`` (B,) to begin anew in n sub-environments only, and for those ``theta`` (n, N) or
+                (N,) with ``allow_outside``.
+        """
         options = _checked(options, ("theta", "allow_outside", "reset_mask"))
         chosen = self._chosen("reset_mask", options.get("reset_mask"))
         seeds = self._seeds(seed)
@@ -184,8 +245,8 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         if not self._generators:
             self._generators = [np.random.default_rng(s) for s in seeds]
         elif seed is not None:
-            for lane in chosen:
-                self._generators[lane] = np.random.default_rng(seeds[lane])
+            for i in chosen:
+                self._generators[i] = np.random.default_rng(seeds[i])
         if self._episodes is None:
             self._episodes = Episodes(self.simulator, self.theta, self._generators, allow_outside=True)
         else:
@@ -194,27 +255,28 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         step = self._episodes.first()
         return step.observations, self._marked(step)
 
-    def _seeds(self, seed: Any) -> list[int | None]:
-        """One seed for each lane: seed, seed + 1, ... of one number."""
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """One seed for each: seed, seed + 1, ... of one number."""
         if seed is None:
             return [None] * self.num_envs
-        if np.ndim(seed) == 0:
+        if isinstance(seed, int | np.integer):
             return [int(seed) + i for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(f"seed: expected one number or {self.num_envs}, got {len(seed)}")
         return [None if s is None else int(s) for s in seed]
 
-    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, Info]:
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, Info]:  # type: ignore[override]
+        """One control step of all with actions (B, A); raises ValueError before the first ``reset``."""
         if self._episodes is None:
             raise ValueError("step: nothing has begun yet; call reset first")
         step = self._episodes.step(actions)
         return step.observations, step.rewards, step.terminated, step.truncated, self._marked(step)
 
-    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: Any = None) -> FloatArray:
+    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: object = None) -> FloatArray:
         """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
         return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
 
     def _marked(self, step: Step) -> Info:
-        """Gymnasium's form: with every entry the lanes that it holds for."""
+        """Gymnasium's form: with every entry those that it holds for."""
         info = _info(step)
         return {**info, **{f"_{key}": np.ones(self.num_envs, bool) for key in info}}

@@ -1,0 +1,1 @@
+"""The benchmark's tasks, a file for each family of robots."""

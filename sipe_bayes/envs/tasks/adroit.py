@@ -2,8 +2,8 @@
 
 Models, rewards and success are those of gymnasium-robotics' AdroitHandRelocate-v1 and AdroitHandDoor-v1 with dense
 reward (Rajeswaran et al., Learning Complex Dexterous Manipulation with Deep Reinforcement Learning and Demonstrations,
-2018, https://arxiv.org/abs/1709.10087). Positions of the palm, the handle and the ball are read one physics step old, as
-those classes read them. What differs, on purpose:
+2018, https://arxiv.org/abs/1709.10087). Positions of the palm, the handle and the ball are read one physics step old,
+as those classes read them. What differs, on purpose:
 
 - Every episode starts from one fixed state, the hand at rest. The published classes draw where the ball and its target,
   or the door, stand. Relocate keeps the places that its XML gives. The door's place in the XML is one that its class
@@ -15,8 +15,8 @@ those classes read them. What differs, on purpose:
   ``scene`` compiles everything, to draw.
 
 Two oddities of the published rewards are kept: 0.1 per metre between the palm and the handle or the ball is paid, not
-charged as their documentation says; and a ball counts as lifted when its centre is above 4 cm, which that of a ball with a
-radius above 4 cm is on the table.
+charged as their documentation says; and a ball counts as lifted when its centre is above 4 cm, which that of a ball
+with a radius above 4 cm is on the table.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ class Relocate(Adroit):
         return observations
 
     def reward(self, step: Transition) -> FloatArray:
-        """0.1 per metre from palm to ball; above the table closeness to the target counts, with bonuses at 10 and 5 cm."""
+        """0.1 per metre from palm to ball; above the table closeness to the target counts, with two bonuses."""
         assert step.next_derived is not None
         palm, ball, target = (step.next_derived[..., i : i + 3] for i in (0, 3, 6))
         gap = _distance(ball, target)
@@ -254,24 +254,25 @@ def _ball_radius(model: mujoco.MjModel, spec: str) -> Target:
     return Target(spec, "m", radius, write, order=1, constants=True, minimum=0.0)
 
 
-_FRAME_MASS = """Mass of the fixed frame. The frame cannot move, so this changes nothing but rounding, which contact may \
-amplify: expect the prior back."""
-_DOOR_MASS = """Mass and, with it, inertia of the door leaf: how slowly it gains and loses speed. Trades off against the \
-latch mass, since the latch hangs on the leaf and turns with it."""
-_LATCH_MASS = """Mass and, with it, inertia of the latch and its handle: it turns with the door, and pulls on the latch \
-because it hangs off its axis. Trades off against the door mass and, once the latch turns, its friction loss."""
-_DOOR_FRICTION = """Dry friction of the door hinge: the torque below which the door stands still. Trades off against the \
-door damping unless the door is seen to move at several speeds."""
+_FRAME_MASS = """Mass of the fixed frame. The frame cannot move, so this changes nothing but rounding, which contact \
+may amplify: expect the prior back."""
+_DOOR_MASS = """Mass and, with it, inertia of the door leaf: how slowly it gains and loses speed. Trades off against \
+the latch mass, since the latch hangs on the leaf and turns with it."""
+_LATCH_MASS = """Mass and, with it, inertia of the latch and its handle: it turns with the door, and pulls on the \
+latch because it hangs off its axis. Trades off against the door mass and, once the latch turns, its friction loss."""
+_DOOR_FRICTION = """Dry friction of the door hinge: the torque below which the door stands still. Trades off against \
+the door damping unless the door is seen to move at several speeds."""
 _LATCH_FRICTION = """Dry friction of the latch: the torque below which it stays where it is, so it shows only while a \
 hand turns the latch. Trades off against the latch damping unless the latch is seen to turn at several speeds."""
 _DOOR_DAMPING = """Friction of the door hinge in proportion to its speed: how soon a swinging door stops. Trades off \
 against the door friction loss."""
-_LATCH_DAMPING = """Friction of the latch in proportion to its speed: how fast a hand can turn it and how soon it stops. \
-Trades off against the latch friction loss, which hardly shows in a latch that coasts to rest under this damping."""
-_BALL_MASS = """Mass and, with it, inertia of the ball: how it answers a push and how it loads the hand. Shows only \
-while the hand touches it; trades off against the radius, which sets where that happens."""
-_BALL_RADIUS = """Radius of the ball at an unchanged mass, its inertia with the square of it: how high it lies and where \
-the fingers meet it. Trades off against the mass in how the ball turns."""
+_LATCH_DAMPING = """Friction of the latch in proportion to its speed: how fast a hand can turn it and how soon it \
+stops. Trades off against the latch friction loss, which hardly shows in a latch that coasts to rest under this \
+damping."""
+_BALL_MASS = """Mass and, with it, inertia of the ball: how it answers a push and how it loads the hand. \
+Shows only while the hand touches it; trades off against the radius, which sets where that happens."""
+_BALL_RADIUS = """Radius of the ball at an unchanged mass, its inertia with the square of it: how high it lies and \
+where the fingers meet it. Trades off against the mass in how the ball turns."""
 
 
 def door(latch_damping: float = 1.5) -> Door:

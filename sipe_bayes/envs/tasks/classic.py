@@ -186,8 +186,8 @@ def pendulum() -> Pendulum:
             [
                 scaled(
                     *("mass", 1.0, ["body:rod.mass"], "kg"),
-                    "Weight and inertia of the rod, against which the motor works: without damping or torque it changes "
-                    "nothing. It trades off against the length.",
+                    "Weight and inertia of the rod, against which the motor works: without damping or torque it "
+                    "changes nothing. It trades off against the length.",
                 ),
                 scaled(
                     *("length", 1.0, ["rod:rod.length"], "m"),
@@ -195,7 +195,8 @@ def pendulum() -> Pendulum:
                 ),
                 scaled(
                     *("damping", 0.1, ["joint:hinge.damping"], "N m s/rad"),
-                    "Torque against the speed, which takes energy from every swing; a heavier rod loses it more slowly.",
+                    "Torque against the speed, which takes energy from every swing; a heavier rod loses it more "
+                    "slowly.",
                 ),
             ]
         ),
@@ -221,12 +222,13 @@ def cart_pole() -> CartPole:
                 ),
                 scaled(
                     *("pole_length", 1.0, ["rod:pole.length"], "m"),
-                    "A longer pole falls more slowly and turns less as the cart is pushed; nothing trades off against it "
-                    "fully.",
+                    "A longer pole falls more slowly and turns less as the cart is pushed; nothing trades off against "
+                    "it fully.",
                 ),
                 scaled(
                     *("cart_friction", 0.5, ["joint:slider.damping"], "N s/m"),
-                    "Force against the speed of the cart, small on short drives; it trades off against the pole's mass.",
+                    "Force against the speed of the cart, small on short drives; it trades off against the pole's "
+                    "mass.",
                 ),
             ]
         ),

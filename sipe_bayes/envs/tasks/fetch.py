@@ -5,9 +5,9 @@ Research", 2018, https://arxiv.org/abs/1802.09464; theta = 0.5 is gymnasium-robo
 FetchPickAndPlace-v4, of which only the MJCF and the meshes are used.
 
 The gripper is welded to a body that is placed by hand (MuJoCo's mocap): each control step sets it to where the gripper
-was last seen, plus the action. What is seen after a step are MuJoCo's positions before the step's last substep, with the
-velocities after it; where the fingers are blocked, they are put back to zero after each control step and everything is
-seen anew. Control thus needs more than the physics state. These sights are the state's memory: observations, rewards
+was last seen, plus the action. What is seen after a step are MuJoCo's positions before the step's last substep, with
+the velocities after it; where the fingers are blocked, they are put back to zero after each control step and everything
+is seen anew. Control thus needs more than the physics state. These sights are the state's memory: observations, rewards
 and controls are functions of the state alone, and a rollout can go on from any recorded sample.
 """
 
@@ -222,7 +222,7 @@ class Fetch(Task):
         return states
 
     def probe(self, model: mujoco.MjModel, before: FloatArray, states: FloatArray) -> FloatArray:
-        """Positions before the last substep and velocities after it; the states themselves where fingers are blocked."""
+        """Positions before the last substep, velocities after it; the states themselves where fingers are blocked."""
         if self.scene.blocked:
             return states
         late = states.copy()
@@ -307,8 +307,9 @@ def _parameters(friction: float) -> ParameterSpace:
         2.0,
         ["body:object0.mass"],
         "kg",
-        "Mass of the object, its inertia with it: how far a knock sends it and how much it weighs on a lifting gripper. "
-        "Once it slides alone, its mass no longer matters; a light object and a slippery table both make it go farther.",
+        "Mass of the object, its inertia with it: how far a knock sends it and how much it weighs on a lifting "
+        "gripper. Once it slides alone, its mass no longer matters; a light object and a slippery table both make it "
+        "go farther.",
     )
     sliding = scaled(
         "sliding_friction",

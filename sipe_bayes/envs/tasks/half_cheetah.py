@@ -159,8 +159,8 @@ def _joint_parameters(legs: tuple[_Leg, ...]) -> list[Parameter]:
         ),
         (
             *("stiffness", "joint", "N m/rad"),
-            "Spring that returns the {joint} to its middle, which also carries weight; it trades off against the gear in "
-            "slow motion.",
+            "Spring that returns the {joint} to its middle, which also carries weight; it trades off against the gear "
+            "in slow motion.",
         ),
         (
             *("gear", "actuator", "N m"),

@@ -101,8 +101,8 @@ def hopper() -> Hopper:
                 ),
                 scaled(
                     *("thigh_length", 0.45, ["link:thigh_geom.length"], "m"),
-                    "Distance of the knee from the hip, with the thigh's mass; in the height of the torso it trades off "
-                    "against the leg.",
+                    "Distance of the knee from the hip, with the thigh's mass; in the height of the torso it trades "
+                    "off against the leg.",
                     *(0.75, 1.25),
                 ),
                 scaled(

@@ -8,8 +8,8 @@ between 1 and 2 m high.
 
 The observation's 376 numbers are 45 of position and velocity and 331 that MuJoCo derives: inertia and velocity of every
 body about the centre of mass of the whole robot, actuator and contact forces. The model is integrated with Runge-Kutta,
-and what MjData holds after a step belongs to the last stage of the last physics step: close to the new state, not at it.
-Gymnasium reads that, and so does this task; sensors would give the state before that physics step. The first
+and what MjData holds after a step belongs to the last stage of the last physics step: close to the new state, not at
+it. Gymnasium reads that, and so does this task; sensors would give the state before that physics step. The first
 observation of an episode has what belongs to the starting state.
 
 Episodes start with the torso at 1.4 m, as published, however long the legs are: legs much longer than the model's own
@@ -148,6 +148,7 @@ class Humanoid(LinkTask):
 
     @cached_property
     def channels(self) -> tuple[str, ...]:  # type: ignore[override]
+        """45 of position and velocity, and 331 that MuJoCo derives."""
         model = self.published
         bodies = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) for i in range(model.nbody)]
         joints = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, model.njnt)]
@@ -249,8 +250,8 @@ def _joint_parameters(model: mujoco.MjModel, joint: str) -> list[Parameter]:
             f"{joint}_gear",
             f"actuator:{joint}.gear",
             "N m",
-            f"Torque of the joint that {moves} for a unit action. Raised together with damping and stiffness it changes "
-            "little but how the joint answers to inertia and contacts.",
+            f"Torque of the joint that {moves} for a unit action. Raised together with damping and stiffness it "
+            "changes little but how the joint answers to inertia and contacts.",
         ),
     ]
 

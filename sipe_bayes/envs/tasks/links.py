@@ -68,8 +68,15 @@ class _Groups:
         return cls(bodies, np.array([row[g] for g in flat], int), starts, shape)
 
     def add(self, places: FloatArray, inertial: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mass (k,), centre of mass (k, 3) and inertia about it (k, 3, 3) of the bodies, of the centres (G, 3) and
-        ``inertial`` (G, 3) of all links."""
+        """What the bodies' geoms add up to.
+
+        Args:
+            places: the centres (G, 3) of all links.
+            inertial: their mass and moments across and along the axis, (G, 3).
+
+        Returns:
+            Mass (k,), centre of mass (k, 3) and inertia about it (k, 3, 3) of the bodies.
+        """
         at, inertial = places[self.rows], inertial[self.rows]
         moment = inertial[:, :1] * at
         # second moments C of the mass about the body's origin; the inertia is tr(C) - C
