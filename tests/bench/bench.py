@@ -15,12 +15,15 @@ import os
 import platform
 import pstats
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[2]))  # where this is run as a command
 import arm
+import batch
 import ddpg
 import envs
 import fits
@@ -34,9 +37,10 @@ from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.simulation.simulator import Simulator
+from tests.problems import sysid
 
 PENDULUM = Path(__file__).parents[2] / "examples" / "simple_pendulum" / "calibrate.toml"
-LANES, STEPS = 64, 200
+NUM_ENVS, STEPS = 64, 200
 PENDULUM_XML = """
 <mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body><joint name="a" axis="0 1 0"
 damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/></body></worldbody>
@@ -74,13 +78,13 @@ def side_by_side(ours: Callable[[int], float], other: Callable[[int], float], pa
 
 
 def engine(pairs: int) -> None:
-    print(f"\nEngine: Simulator.rollout against mujoco.rollout, {LANES} lanes x {STEPS} control steps")
+    print(f"\nEngine: Simulator.rollout against mujoco.rollout, {NUM_ENVS} simulations x {STEPS} control steps")
     print("mujoco.rollout: models written beforehand, controls repeated beforehand, states alone read")
     print(f"{'model':<12}{'substeps':>9}{'ours ms':>10}{'bare ms':>10}{'ratio':>8}{'M steps/s':>11}")
     for name, xml, joints in (("pendulum", PENDULUM_XML, "a"), ("two links", TWO_LINKS_XML, "ab")):
         for substeps in (1, 5):
             mine, bare, ratio = _engine_row(xml, joints, substeps, pairs)
-            rate = LANES * STEPS * substeps / mine / 1e6
+            rate = NUM_ENVS * STEPS * substeps / mine / 1e6
             print(f"{name:<12}{substeps:>9}{1e3 * mine:>10.2f}{1e3 * bare:>10.2f}{ratio:>8.2f}{rate:>11.2f}")
 
 
@@ -91,9 +95,9 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
     parameters = [Parameter(f"damping_{j}", 0.01, 1.0, targets=(f"joint:{j}.damping",)) for j in joints]
     simulator = Simulator(MjcfEnvironment.build(xml, parameters, list(joints), [f"joint:{j}.position" for j in joints]))
     rng = np.random.default_rng(0)
-    theta = rng.random((LANES, len(joints)))
-    actions = rng.standard_normal((LANES, STEPS, len(joints)))
-    start = np.tile(simulator.default_state(), (LANES, 1))
+    theta = rng.random((NUM_ENVS, len(joints)))
+    actions = rng.standard_normal((NUM_ENVS, STEPS, len(joints)))
+    start = np.tile(simulator.default_state(), (NUM_ENVS, 1))
     dt = substeps * simulator.model.opt.timestep
     models = []
     for row in theta:
@@ -111,7 +115,7 @@ def _engine_row(xml: str, joints: str, substeps: int, pairs: int) -> Seconds:
         return simulator.rollout(theta, actions, start, dt)
 
     np.testing.assert_array_equal(ours().states[:, 1:], bare()[:, substeps - 1 :: substeps])
-    return side_by_side(lambda _: seconds(ours), lambda _: seconds(bare), max(pairs, 21))
+    return side_by_side(lambda _: seconds(ours), lambda _: seconds(bare), 3 * pairs)
 
 
 def rival(pairs: int) -> None:
@@ -158,6 +162,19 @@ def rival(pairs: int) -> None:
         half = 1e3 * np.mean([e.half for e in estimates.values()])
         inside = sum(e.inside for e in estimates.values())
         print(f"{name:<40}{error:>14.3f}{half:>17.3f}{inside:>9} of {5 * len(estimates)}")
+
+
+def starts() -> None:
+    """What mujoco.sysid answers on a cart of which only gear / mass shows, from three starts."""
+    print("\nmujoco.sysid on a cart of which only gear / mass shows, little noise, from three starts; laplace")
+    print("names the ridge (tests/inference/test_rival.py)")
+    print(
+        f"{'start: gear, mass':<24}{'answer: gear, mass':>22}{'gear / mass':>14}   (truth {sysid.GEAR / sysid.MASS:g})"
+    )
+    for gear, mass in sysid.CART_STARTS:
+        xml = sysid.CART_XML.format(gear=gear, mass=mass)
+        answer = sysid.rival(xml, sysid.cart_log(), sysid.cart_unknowns("log")).value
+        print(f"{gear:>8g}, {mass:<14g}{answer[0]:>14.3f}, {answer[1]:<6.3f}{answer[0] / answer[1]:>14.3f}", flush=True)
 
 
 STAGES = {  # stage: (file, function) pairs whose cumulative seconds it is; none of a stage calls another of it
@@ -223,7 +240,7 @@ def chain() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    tables = ("engine", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "transfer")
+    tables = ("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "transfer")
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
     given = parser.parse_args()
@@ -245,14 +262,19 @@ def main() -> None:
         elif name == "fits":
             fits.table()
         elif name == "ddpg":
-            ddpg.table(max(given.pairs, 7), side_by_side)
+            ddpg.table(given.pairs, side_by_side)
         elif name == "transfer":
-            transfer.table(max(given.pairs, 7), side_by_side)
+            transfer.table(given.pairs, side_by_side)
+        elif name == "batch":
+            models = {"pendulum": (PENDULUM_XML, "a"), "two links": (TWO_LINKS_XML, "ab")}
+            batch.table(given.pairs, side_by_side, models)
         elif name == "envs":
-            envs.table(max(given.pairs, 7), side_by_side)
-            envs.against_parsing(max(given.pairs, 7), side_by_side)
+            envs.table(given.pairs, side_by_side)
+            envs.against_parsing(given.pairs, side_by_side)
         else:
-            {"engine": engine, "rival": rival, "stages": stages}[name](max(given.pairs, 7))
+            {"engine": engine, "rival": rival, "stages": stages}[name](given.pairs)
+            if name == "rival":
+                starts()
 
 
 if __name__ == "__main__":

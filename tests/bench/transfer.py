@@ -19,7 +19,7 @@ from sipe_bayes.rl.trainer import Trainer
 STEPS = {
     "FetchPush": 16 * 51,
     "HalfCheetahLinks": 8 * 1_001,
-}  # control steps of each side of a pair: an episode in each of the lanes
+}  # control steps of each side of a pair: an episode in each environment
 BAR = 0.9
 SideBySide = Callable[[Callable[[int], float], Callable[[int], float], int], tuple[float, float, float]]
 

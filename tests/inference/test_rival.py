@@ -1,46 +1,36 @@
 """Three traps: a NaN in the log, a start that diverges, a cart of which only gear / mass shows.
 
 Ours returns a usable posterior and says what happened. Where mujoco.sysid can be imported, what it does in the same place
-is checked too: it returns the start, dies, and gives an answer that depends on the start. Should a test of its behaviour
-fail, the rival has improved, and what the README says of it must change.
+is checked too: it returns the start, or dies. (That its answer depends on the start is a printed figure: `bench.py
+rival`.) Should a test of its behaviour fail, the rival has improved, and what the README says of it must change.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import mujoco
-import mujoco.rollout
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.run import calibrate
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
+from tests.problems.sysid import (
+    CART_STARTS,
+    CART_XML,
+    GEAR,
+    MASS,
+    SPRING,
+    SPRING_UNKNOWNS,
+    SPRING_XML,
+    cart_log,
+    cart_unknowns,
+    rival,
+    spring_log,
+)
 
-FloatArray = NDArray[np.float64]
-
-DT, STEPS = 0.002, 1000
-SPRING = 100.0, 0.5  # stiffness, damping of the truth
-GEAR, MASS = 2.0, 0.8  # of the truth; only their ratio shows
-NOISE = 1e-3  # m
-
-# a model's own value is where mujoco.sysid is started, and what ours takes as the model as given
-SPRING_XML = """
-<mujoco><option timestep="0.002"/><worldbody><body name="block"><joint name="slide" type="slide" axis="1 0 0"
-stiffness="{stiffness}" damping="{damping}"/><geom size="0.05" mass="0.1"/></body></worldbody>
-<actuator><motor name="motor" joint="slide"/></actuator><sensor><jointpos name="x" joint="slide"/></sensor></mujoco>
-"""
-CART_XML = """
-<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="slide" type="slide" axis="1 0 0"/>
-<geom size="0.05" mass="{mass}"/></body></worldbody>
-<actuator><motor name="motor" joint="slide" gear="{gear}"/></actuator>
-<sensor><jointpos name="x" joint="slide"/></sensor></mujoco>
-"""
 CONFIG = """
 model = "model.xml"
 window = 0.5
@@ -69,38 +59,6 @@ target = "{1}"
 bounds = [{2}, {3}]
 scale = "{4}"
 """
-SPRING_UNKNOWNS = (
-    ("stiffness", "joint:slide.stiffness", 10.0, 1e6, "log"),
-    ("damping", "joint:slide.damping", 0.05, 5.0, "log"),
-)
-CART_STARTS = ((0.5, 0.25), (0.5, 3.0), (2.0, 1.0))  # gear, mass
-
-
-def cart_unknowns(scale: str) -> tuple[tuple[str, str, float, float, str], ...]:
-    return ("gear", "actuator:motor.gear", 0.2, 8.0, scale), ("mass", "body:cart.mass", 0.1, 4.0, scale)
-
-
-def forces(time: FloatArray) -> FloatArray:
-    return np.sin(2 * np.pi * 1.3 * time) + 0.6 * np.sin(2 * np.pi * 3.1 * time + 0.4)
-
-
-@cache
-def log(xml: str, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """time (T+1,), force (T+1,) and position (T+1,) with white noise, from rest."""
-    model = mujoco.MjModel.from_xml_string(xml)
-    time = np.arange(STEPS + 1) * DT
-    force = forces(time)
-    state, _ = mujoco.rollout.rollout(model, mujoco.MjData(model), np.zeros(3), force[:-1, None])
-    position = np.concatenate([[0.0], state[0, :, 1]])
-    return time, force, position + NOISE * np.random.default_rng(seed).standard_normal(STEPS + 1)
-
-
-def spring_log() -> tuple[FloatArray, FloatArray, FloatArray]:
-    return log(SPRING_XML.format(stiffness=SPRING[0], damping=SPRING[1]))
-
-
-def cart_log() -> tuple[FloatArray, FloatArray, FloatArray]:
-    return log(CART_XML.format(gear=GEAR, mass=MASS))
 
 
 def ours(folder: Path, xml: str, table: tuple[FloatArray, ...], unknowns: tuple[Any, ...]) -> Calibration:
@@ -112,38 +70,6 @@ def ours(folder: Path, xml: str, table: tuple[FloatArray, ...], unknowns: tuple[
     parameters = "".join(PARAMETER.format(*u) for u in unknowns)
     (folder / "calibrate.toml").write_text(CONFIG.format(parameters=parameters))
     return calibrate(prepare(folder / "calibrate.toml"))
-
-
-def rival(xml: str, table: tuple[FloatArray, ...], unknowns: tuple[Any, ...]) -> SimpleNamespace:
-    """What mujoco.sysid finds: start and value, by parameter. Raises what it raises."""
-    from mujoco import sysid
-
-    time, force, position = table
-    spec = mujoco.MjSpec.from_string(xml)
-    model, params = spec.compile(), sysid.ParameterDict()
-    for name, target, low, high, _ in unknowns:
-        start, write = _modifier(spec, target)
-        params.add(sysid.Parameter(name, start, low, high, modifier=write))
-    # sensordata of the state before a step carry the time after it, as mujoco.rollout returns them
-    measured = sysid.TimeSeries.from_names(time[1:], position[:-1, None], model)
-    state = sysid.create_initial_state(model, np.zeros(1), np.zeros(1), np.zeros(0))
-    control = sysid.TimeSeries(time, force[:, None])
-    sequence = sysid.ModelSequences("model", spec, "log", state, control, measured)
-    residual = sysid.build_residual_fn(models_sequences=[sequence])
-    start = params.as_vector()
-    found, _ = sysid.optimize(params, residual, verbose=False)
-    return SimpleNamespace(start=start, value=found.as_vector())
-
-
-def _modifier(spec: Any, target: str) -> tuple[float, Any]:
-    """A parameter's value in the model and what writes it, for mujoco.sysid."""
-    if target == "joint:slide.stiffness":
-        return spec.joint("slide").stiffness[0], lambda s, p: s.joint("slide").stiffness.__setitem__(0, p.value[0])
-    if target == "joint:slide.damping":
-        return spec.joint("slide").damping[0], lambda s, p: s.joint("slide").damping.__setitem__(0, p.value[0])
-    if target == "actuator:motor.gear":
-        return spec.actuator("motor").gear[0], lambda s, p: s.actuator("motor").gear.__setitem__(0, p.value[0])
-    return spec.geoms[0].mass, lambda s, p: setattr(s.geoms[0], "mass", p.value[0])
 
 
 def summary(found: Calibration, name: str) -> ParameterSummary:
@@ -235,15 +161,3 @@ def test_sysid_dies_when_the_start_diverges(tmp_path: Path, monkeypatch: Any) ->
     monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
     with pytest.raises(ValueError, match="times must be strictly increasing"):
         rival(DIVERGING_XML, spring_log(), SPRING_UNKNOWNS)
-
-
-def test_sysid_answers_differ_from_start_to_start(tmp_path: Path, monkeypatch: Any) -> None:
-    pytest.importorskip("mujoco.sysid._src.optimize", reason="mujoco[sysid] is not installed")
-    monkeypatch.chdir(tmp_path)
-    values = np.array(
-        [rival(CART_XML.format(gear=g, mass=m), cart_log(), cart_unknowns("log")).value for g, m in CART_STARTS]
-    )
-    np.testing.assert_allclose(values[:, 0] / values[:, 1], GEAR / MASS, rtol=0.02)
-    gears = values[:, 0]
-    print("gear, mass of three starts:", values.round(3).tolist())
-    assert gears.max() > 2 * gears.min(), values
