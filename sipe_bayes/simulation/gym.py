@@ -23,7 +23,7 @@ from sipe_bayes.simulation.episodes import Episodes, Step
 from sipe_bayes.simulation.simulator import Simulator
 
 Space = gymnasium.Space[FloatArray]
-Info = dict[str, Any]
+Info = dict[str, object]
 """Gymnasium's ``info`` and ``options``: whatever goes with a step or a reset, by name."""
 
 for _name in TASKS:

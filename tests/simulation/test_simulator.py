@@ -3,10 +3,7 @@ ran before."""
 
 from __future__ import annotations
 
-import math
 import pickle
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,147 +13,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.simulation.engine import Engine
 from sipe_bayes.simulation.simulator import Memory, Simulator
-
-FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
-HORIZON = 24
-
-PENDULUM = """<mujoco><option timestep="0.004"/><worldbody><body name="rod">
-  <joint name="hinge" axis="0 1 0" damping="0.05" frictionloss="0.02"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/></body></worldbody>
-  <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
-CART_POLE = """<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody><body name="cart">
-  <joint name="slider" type="slide" axis="1 0 0" damping="0.1"/><geom type="box" size=".1 .1 .05" mass="1"/>
-  <body name="pole" pos="0 0 .05"><joint name="hinge" axis="0 1 0"/>
-  <inertial pos="0 0 .3" mass=".2" diaginertia=".006 .006 .003"/></body></body></worldbody>
-  <actuator><motor name="motor" joint="slider" gear="3"/></actuator></mujoco>"""
-ARM = """<mujoco><option timestep="0.004"/><worldbody><geom name="floor" type="plane" size="3 3 .1"/>
-  <body name="upper" pos="0 0 .6"><joint name="shoulder" axis="0 1 0" damping="0.1"/>
-    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass=".5"/>
-    <body name="lower" pos=".3 0 0"><joint name="elbow" axis="0 1 0" damping="0.1"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass=".3"/>
-      <site name="tip" pos=".3 0 0"/></body></body>
-  <body name="box" pos=".3 0 .1"><freejoint/><geom name="box" type="box" size=".1 .1 .1" mass=".4"/></body>
-  </worldbody>
-  <actuator><motor name="m1" joint="shoulder"/><motor name="m2" joint="elbow"/></actuator>
-  <sensor><accelerometer name="acc" site="tip"/><gyro name="gyro" site="tip"/>
-    <framepos name="pos" objtype="body" objname="box"/><jointpos name="enc" joint="elbow"/></sensor>
-  </mujoco>"""
-SERVO = """<mujoco><option timestep="0.004"/><worldbody><body name="rod">
-  <joint name="hinge" axis="0 1 0" armature=".01"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/></body></worldbody>
-  <actuator><general name="servo" joint="hinge" dyntype="filter" dynprm=".03" gainprm="20"
-    biastype="affine" biasprm="0 -20 -1"/></actuator></mujoco>"""
+from tests.problems.small_models import ARM, CASES, FULL, HINGE, HORIZON, PENDULUM, draw, p, plain
 
 
 @pytest.fixture(autouse=True)
 def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain loops let MuJoCo write its log where they run."""
     monkeypatch.chdir(tmp_path)
-
-
-@dataclass(frozen=True)
-class Case:
-    xml: str
-    parameters: tuple[Parameter, ...]
-    actuators: tuple[str, ...]
-    measurements: tuple[str | Channel, ...]
-
-    def environment(self) -> MjcfEnvironment:
-        return MjcfEnvironment.build(self.xml, self.parameters, self.actuators, self.measurements)
-
-
-def p(name: str, low: float, high: float, *targets: str, **more: Any) -> Parameter:
-    return Parameter(name, low, high, targets=targets, **more)
-
-
-HINGE = ("joint:hinge.position", "joint:hinge.velocity")
-ARM_SENSORS = tuple(f"sensor:{s}[{i}]" for s in ("acc", "gyro", "pos") for i in range(3))
-CASES = {
-    "pendulum": Case(
-        PENDULUM,
-        (
-            p("mass", 0.5, 2, "body:rod.mass", scale="log"),
-            p("friction", 0, 0.1, "joint:hinge.frictionloss"),
-            p("com", -0.4, -0.1, "body:rod.com_z"),
-        ),
-        ("motor",),
-        HINGE,
-    ),
-    "cart-pole": Case(
-        CART_POLE,
-        (
-            p("cart", 0.5, 2, "body:cart.mass"),
-            p("inertia", 0.004, 0.008, "body:pole.inertia_yy"),
-            p("tilt", -0.001, 0.001, "body:pole.inertia_xz"),
-            p("gear", 1, 5, "actuator:motor.gear"),
-        ),
-        ("motor",),
-        ("joint:slider.position", *HINGE),
-    ),
-    "arm": Case(
-        ARM,
-        (
-            p("lower", 0.5, 2, "body:lower.mass", relative=True),
-            p("slip", 0.2, 1.5, "geom:box.friction", "geom:floor.friction"),
-            p("box", -0.05, 0.05, "body:box.com_x"),
-            p("gravity", -12, -8, "option.gravity_z"),
-        ),
-        ("m1", "m2"),
-        ("joint:shoulder.position", "joint:elbow.velocity", *ARM_SENSORS, "sensor:enc"),
-    ),
-    "servo": Case(
-        SERVO,
-        (
-            p("kp", 5, 40, "actuator:servo.kp"),
-            p("kv", 0, 2, "actuator:servo.kv"),
-            p("d", 0, 1, "joint:hinge.damping"),
-        ),
-        ("servo",),
-        HINGE,
-    ),
-    "delay": Case(
-        PENDULUM,
-        (p("delay", 0, 0.03, "actuator:motor.delay"), p("offset", -0.5, 0.5, "actuator:motor.offset")),
-        ("motor",),
-        HINGE,
-    ),
-}
-
-
-def draw(case: Case, batch: int = 7, seed: int = 0) -> tuple[Simulator, Any, Any, Any]:
-    """A simulator with one thread and random theta (B, N), actions (B, T, A) and starts (B, S)."""
-    simulator, rng = Simulator(case.environment(), 1), np.random.default_rng(seed)
-    model = simulator.model
-    starts = np.tile(simulator.default_state(), (batch, 1))
-    starts[:, 1 + model.nq : 1 + model.nq + model.nv] = rng.normal(0, 0.5, (batch, model.nv))
-    actions = rng.normal(0, 1, (batch, HORIZON, len(case.actuators)))
-    return simulator, rng.random((batch, len(case.parameters))), actions, starts
-
-
-def plain(environment: MjcfEnvironment, theta: Any, actions: Any, start: Any, dt: float, skip: int) -> tuple[Any, int]:
-    """States (T+1, S) of one lane by mj_step, and the first physics step that warned, from 1."""
-    model = environment.compile()
-    environment.write(model, environment.space.values(theta))
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
-    model.opt.timestep, data = dt / skip, mujoco.MjData(model)
-    mujoco.mj_setState(model, data, start, FULL)
-    states, bad = [start], len(actions) * skip + 1
-    for t, action in enumerate(np.repeat(actions, skip, axis=0)):
-        data.ctrl[environment._controls] = action
-        mujoco.mj_step(model, data)
-        mujoco.mj_getState(model, data, state := np.empty_like(start), FULL)
-        states.append(state)
-        if data.warning.number.any():
-            bad = t + 1
-            break
-    states += states[-1:] * (len(actions) * skip + 1 - len(states))
-    return np.array(states)[::skip], bad
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -221,118 +87,6 @@ def test_environment_survives_pickling() -> None:
     other = Simulator(pickle.loads(pickle.dumps(simulator.environment)), 1)  # noqa: S301
     expected = simulator.rollout(theta, actions, starts)
     np.testing.assert_array_equal(other.rollout(theta, actions, starts).observations, expected.observations)
-
-
-# divergence
-
-
-def divergent(case: str) -> tuple[Simulator, Any, Any, Any]:
-    """Seven lanes; 2 and 5 diverge, at different times and for different reasons."""
-    simulator, theta, actions, starts = draw(CASES[case])
-    velocity = 1 + simulator.model.nq
-    starts[2, velocity] = 1e11  # refused by the first step
-    starts[5, velocity] = 3e9 if case != "servo" else 0.0
-    if case == "servo":
-        theta[5] = 1e9, 0, 0  # unstable: grows until the acceleration is refused
-    return simulator, theta, actions, starts
-
-
-@pytest.mark.parametrize("case", ["pendulum", "cart-pole", "arm", "servo", "delay"])
-@pytest.mark.parametrize("skip", [1, 3])
-def test_divergence_is_flagged_and_touches_no_other_lane(
-    case: str, skip: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    simulator, theta, actions, starts = divergent(case)
-    dt = skip * simulator.model.opt.timestep
-    sound = np.array([0, 1, 3, 4, 6])
-    alone = simulator.rollout(theta[sound], actions[sound], starts[sound], dt)
-    for threads in (1, 2):
-        engine = Simulator(simulator.environment, threads)
-        result = engine.rollout(theta, actions, starts, dt, allow_outside=True)
-        np.testing.assert_array_equal(result.states[sound], alone.states)
-        np.testing.assert_array_equal(result.observations[sound], alone.observations)
-        assert result.valid[sound].all()
-        assert engine.diverged == (~result.valid[:, -1]).sum()
-    assert not list(tmp_path.iterdir()), "MuJoCo wrote its log"
-    assert capfd.readouterr() == ("", ""), "MuJoCo wrote to the terminal"
-    for lane in (2, 5):
-        states, bad = plain(simulator.environment, theta[lane], actions[lane], starts[lane], dt, skip)
-        first = math.ceil(bad / skip)
-        if simulator.environment.needs_derived and bad % skip == 1 % skip:
-            first -= 1  # the sensors of the sample before come from the step that failed
-        if lane == 2:
-            first = 0  # the start itself is what MuJoCo takes for diverged
-        assert result.valid[lane].tolist() == [t < first for t in range(HORIZON + 1)]
-        np.testing.assert_array_equal(result.states[lane, :first], states[:first])
-
-
-@pytest.mark.parametrize("horizon", [1, 2, 5])
-@pytest.mark.parametrize("time", [0.0, 1.0])
-def test_a_first_step_that_fails_is_flagged(horizon: int, time: float) -> None:
-    """From time 0 MuJoCo's reset ends on the expected time: the state alone does not tell."""
-    simulator, theta, actions, starts = draw(CASES["servo"], batch=3)
-    starts[:, 0] = time
-    starts[1, 1] = 9e9  # a spring of 1e9 N m/rad: the acceleration is refused
-    theta[1] = 1e9, 0, 0
-    result = simulator.rollout(theta, actions[:, :horizon], starts, allow_outside=True)
-    assert result.valid[1].tolist() == [True] + [False] * horizon
-    assert result.valid[[0, 2]].all()
-
-
-@pytest.mark.parametrize("horizon", [1, 2, 5])
-def test_a_warning_without_a_reset_is_flagged(horizon: int) -> None:
-    """A body without mass: MuJoCo warns of a singular inertia, steps once and repeats that state."""
-    environment = MjcfEnvironment.build(PENDULUM, [p("m", 0, 2, "body:rod.mass")], ["motor"], HINGE)
-    simulator, actions = Simulator(environment, 1), np.ones((1, horizon, 1))
-    start = simulator.default_state()
-    result = simulator.rollout([[0.0], [0.5]], actions, start)
-    assert plain(environment, np.zeros(1), actions[0], start, 0.004, 1)[1] == 1
-    assert result.valid.tolist() == [[True] + [False] * horizon, [True] * (horizon + 1)]
-
-
-@pytest.mark.parametrize(
-    ("parameter", "theta"),
-    [
-        (p("m", 0.5, 2, "body:rod.mass"), -1.0),
-        (p("d", 0.0, 2, "joint:hinge.damping"), -0.1),
-        (p("i", 0.001, 0.05, "body:rod.inertia_yy"), 1.0),
-        (p("i", 0.0001, 0.05, "body:rod.inertia_zz"), -1.0),
-        (p("i", 0.0, 1.0, "body:rod.inertia_xz"), 0.9),
-    ],
-)
-def test_unphysical_parameters_are_never_simulated(
-    parameter: Parameter, theta: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lanes = []
-    real: Callable[..., Any] = Engine._native
-
-    def counted(engine: Engine, models: Any, *args: Any) -> Any:
-        lanes.append(len(models))
-        return real(engine, models, *args)
-
-    monkeypatch.setattr(Engine, "_native", counted)
-    environment = MjcfEnvironment.build(PENDULUM, [parameter], ["motor"], HINGE)
-    simulator, actions = Simulator(environment, 1), np.zeros((1, 3, 1))
-    default = float(environment.space.default_theta[0])
-    thetas = [[default], [theta], [default]]
-    result = simulator.rollout(thetas, actions, simulator.default_state(), allow_outside=True)
-    assert result.valid.all(1).tolist() == [True, False, True]
-    assert not result.valid[1].any()
-    assert np.isnan(result.states[1]).all()
-    assert lanes == [2]
-    assert simulator.diverged == 1
-    assert not simulator.rollout([[theta]], actions, simulator.default_state(), allow_outside=True).valid.any()
-    assert lanes == [2]
-
-
-def test_a_start_that_is_not_finite_is_never_simulated() -> None:
-    simulator, theta, actions, starts = draw(CASES["pendulum"])
-    starts[3, 1] = np.nan
-    result = simulator.rollout(theta, actions, starts)
-    assert not result.valid[3].any()
-    assert result.valid[[0, 1, 2, 4, 5, 6]].all()
-    assert np.isnan(result.observations[3]).all()
 
 
 # delays
