@@ -71,7 +71,7 @@ def _spaces(task: Task) -> tuple[Space, Space]:
     return observation, cast(Space, action)
 
 
-def _info(step: Step) -> Info:
+def _info(step: Step) -> dict[str, FloatArray | BoolArray]:
     """What a step says besides observation, reward and end, for all sub-environments."""
     info = {
         "valid": step.valid,
@@ -136,7 +136,7 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         super().reset(seed=seed)
         options = _checked(options, ("theta", "allow_outside"))
         if "theta" in options:
-            self.set_parameters(options["theta"], bool(options.get("allow_outside", False)))
+            self.set_parameters(cast(FloatArray, options["theta"]), bool(options.get("allow_outside", False)))
         if self._episodes is None:
             self._episodes = Episodes(self.simulator, self.theta, [self.np_random], allow_outside=True)
         else:
@@ -238,10 +238,10 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
                 (N,) with ``allow_outside``.
         """
         options = _checked(options, ("theta", "allow_outside", "reset_mask"))
-        chosen = self._chosen("reset_mask", options.get("reset_mask"))
+        chosen = self._chosen("reset_mask", cast(BoolArray | None, options.get("reset_mask")))
         seeds = self._seeds(seed)
         if "theta" in options:
-            self.set_parameters(options["theta"], chosen, bool(options.get("allow_outside", False)))
+            self.set_parameters(cast(FloatArray, options["theta"]), chosen, bool(options.get("allow_outside", False)))
         if not self._generators:
             self._generators = [np.random.default_rng(s) for s in seeds]
         elif seed is not None:

@@ -98,11 +98,11 @@ def test_nan_in_the_log_costs_one_sample(tmp_path: Path) -> None:
     found = ours(tmp_path, NAN_XML, nan_log(), SPRING_UNKNOWNS)
     assert_near(found, "stiffness", SPRING[0])
     assert_near(found, "damping", SPRING[1])
-    assert found.logs[0]["missing"]["x"] == 1
+    assert found.logs[0].missing["x"] == 1
     clean = tmp_path / "clean"
     clean.mkdir()
     whole = ours(clean, NAN_XML, spring_log(), SPRING_UNKNOWNS)
-    assert not whole.logs[0]["missing"].get("x", 0)
+    assert not whole.logs[0].missing.get("x", 0)
     for name in ("stiffness", "damping"):
         with_nan, without = summary(found, name), summary(whole, name)
         assert abs(with_nan.mean - without.mean) < 0.5 * without.sd
@@ -110,8 +110,8 @@ def test_nan_in_the_log_costs_one_sample(tmp_path: Path) -> None:
 
 def test_nan_in_the_log_is_named_to_the_reader(tmp_path: Path) -> None:
     found = ours(tmp_path, NAN_XML, nan_log(), SPRING_UNKNOWNS)
-    print(found.logs[0]["notes"])
-    assert any("x" in note and "1" in note for note in found.logs[0]["notes"]), found.logs[0]["notes"]
+    print(found.logs[0].notes)
+    assert any("x" in note and "1" in note for note in found.logs[0].notes), found.logs[0].notes
 
 
 def test_start_that_diverges_is_left_and_named(tmp_path: Path) -> None:
