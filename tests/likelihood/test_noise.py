@@ -225,7 +225,7 @@ def test_restricted_likelihood_is_the_dense_one(name: str, noise: Noise, free: t
 @EVERY_NOISE
 @pytest.mark.parametrize("free", [(True, True, True), (True, False, True), (False, False, False)])
 def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tuple[bool, ...]) -> None:
-    """Normal equations, restricted likelihood and its slopes against dense algebra; white noise also by the quick way."""
+    """Normal equations, restricted likelihood and its slopes against dense algebra; white noise also the quick way."""
     case, rng = PROBLEMS[name], np.random.default_rng(6)
     channels, (covariance, jacobian, residual) = case.observed.shape[2], dense(case, noise)
     jacobian, moving = jacobian[:, :N], np.array(free)

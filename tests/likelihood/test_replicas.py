@@ -15,7 +15,7 @@ from tests.problems.springs import HIGH, LOW, PROCESS, spring, spring_logs, spri
 
 
 def test_next_to_no_process_noise_is_the_plain_replay() -> None:
-    """With a delayed motor, a sensor that is read a physics step late, two logs of different lengths and a missing sample."""
+    """With a delayed motor, a sensor read a physics step late, two logs of different lengths and a missing sample."""
     xml = XML.replace("</mujoco>", '<sensor><jointvel name="rate" joint="hinge"/></sensor></mujoco>')
     parameters = [
         Parameter("rod_mass", 0.3, 1.0, targets=("body:rod.mass",)),
@@ -45,8 +45,10 @@ def test_next_to_no_process_noise_is_the_plain_replay() -> None:
 
 
 def test_states_are_shaken_as_much_as_asked_for() -> None:
-    """Variances of 600 replicas of a linear spring's position along the log, against the plain recursion: all of 59 within 5 standard
-    errors (28 %)."""
+    """Variances of 600 replicas of a linear spring's position along the log, against the plain recursion.
+
+    All of 59 within 5 standard errors (28 %).
+    """
     simulator, (log,) = spring(), spring_logs(count=1)
     recorded = Trajectories.stack(log)
     theta = np.tile([(12.0 - LOW) / (HIGH - LOW)], (600, 1))

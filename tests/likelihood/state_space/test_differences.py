@@ -1,4 +1,7 @@
-"""Differences as long as the posterior is wide: exact where the model is linear, between the slopes of a kink, with an error there."""
+"""Differences as long as the posterior is wide.
+
+Exact where the model is linear, between the slopes of a kink, with an error there.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,10 @@ STEP = 0.01
 
 
 def sliding(spring: float = 10.0, limited: str = "false") -> Chain:
-    """A mass on a slide joint, one control step of 10 ms long, that may end at a stop at zero; pushed, its position measured."""
+    """A mass on a slide joint, one control step of 10 ms long, that may end at a stop at zero.
+
+    Pushed, its position measured.
+    """
     xml = (
         f'<mujoco><option timestep="{STEP}" gravity="0 0 0" integrator="Euler"/><worldbody><body>'
         f'<joint name="x" type="slide" stiffness="{spring}" range="0 1" limited="{limited}"/>'
@@ -55,8 +61,11 @@ def test_a_linear_model_has_the_same_slopes_at_any_length_and_no_error() -> None
 
 
 def test_at_a_stop_the_slope_is_between_both_sides_and_the_jump_has_an_error() -> None:
-    """Just at the stop, pushed on by nothing: in front of it the velocity does not depend on the position, behind it the stop
-    pushes back. Half of that is the slope, and half the squared deviation of one side, once more halved, the variance."""
+    """Just at the stop, pushed on by nothing.
+
+    In front of it the velocity does not depend on the position, behind it the stop pushes back. Half of that is the
+    slope, and half the squared deviation of one side, once more halved, the variance.
+    """
     chain, step = sliding(spring=1e-9, limited="true"), 0.01
     theta, at = np.array([0.0]), states([0.0, 0.5, 0.5])
     wide = linearise_widely(chain, theta, at, np.array([1e-4]), np.full((3, 2), step))

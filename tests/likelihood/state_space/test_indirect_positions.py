@@ -1,4 +1,7 @@
-"""What `StateSpace` reads off the channels before it filters: angles of which cosine and sine are measured, and what nothing tells."""
+"""What `StateSpace` reads off the channels before it filters.
+
+Angles of which cosine and sine are measured, and what nothing tells.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,10 @@ from sipe_bayes.simulation.simulator import Simulator
 
 
 def swing(truth: np.ndarray, seed: int, steps: int = 100, level: float = 0.01) -> tuple[Simulator, Trajectory]:
-    """The benchmark's Pendulum from anywhere on its circle, with its states: of the angle cosine and sine are measured."""
+    """The benchmark's Pendulum from anywhere on its circle, with its states.
+
+    Of the angle cosine and sine are measured.
+    """
     simulator, rng = Simulator(sipe.make_task("Pendulum"), num_threads=1), np.random.default_rng(seed)
     start = simulator.default_state()
     start[1:3] = rng.uniform(-np.pi, np.pi), rng.uniform(-1, 1)
@@ -45,17 +51,24 @@ def test_an_angle_is_found_from_its_cosine_and_sine() -> None:
 
 
 TIPS = """
-<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="one"><joint name="a" axis="0 1 0" damping="0.05"/>
-<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.01" mass="0.6" contype="0" conaffinity="0"/>{rest}</body></worldbody>
-<actuator><motor name="m" joint="a"/></actuator><sensor><framepos name="tip" objtype="site" objname="tip"/></sensor></mujoco>"""
-SECOND = """<body name="two" pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -0.5"
+<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody>
+<body name="one"><joint name="a" axis="0 1 0" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.01" mass="0.6" contype="0" conaffinity="0"/>{rest}
+</body></worldbody>
+<actuator><motor name="m" joint="a"/></actuator>
+<sensor><framepos name="tip" objtype="site" objname="tip"/></sensor></mujoco>"""
+SECOND = """<body name="two" pos="0 0 -0.5"><joint name="b" axis="0 1 0" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5"
 size="0.01" mass="0.6" contype="0" conaffinity="0"/><site name="tip" pos="0 0 -0.5"/></body>"""
 
 
 @pytest.mark.parametrize(("links", "seen", "indirect"), [(1, "xz", True), (1, "z", False), (2, "xz", False)])
 def test_an_angle_that_is_not_unique_is_not_made_up(links: int, seen: str, indirect: bool) -> None:
-    """The place of a rod's tip tells its angle; its height alone leaves two, and two angles move the tip of a second rod together: there
-    nothing is made up, and the search goes by the filter as before."""
+    """The place of a rod's tip tells its angle.
+
+    Its height alone leaves two, and two angles move the tip of a second rod together: there nothing is made up, and the
+    search goes by the filter as before.
+    """
     xml = TIPS.format(rest=SECOND if links == 2 else '<site name="tip" pos="0 0 -0.5"/>')
     unknown = [Parameter("mass", 0.3, 1.0, targets=("body:one.mass",))]
     channels = [f"sensor:tip[{'xyz'.index(axis)}]" for axis in seen]
@@ -86,8 +99,11 @@ def test_what_no_channel_depends_on_stays_where_it_is() -> None:
 
 
 def test_intervals_hold_the_truth_where_cosine_and_sine_are_measured() -> None:
-    """16 logs of the Pendulum, truths from the prior: of the 48 intervals of 90 % at least 38 hold the truth (right ones fail with
-    probability 1 %, were they independent), and the inferred noise is that of the logs."""
+    """16 logs of the Pendulum, truths from the prior.
+
+    Of the 48 intervals of 90 % at least 38 hold the truth (right ones fail with probability 1 %, were they
+    independent), and the inferred noise is that of the logs.
+    """
     rng, covered = np.random.default_rng(5), 0
     for seed in range(16):
         theta = rng.uniform(0, 1, 3)

@@ -27,7 +27,7 @@ FLAT = QuadraticPrior(np.full(2, 0.5), np.zeros((2, 2)))
 def random_chain(
     rng: np.random.Generator, some_outliers: bool = False, bent: bool = False
 ) -> tuple[ChainLinearisation, ChainNoise]:
-    """Two logs of 4 and 3 states with 3 coordinates, 2 channels, 2 parameters; two of the jumps may be outliers, and each have an error."""
+    """Two logs of 4 and 3 states with 3 coordinates, 2 channels, 2 parameters; with outliers and errors."""
     k, d, c, n = 7, 3, 2, 2
     linked = np.array([True, True, True, False, True, True])
     first = np.array([True, False, False, False, True, False, False])
@@ -56,7 +56,7 @@ def random_chain(
 
 
 def test_regular_gains_are_the_difference_of_evidence() -> None:
-    """What `tightening` says of each outlying jump against two restricted likelihoods and the price of one more outlier."""
+    """Of each outlier, against two restricted likelihoods and the price of one more outlier."""
     linear, noise = random_chain(np.random.default_rng(8), some_outliers=True)
     theta, prior = np.full(2, 0.4), FLAT
     hold = border(prior, theta, np.zeros(2))
@@ -135,7 +135,7 @@ def test_the_chain_is_the_dense_least_squares(some_outliers: bool, bent: bool) -
 @pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize(("some_outliers", "bent"), [(False, False), (True, False), (False, True), (True, True)])
 def test_fishers_gradient_of_the_noise(some_outliers: bool, bent: bool, held: bool) -> None:
-    """Against central differences of the restricted likelihood, which held back lacks just what the best step would gain."""
+    """Against central differences of the restricted likelihood, held back without what the best step would gain."""
     linear, noise = random_chain(np.random.default_rng(3), some_outliers, bent)
     hold = border(FLAT, np.full(2, 0.4), np.zeros(2))
     value, by_sd, by_process = restricted(linear, noise, hold, held)

@@ -26,9 +26,9 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.state_space.growing_horizon import grown
 from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise, likeliest_share
-from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 from sipe_bayes.inference.laplace.state_space.smoother import border, smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
+    ChainSearch,
     ChainState,
     Phase,
     Position,
@@ -37,9 +37,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
     screened,
     unknown_noise,
 )
-from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import linearise, linearise_widely
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
@@ -71,27 +69,13 @@ class KnownStartState(ChainState[KnownStartPosition]):
     here: KnownStartPosition
 
 
-@dataclass(frozen=True)
-class KnownStartSearch:
-    """The ``Strategy`` for a ``StateSpace`` whose first states are known.
-
-    Args:
-        problem: prior, starting points, options.
-        chain: the logs.
-    """
-
-    problem: SearchProblem
-    chain: Chain
+class KnownStartSearch(ChainSearch[KnownStartState]):
+    """The ``Strategy`` for a ``StateSpace`` whose first states are known."""
 
     @property
     def step_rollouts(self) -> int:
         """Rollouts that a step takes."""
         return (2 * (self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
-
-    @property
-    def tuning(self) -> ChainTuning:
-        """Numbers of the search."""
-        return self.problem.options.tuning.state_space
 
     def start(self) -> KnownStartState:
         """The first state: at the first starting point."""
@@ -103,15 +87,13 @@ class KnownStartSearch:
             points = screened(self.problem, chain)
         return KnownStartState(points, 0, self._begin(points[0]), chain.uncounted)
 
-    def step(self, state: KnownStartState) -> KnownStartState:
-        """One linearisation and what follows from it; what it does is the phase's."""
-        phases: dict[Phase, Callable[[KnownStartState], KnownStartState]] = {
+    def phases(self) -> dict[Phase, Callable[[KnownStartState], KnownStartState]]:
+        """A function for each phase."""
+        return {
             Phase.FOLLOW: self._follow,
             Phase.SMOOTH: self._smooth,
             Phase.NOISE: self._noise,
         }
-        self.chain.uncounted = state.uncounted
-        return replace(phases[state.here.phase](state), uncounted=self.chain.uncounted)
 
     def _begin(self, theta: FloatArray) -> KnownStartPosition:
         """At a starting point (N,)."""

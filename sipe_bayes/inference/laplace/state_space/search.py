@@ -25,10 +25,10 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.inference.laplace.state_space.kalman_filter import filtered
 from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise, likeliest_share, regress
-from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import needed, outstanding
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
+    ChainSearch,
     ChainState,
     Phase,
     Position,
@@ -37,9 +37,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
     screened,
     unknown_noise,
 )
-from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import linearise
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise
 
@@ -78,27 +76,13 @@ class _Filtered:
     energy: float
 
 
-@dataclass(frozen=True)
-class StateSpaceSearch:
-    """The ``Strategy`` for a ``StateSpace``.
-
-    Args:
-        problem: prior, starting points, options.
-        chain: the logs.
-    """
-
-    problem: SearchProblem
-    chain: Chain
+class StateSpaceSearch(ChainSearch[StateSpaceState]):
+    """The ``Strategy`` for a ``StateSpace``."""
 
     @property
     def step_rollouts(self) -> int:
         """Rollouts that a step takes."""
         return ((self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
-
-    @property
-    def tuning(self) -> ChainTuning:
-        """Numbers of the search."""
-        return self.problem.options.tuning.state_space
 
     def start(self) -> StateSpaceState:
         """The first state: at the first starting point."""
@@ -108,16 +92,14 @@ class StateSpaceSearch:
         none = np.empty((0, chain.num_theta))
         return StateSpaceState(points, 0, self._begin(points[0]), chain.uncounted, regressed=none)
 
-    def step(self, state: StateSpaceState) -> StateSpaceState:
-        """One linearisation and what follows from it; what it does is the phase's."""
-        phases: dict[Phase, Callable[[StateSpaceState], StateSpaceState]] = {
+    def phases(self) -> dict[Phase, Callable[[StateSpaceState], StateSpaceState]]:
+        """A function for each phase."""
+        return {
             Phase.REGRESS: self._regress,
             Phase.FOLLOW: self._follow,
             Phase.SMOOTH: self._smooth,
             Phase.NOISE: self._noise,
         }
-        self.chain.uncounted = state.uncounted
-        return replace(phases[state.here.phase](state), uncounted=self.chain.uncounted)
 
     def _begin(self, theta: FloatArray) -> SmoothingPosition:
         """At a starting point (N,)."""
@@ -230,10 +212,10 @@ class StateSpaceSearch:
         prior = self.problem.quadratic_prior
         end = _Filtered(ChainPoint(theta, begin), self.tuning.damping.first, np.inf)
         for _ in range(tuning.filter_steps):
-            there = linearise(chain, end.point.theta, end.point.states)
-            if there is None:
+            fresh = linearise(chain, end.point.theta, end.point.states)
+            if fresh is None:
                 return None
-            point, fit = smooth(chain, there, noise, prior, end.point, end.damping, tuning.tolerance, self.tuning)
+            point, fit = smooth(chain, fresh, noise, prior, end.point, end.damping, tuning.tolerance, self.tuning)
             end = _Filtered(point, fit.damping, fit.energy)
             if fit.point is None:
                 break
@@ -287,10 +269,10 @@ class StateSpaceSearch:
         regular = solvable(linear, replace(noise, outliers=np.zeros_like(here.refused)))
         try:
             end = self._refiltered(linear, regular, here.theta, here.states)
-            there = None if end is None else linearise(self.chain, end.point.theta, end.point.states)
+            fresh = None if end is None else linearise(self.chain, end.point.theta, end.point.states)
         except BudgetExhausted:
             return None
-        if end is None or there is None:
+        if end is None or fresh is None:
             return None
         position = replace(here, theta=end.point.theta, states=end.point.states)
-        return end, evidence(self.problem, position, there, solvable(there, regular), False)
+        return end, evidence(self.problem, position, fresh, solvable(fresh, regular), False)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum, auto
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ import torch
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.state_space.noise import jump_scale, process_penalty
+from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import rarity
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, border, penalty
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
@@ -177,6 +179,44 @@ class ChainState(Generic[P]):
                 "log's channels and units, or shorten the model's timestep"
             )
         return self.next_point(begin)
+
+
+S = TypeVar("S", bound="ChainState[Any]")
+
+
+@dataclass(frozen=True)
+class ChainSearch(Generic[S]):
+    """What both searches over a chain of states are.
+
+    Args:
+        problem: prior, starting points, options.
+        chain: the logs.
+    """
+
+    problem: SearchProblem
+    chain: Chain
+
+    @property
+    def tuning(self) -> ChainTuning:
+        """Numbers of the search."""
+        return self.problem.options.tuning.state_space
+
+    @abstractmethod
+    def phases(self) -> dict[Phase, Callable[[S], S]]:
+        """What a step does in each phase."""
+
+    def step(self, state: S) -> S:
+        """One linearisation and what follows from it; what it does is the phase's.
+
+        Args:
+            state: where the search stands.
+
+        Raises:
+            BudgetExhausted: the state that went in is kept.
+        """
+        self.chain.uncounted = state.uncounted
+        after = self.phases()[state.here.phase](state)
+        return replace(after, uncounted=self.chain.uncounted)
 
 
 def unknown_noise(chain: Chain) -> ChainNoise:

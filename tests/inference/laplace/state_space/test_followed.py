@@ -40,8 +40,10 @@ def test_a_known_start_costs_two_fifths_of_the_budget_at_most() -> None:
 
 
 def test_a_budget_that_ends_early_leaves_a_wide_posterior() -> None:
-    """Of six logs with each of three budgets, some before the first step: the truth within four sds (right ones all do but with
-    probability 0.1 %)."""
+    """Of six logs with each of three budgets, some before the first step.
+
+    The truth within four sds (right ones all do but with probability 0.1 %).
+    """
     for seed in range(6):
         for budget in (20, 50, 100):
             estimator = Laplace(hung(), likelihood=StateSpace(starts="recorded"), budget=budget, seed=seed)

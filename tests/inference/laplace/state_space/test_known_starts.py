@@ -21,8 +21,10 @@ KNOWN = StateSpace(starts="recorded")
 
 
 def bouncing(num_threads: int = 1) -> Simulator:
-    """A ball of unknown mass on a spring of unknown stiffness above a stiff floor, which it hits again and again; its height measured,
-    and a second joint that nothing moves or measures, whose damping is unknown, too."""
+    """A ball of unknown mass on a spring of unknown stiffness above a stiff floor, which it hits again and again.
+
+    Its height measured, and a second joint that nothing moves or measures, whose damping is unknown, too.
+    """
     xml = (
         '<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="1 1 .1" solref="-8000 -2"/>'
         '<body name="ball" pos="0 0 .25"><joint name="z" type="slide" axis="0 0 1" stiffness="20" damping="0.2"/>'
@@ -48,8 +50,11 @@ def bouncing_log(theta: np.ndarray, seed: int, steps: int = 100) -> Trajectory:
 
 
 def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
-    """Of 20 intervals of 90 % for what bounces at least 14 hold the truth (right ones fail with probability 0.2 %, were they
-    independent), and their squared z-scores average 3 at most (0.0007 %; short differences have 4); what nothing moves keeps its prior."""
+    """Of 20 intervals of 90 % for what bounces at least 14 hold the truth; what nothing moves keeps its prior.
+
+    Right ones fail with probability 0.2 %, were they independent. Their squared z-scores average 3 at most (0.0007 %;
+    short differences have 4).
+    """
     rng, covered, errors, scores = np.random.default_rng(4), 0, [], []
     for seed in range(10):
         theta = rng.uniform(0.1, 0.9, 3)
@@ -76,8 +81,10 @@ def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray |
 
 
 def test_many_logs_and_late_samples_grow_as_well() -> None:
-    """A dozen logs, one of them alone, and one whose first samples are missing: each comes near the truth (the prior's mean is .37
-    and .12 off)."""
+    """A dozen logs, one of them alone, and one whose first samples are missing.
+
+    Each comes near the truth (the prior's mean is .37 and .12 off).
+    """
     theta = np.array([0.87, 0.38, 0.5])
     logs = [bouncing_log(theta, seed, 60) for seed in range(12)]
     late = logs[0].observations.copy()
@@ -108,7 +115,10 @@ def test_a_model_that_diverges_as_given_is_said_to() -> None:
 
 
 def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
-    """With every budget around the one at which the first estimate of the noise is done, nothing likelier is known than what is kept."""
+    """With every budget around the one at which the first estimate of the noise is done.
+
+    Nothing likelier is known than what is kept.
+    """
     log, start, seen = bouncing_log(np.array([0.4, 0.6, 0.5]), 5, 60), np.array([[0.5, 0.5, 0.5]]), []
 
     def noted(self, state, linear):  # type: ignore[no-untyped-def]

@@ -25,7 +25,7 @@ from tests.problems.pendulums import pendulum
 
 
 def test_noise_that_rounding_cannot_bear_is_raised() -> None:
-    """The process noise that ``solvable`` returns is the least of a few that the equations can be solved with, and no other is touched."""
+    """``solvable`` returns the least process noise of a few that the equations can be solved with; no other changes."""
     chain = bind(StateSpace(), hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))
     linear = linearise(chain, np.array([0.4]), chain.reference)
     assert linear is not None

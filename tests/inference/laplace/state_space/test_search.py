@@ -66,7 +66,8 @@ def test_laplace_and_mcmc_find_the_kalman_filters_posterior() -> None:
 def test_a_jump_that_stands_out_is_an_outlier() -> None:
     """A kick in each of two logs: one step of each is an outlier, at most 40 ms from it, none of logs without a kick.
 
-    The interval is hardly wider than theirs (with one process noise for all steps it is ten times as wide). mcmc agrees.
+    The interval is hardly wider than theirs (with one process noise for all steps it is ten times as wide); mcmc
+    agrees.
     """
     fits = {}
     for kick in (0.0, 1.0):
@@ -96,7 +97,7 @@ def test_a_jump_that_stands_out_is_an_outlier() -> None:
 
 
 def test_no_budget_loses_what_was_found() -> None:
-    """Kicked logs: with more rollouts the evidence never falls, also where they end while outliers are proposed or given up."""
+    """With more rollouts the evidence never falls, also where they end while outliers are proposed or given up."""
     found = []
     for budget in range(75, 205, 10):
         estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0, budget=budget)
@@ -111,9 +112,11 @@ def test_no_budget_loses_what_was_found() -> None:
 
 
 def test_the_pendulums_intervals_hold_the_truth() -> None:
-    """16 logs of 1.2 s, mass and damping from the prior, only the angle measured: of the 32 intervals of 90 % at least 24
-    hold the truth (right ones fail with probability 0.3 %, were they independent), and the squared z-scores average
-    0.4 to 1.9 (0.3 %)."""
+    """16 logs of 1.2 s, mass and damping from the prior, only the angle measured.
+
+    Of the 32 intervals of 90 % at least 24 hold the truth (right ones fail with probability 0.3 %, were they
+    independent), and the squared z-scores average 0.4 to 1.9 (0.3 %).
+    """
     simulator, rng = pendulum(), np.random.default_rng(5)
     covered, scores = 0, []
     for seed in range(16):
@@ -166,9 +169,12 @@ def cheetah_log(simulator: Simulator, steps: int) -> tuple[np.ndarray, Trajector
 
 BALL = """
 <mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="rod"><joint name="hip" type="ball"
-damping="0.02"/><geom type="capsule" fromto="0 0 0 0.2 0 -0.5" size="0.03" mass="0.6"/><site name="tip" pos="0.2 0 -0.5"/>
-</body><body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="1"/><geom size="0.1" mass="1" pos="0 3 0"/>
-</body></worldbody><actuator><motor name="turn" joint="hip" gear="1 0.5 0.2"/><motor name="push" joint="slide"/></actuator>
+damping="0.02"/><geom type="capsule" fromto="0 0 0 0.2 0 -0.5" size="0.03" mass="0.6"/>
+<site name="tip" pos="0.2 0 -0.5"/>
+</body><body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="1"/>
+<geom size="0.1" mass="1" pos="0 3 0"/>
+</body></worldbody><actuator><motor name="turn" joint="hip" gear="1 0.5 0.2"/>
+<motor name="push" joint="slide"/></actuator>
 <sensor><framepos name="place" objtype="site" objname="tip"/></sensor></mujoco>
 """
 

@@ -23,8 +23,11 @@ from tests.problems.springs import (
 
 @pytest.mark.parametrize("lengths", [0.0, 0.01])
 def test_the_target_with_fresh_jacobians_is_the_kalman_filter(lengths: float) -> None:
-    """Refreshed: differences between thetas to 1e-6 nats. As mcmc has it: to 0.2 nats within two sds of the optimum. The model is
-    linear, so longer differences change nothing."""
+    """Refreshed: differences between thetas to 1e-6 nats.
+
+    As mcmc has it: to 0.2 nats within two sds of the optimum. The model is linear, so longer differences change
+    nothing.
+    """
     chain, logs, firsts = spring_chain()
     noise, theta = MADE_WITH, np.array([0.35])
     linear = linearise(chain, theta, chain.reference)
