@@ -185,6 +185,7 @@ class MCMC(Estimator[MCMCState]):
             ) from None
         windows.rollouts += search.rollouts
         assert search.snapshot is not None
+        assert isinstance(normals, GaussianMixture)
         # what was noticed on the way holds; what its posterior says of itself does not hold of the chains
         self.findings.extend(search.snapshot.findings)
         optima = search.snapshot.state.search.optima

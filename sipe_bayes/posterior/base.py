@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from pyro.distributions import TorchDistribution
 from torch import Generator, Tensor
 from torch.distributions import constraints
 
@@ -23,6 +22,11 @@ from sipe_bayes.posterior.storage import Header, write_pair
 
 if TYPE_CHECKING:
     import arviz
+
+    # Pyro has no types: as an unknown base it would make every unknown attribute of a posterior one of type Any
+    from torch.distributions import Distribution as TorchDistribution
+else:
+    from pyro.distributions import TorchDistribution
 
 Numbers = ArrayLike | Tensor
 """A number or an array of numbers of any kind."""

@@ -31,7 +31,7 @@ RESULTS = [
         "estimator.warnings",
         "estimator.rollouts",
     ),
-    *("sipe.load_posterior('posterior')", "sipe.calibrate(sipe.prepare(Path('config.toml'), 1))"),
+    *("sipe.load_posterior('posterior')", "sipe.calibrate(sipe.prepare(Path('config.toml'), 1)).posterior"),
     *("sipe.gym.make('Pendulum')", "trajectories[:2]"),
 ]
 CHECKERS = {
@@ -69,7 +69,10 @@ def test_no_public_name_is_any(checker: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("checker", CHECKERS)
-@pytest.mark.parametrize("mistake", ["sipe.Simulater", "sipe.Parameter('mass', low='a')", "sipe.make_task(3)"])
+@pytest.mark.parametrize(
+    "mistake",
+    ["sipe.Simulater", "sipe.Parameter('mass', low='a')", "sipe.make_task(3)", "sipe.load_posterior('p').means"],
+)
 def test_mistakes_are_errors(checker: str, mistake: str, tmp_path: Path) -> None:
     exit_code, lines = check(checker, f"print({mistake})\n", tmp_path)
     assert exit_code == 1
