@@ -16,6 +16,13 @@ def seed_integer(entropy: Sequence[int]) -> int:
     return int(np.random.SeedSequence(list(entropy)).generate_state(1)[0])
 
 
+def torch_generator_from(random: np.random.Generator) -> Generator:
+    """A generator of torch's own, seeded with the next number of one of NumPy's."""
+    import torch
+
+    return torch.Generator().manual_seed(int(random.integers(2**62)))
+
+
 def torch_generator(entropy: Sequence[int]) -> Generator:
     """A generator of torch's own, seeded with ``seed_integer``."""
     import torch

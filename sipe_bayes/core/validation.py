@@ -43,13 +43,6 @@ def positive(name: str, value: object) -> float:
     return float(value)
 
 
-def share(name: str, value: object) -> float:
-    """``value`` as a float above zero and below one."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) < 1:
-        raise ValueError(f"{name}: expected a share above 0 and below 1, got {_shown(value)}")
-    return float(value)
-
-
 def flag(name: str, value: object) -> bool:
     """``value`` if it is True or False."""
     if not isinstance(value, bool):

@@ -71,6 +71,5 @@ def get_estimator(
 
 def arguments(name: str) -> dict[str, inspect.Parameter]:
     """What the estimator called ``name`` takes besides the simulator, in alphabetical order."""
-    classes = estimator_class(name).__mro__[:-1]
-    every = {key: p for one in reversed(classes) for key, p in inspect.signature(one).parameters.items()}
-    return {key: every[key] for key in sorted(every.keys() - {"self", "simulator", "settings", "options"})}
+    taken = inspect.signature(estimator_class(name)).parameters
+    return {key: taken[key] for key in sorted(taken.keys() - {"simulator", "options"})}

@@ -176,7 +176,10 @@ class LoopRun:
             if not recorded:
                 raise ValueError("every trajectory of the reference diverged at once")
             given = Trajectories.stack(recorded)
-            self._searched(given, allowed) if isinstance(self.estimator, Search) else self._fitted(given, allowed)
+            if isinstance(self.estimator, Search):
+                self._searched(self.estimator, given, allowed)
+            else:
+                self._fitted(given, allowed)
         except ValueError as error:
             if not self.history:
                 raise ValueError(
@@ -185,17 +188,16 @@ class LoopRun:
             return str(error)
         return None
 
-    def _searched(self, given: Trajectories, allowed: int) -> None:
+    def _searched(self, estimator: Search, given: Trajectories, allowed: int) -> None:
         """Steps of a search, until it has spent ``allowed`` more rollouts or is over."""
-        estimator, until = self.estimator, self.spent + allowed
+        until = self.spent + allowed
         estimator.findings = Findings()  # those of earlier estimates are over
         while self.spent < until and not self.idle:
             estimator.update_parameter_estimate(given)
             self.idle = estimator.rollouts == self.spent
             self.spent = estimator.rollouts
         self.posterior = estimator.get_parameter_estimate(given)
-        proposal = getattr(estimator, "proposal", None)
-        self.draw.source = self.posterior if proposal is None else proposal
+        self.draw.source = self.posterior if estimator.proposal is None else estimator.proposal
 
     def _fitted(self, given: Trajectories, allowed: int) -> None:
         """A new fit with a budget of ``allowed`` rollouts; what it leaves is for the next one."""

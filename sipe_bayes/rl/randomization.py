@@ -27,6 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.core.validation import whole
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.simulation.simulator import Simulator
@@ -177,7 +178,7 @@ class Draws:
 
 def sample(source: Posterior, rng: np.random.Generator, count: int, space: ParameterSpace) -> FloatArray:
     """Draws (count, N) of a posterior as theta of ``space``, by name and value where the two spaces' order or bounds differ."""
-    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    generator = torch_generator_from(rng)
     theta = np.asarray(source.sample((count,), generator=generator).numpy())
     if _scales(source.space) == _scales(space):
         return theta

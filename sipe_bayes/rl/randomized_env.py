@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.rl.randomization import Draws, Randomization, randomization
 from sipe_bayes.simulation.simulator import Simulator
@@ -99,9 +100,8 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
     def _drawn(self) -> FloatArray:
         if self._draws is not None:
             return np.asarray(self._draws(self._generator, 1)[0])
-        import torch
 
-        generator = torch.Generator().manual_seed(int(self._generator.integers(2**62)))
+        generator = torch_generator_from(self._generator)
         return np.asarray(self.randomization.posterior.sample(generator=generator).numpy())
 
     def _seen(self, observation: FloatArray) -> FloatArray:

@@ -34,12 +34,12 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-import torch
 from scipy.optimize import brentq
 from scipy.stats import rankdata
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import option
+from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.search.base import PoolState, RewardSearch
 from sipe_bayes.inference.search.learned_reward import RewardOptions
@@ -87,8 +87,7 @@ class ADR(RewardSearch[ADRState]):
     def start(self, trajectories: Trajectories) -> ADRState:
         """Particles drawn from the prior."""
         pool, training = self.empty_pool(trajectories), self.untrained(trajectories)
-        generator = torch.Generator().manual_seed(int(self.random(0).integers(2**62)))
-        first = self.prior.sample((self.options.particles,), generator=generator).numpy()
+        first = self.prior.sample((self.options.particles,), torch_generator_from(self.random(0))).numpy()
         return ADRState(pool=pool, training=training, draws=1, paths=first[None])
 
     def describe(self, state: ADRState) -> str:

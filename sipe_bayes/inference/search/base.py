@@ -83,12 +83,14 @@ P = TypeVar("P", bound=PoolState)
 class Search(Estimator[P]):
     """Base of the methods that simulate where they expect good rewards.
 
-    A reward is minus the cost of ``discrepancy.StateDifference``.
+    A reward is minus the cost of ``discrepancy.StateDifference``. ``proposal`` is what new theta are drawn from, where
+    that is not the posterior.
     """
 
     uses_prior: ClassVar[bool] = False
     uncertain: ClassVar[bool] = False
     begins_with_prior: ClassVar[bool] = True
+    proposal: Posterior | None = None
 
     def fit(self, trajectories: Recorded, *, retrain: bool = False) -> Posterior:
         """As ``Estimator.fit``; a finding if a prior was given, of which a search makes little use."""

@@ -25,10 +25,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.search.base import PoolState, Search
 from sipe_bayes.inference.search.gaussians import LEAST_VARIANCE, draw_in_cube
@@ -107,8 +107,7 @@ class CEM(Search[CEMState]):
         random = self.random(state.draws)
         if state.generations:
             return draw_in_cube(state.mean, state.covariance, count, random)
-        generator = torch.Generator().manual_seed(int(random.integers(2**62)))
-        theta: FloatArray = self.prior.sample((count,), generator=generator).numpy()
+        theta: FloatArray = self.prior.sample((count,), torch_generator_from(random)).numpy()
         return theta
 
     def _fitted(self, state: CEMState) -> CEMState:

@@ -102,7 +102,6 @@ class SimOpt(RewardSearch[SimOptState]):
     options_type = SimOptOptions
     state_type = SimOptState
     options: SimOptOptions
-    proposal: GaussianMixture | None = None
 
     def start(self, trajectories: Trajectories) -> SimOptState:
         """The first Gaussian."""
