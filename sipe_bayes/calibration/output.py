@@ -120,10 +120,9 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
         calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
     values = problem.environment.space.values(calibration.posterior.mode.numpy())
     try:
-        remarks = write_identified(problem.environment, values, folder / "identified.xml")
+        noticed = write_identified(problem.environment, values, folder / "identified.xml")
     except ExportError as error:
-        remarks = [str(error)]
-    noticed = [finding(Code.EXPORT, text=remark) for remark in remarks]
+        noticed = [finding(Code.NOT_EXPORTED, reason=error)]
     calibration = replace(calibration, findings=(*calibration.findings, *noticed))
     draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=_generator())
     write_randomization(problem.environment, draws, folder / RANDOMIZATION)

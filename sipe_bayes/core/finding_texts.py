@@ -97,7 +97,8 @@ class Code(StrEnum):
     # what went in and what came out
     PRIOR_OF_MIXTURE = auto()
     PRIOR_COUNTED_TWICE = auto()
-    EXPORT = auto()
+    NOT_EXPORTED = auto()
+    BIAS_NOT_EXPORTED = auto()
 
     # amortised: methods that learn from simulations of the prior
     INVALID_SIMULATIONS = auto()
@@ -340,7 +341,10 @@ TEXTS: dict[Code, Text] = {
         _CAUTION,
         "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow",
     ),
-    Code.EXPORT: Text(_CAUTION, "{text}"),
+    Code.NOT_EXPORTED: Text(_CAUTION, "{reason}"),
+    Code.BIAS_NOT_EXPORTED: Text(
+        _CAUTION, "identified.xml has no place for the sensor bias {parameters!r}; subtract it from the measurement"
+    ),
     # amortised: methods that learn from simulations of the prior
     Code.INVALID_SIMULATIONS: Text(
         _CAUTION, "{invalid} of {made} simulations {failure}, {place}; the others were used"

@@ -13,6 +13,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
 
@@ -24,7 +25,7 @@ class ExportError(RuntimeError):
     """The written model is not the calibrated one."""
 
 
-def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Path) -> list[str]:
+def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Path) -> list[Finding]:
     """Write the MJCF at some values of its parameters. Those that differ between logs take their mean.
 
     Args:
@@ -33,7 +34,7 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
         path: the file.
 
     Returns:
-        Remarks in words: sensor biases have no place in a model and are named.
+        Sensor biases, which have no place in a model.
 
     Raises:
         ExportError: where the written model would not be the calibrated one.
@@ -61,9 +62,7 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
                 f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written"
             )
     biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
-    return [
-        f"identified.xml has no place for the sensor bias {name!r}; subtract it from the measurement" for name in biased
-    ]
+    return [finding(Code.BIAS_NOT_EXPORTED, parameters=[name]) for name in biased]
 
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:

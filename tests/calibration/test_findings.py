@@ -60,7 +60,7 @@ def calibrations() -> dict[str, Calibration]:
     ridge = made(Code.RIDGE_TO_RESOLVE, *names[-2:])
     every = [made(code, names[0]) for code in Code]
     cases = {str(item.code): dataclasses.replace(plain, findings=(item, ridge)) for item in every}
-    cases["blocking"] = dataclasses.replace(plain, findings=(made(Code.EXPORT, severity=Severity.BLOCKING),))
+    cases["blocking"] = dataclasses.replace(plain, findings=(made(Code.NOT_EXPORTED, severity=Severity.BLOCKING),))
     cases["all"] = dataclasses.replace(plain, findings=(*every, ridge))
     unmixed = (made(Code.NOT_MIXED), made(Code.BUDGET_SPENT))
     cases["chains"] = dataclasses.replace(with_chains(plain, 1.4), findings=unmixed)

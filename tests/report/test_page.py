@@ -115,7 +115,7 @@ def test_page_escapes_every_word_from_outside() -> None:
     found.noise[EVIL] = ChannelNoise(1.0, 0.5, EVIL)
     found.logs[0] = dataclasses.replace(found.logs[0], name=EVIL, findings=(noticed(Code.LOG_GAP, text=EVIL),))
     found.holdout[0] = dataclasses.replace(found.holdout[0], log=EVIL, channel=EVIL)
-    findings = (*found.findings, noticed(Code.EXPORT, text=EVIL))
+    findings = (*found.findings, noticed(Code.NOT_EXPORTED, text=EVIL))
     found = dataclasses.replace(found, name=EVIL, findings=findings, run={"config": {"name": EVIL}})
     image = report.Picture("marginals", "marginals.png", b"", f'"{EVIL}')
     page = Page(report.render(found, [image]))
