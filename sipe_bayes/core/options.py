@@ -12,6 +12,7 @@ come from the fields::
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import types
 import typing
@@ -115,6 +116,12 @@ class Options:
                 )
         make: Callable[..., Self] = cls
         return make(**given)
+
+    @classmethod
+    def parameters(cls) -> list[inspect.Parameter]:
+        """The fields as keyword arguments of a constructor."""
+        kind = inspect.Parameter.KEYWORD_ONLY
+        return [inspect.Parameter(f.name, kind, default=f.default, annotation=f.type) for f in dataclasses.fields(cls)]
 
     def plain(self) -> dict[str, object]:
         """Names and values as JSON has them, for fingerprints and records."""

@@ -12,7 +12,8 @@ import inspect
 import json
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
@@ -20,14 +21,14 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.checkpoint import SearchState, load_state, save_state
-from sipe_bayes.core.findings import Code, Finding, Findings, finding
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.inference.recorded import Progress, Recorded, digest
-from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.binding import bind, default_likelihood
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
@@ -75,9 +76,7 @@ class Estimator(ABC, Generic[S]):
     method draws from the prior and keeps the best::
 
         from dataclasses import dataclass, replace
-
         import numpy as np
-
         from sipe_bayes.core.arrays import FloatArray
         from sipe_bayes.core.findings import Code
         from sipe_bayes.core.seeding import torch_generator
@@ -157,7 +156,7 @@ class Estimator(ABC, Generic[S]):
         if difference:
             raise ValueError(f"prior: {difference} in the simulator; use the same bounds and scale")
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
-        if likelihood is not None and not isinstance(likelihood, Segments | StateSpace):
+        if not isinstance(likelihood, Segments | StateSpace | None):
             raise ValueError(
                 f"likelihood: expected sipe.Segments(...), got {likelihood!r}; or give sipe.StateSpace(...)"
             )
@@ -166,10 +165,9 @@ class Estimator(ABC, Generic[S]):
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: expected a function (what, rollouts, budget), got {progress!r}")
         self.seed = whole("seed", seed, 0)
-        self.likelihood: Any = likelihood or _default_likelihood(simulator)  # StateSpace only where it ``searches``
+        self.likelihood: Any = likelihood or default_likelihood(simulator)  # StateSpace only where it ``searches``
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
-        self.rollouts = 0
-        self.findings = Findings()
+        self.rollouts, self.findings = 0, Findings()
         self.diagnostics: dict[str, Any] = {}
         self._last: Snapshot[S] | None = None
         self._run = ""  # fingerprint of the run that it belongs to
@@ -190,7 +188,7 @@ class Estimator(ABC, Generic[S]):
     def check_options(self) -> None:
         """Hold the options against simulator and likelihood, once all are set; raises ValueError."""
 
-    def stored(self, name: str, given: Any) -> Path | None:
+    def stored(self, name: str, given: object) -> Path | None:
         """The path that an argument gives; raises ValueError for a simulator that others there cannot be told from."""
         if given is not None and isinstance(self.simulator, CallableSimulator) and not self.simulator.name:
             raise ValueError(
@@ -199,17 +197,12 @@ class Estimator(ABC, Generic[S]):
             )
         return path(name, given)
 
-    def __init_subclass__(cls, **settings: Any) -> None:
+    def __init_subclass__(cls) -> None:
         """Show the fields of a method's own options in the signature of its constructor."""
-        super().__init_subclass__(**settings)
-        if "options_type" not in vars(cls) or "__init__" in vars(cls):
-            return
-        common = [p for p in inspect.signature(Estimator.__init__).parameters.values() if p.kind is not p.VAR_KEYWORD]
-        own = [
-            inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type)
-            for f in fields(cls.options_type)
-        ]
-        cls.__signature__ = inspect.Signature([*common[1:], *own])  # type: ignore[attr-defined]
+        super().__init_subclass__()
+        if "options_type" in vars(cls) and "__init__" not in vars(cls):
+            *common, _ = list(inspect.signature(Estimator.__init__).parameters.values())[1:]  # without self and options
+            cls.__signature__ = inspect.Signature([*common, *cls.options_type.parameters()])  # type: ignore[attr-defined]
 
     @abstractmethod
     def start(self, trajectories: Trajectories) -> S:
@@ -248,7 +241,7 @@ class Estimator(ABC, Generic[S]):
             self.go_on_from(last)
         saved = time.monotonic()
         try:
-            last = self._keep(self.start(batch)) if last is None else last
+            last = last or self._keep(self.start(batch))
             while not last.state.done:
                 last = self._keep(self.step(last.state, batch))
                 late = time.monotonic() - saved > self.checkpoint_seconds
@@ -304,13 +297,9 @@ class Estimator(ABC, Generic[S]):
         posterior = self.posterior(state, trajectories)
         middle = posterior.quantile(torch.tensor([0.5], dtype=torch.float64))[0].numpy()
         narrow = posterior.stddev.numpy() <= (1 - THRESHOLDS.not_determined) * self.prior.stddev.numpy()
-        at = [
-            n
-            for n, m, sharp in zip(self.space.names, middle, narrow, strict=True)
-            if sharp and min(m, 1 - m) < THRESHOLDS.at_bound
-        ]
-        if at:
-            self.find(Code.AT_BOUND, parameters=at)
+        near = np.minimum(middle, 1 - middle) < THRESHOLDS.at_bound
+        if (narrow & near).any():
+            self.find(Code.AT_BOUND, parameters=np.array(self.space.names)[narrow & near].tolist())
         return posterior
 
     def _recorded(self, given: Recorded) -> Any:
@@ -352,9 +341,17 @@ class Estimator(ABC, Generic[S]):
         self._last, self.rollouts, self.findings = last, last.rollouts, Findings(last.findings)
         self.diagnostics = json.loads(last.diagnostics)
 
-    def find(self, code: Code, **about: Any) -> None:
-        """Note a finding, once; ``about``: as of ``core.findings.finding``."""
-        self.findings.add(finding(code, **about))
+    def find(
+        self,
+        code: Code,
+        *,
+        parameters: Iterable[str] = (),
+        log: str | None = None,
+        severity: Severity | None = None,
+        **values: object,
+    ) -> None:
+        """Note a finding, once; as of ``core.findings.finding``."""
+        self.findings.add(finding(code, parameters=parameters, log=log, severity=severity, **values))
 
     @property
     def warnings(self) -> list[str]:
@@ -385,7 +382,7 @@ class Estimator(ABC, Generic[S]):
         self._last = Snapshot(state, self.rollouts, tuple(self.findings), json.dumps(self.diagnostics))
         return self._last
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """Whatever changes the result besides the trajectories, as plain data; subclasses add theirs."""
         return {
             "estimator": self.name,
@@ -401,10 +398,3 @@ class Estimator(ABC, Generic[S]):
     def _fingerprint(self, trajectories: Trajectories) -> str:
         """What tells runs apart: all settings, and the trajectories."""
         return hashlib.sha256(f"{self.settings()!r}{digest(trajectories)}".encode()).hexdigest()
-
-
-def _default_likelihood(simulator: Simulator | CallableSimulator) -> Segments:
-    if not isinstance(simulator, CallableSimulator):
-        return Segments()
-    sd = simulator.noise_sd or (0.0,) * len(simulator.environment.channels)  # 0: fn makes its own noise
-    return Segments(None, noise="white", noise_sd=sd, starts="recorded")

@@ -45,9 +45,6 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.posterior.ensemble import mixing_of
 
-_MOVES = (0.6, 0.3, 0.1)  # shares of independent Metropolis-Hastings, differential evolution, and its snooker
-_FEWEST_CHECKED = 4  # walkers that make an sd
-
 
 @dataclass(frozen=True)
 class MCMCTuning(Options):
@@ -60,6 +57,10 @@ class MCMCTuning(Options):
     )
     most_draws: int = option(4000, "draws kept at most", least=1)
     placings: int = option(20, "rounds in which walkers look for a valid place", least=1)
+    moves: tuple[float, ...] = option(
+        (0.6, 0.3, 0.1), "shares of independent Metropolis-Hastings, differential evolution, and its snooker"
+    )
+    fewest_checked: int = option(4, "walkers that make an sd", least=2)
     checked: int = option(16, "walkers on which the linearisation is checked", least=1)
     check_share: float = option(0.1, "share of the budget that this may cost", above=0, below=1)
     search_share: float = option(0.8, "share of the budget that the laplace fit may cost", above=0, below=1)
@@ -270,7 +271,7 @@ class MCMC(Estimator[MCMCState]):
             emcee.moves.DEMove(),
             emcee.moves.DESnookerMove(),
         )
-        shares = list(zip(moves, _MOVES, strict=True))
+        shares = list(zip(moves, self.options.tuning.moves, strict=True))
         sampler = emcee.EnsembleSampler(walkers, dimensions, target, vectorize=True, moves=shares)
         sampler.log_prob_fn = target  # bare: emcee's wrapper prints the walkers when it is interrupted
         begin = emcee.State(state.walkers, log_prob=state.log_prob, random_state=state.random.plain())
@@ -327,8 +328,8 @@ class MCMC(Estimator[MCMCState]):
         mixing, error = self._mixing(state), state.linearisation_error
         self.diagnostics = {"mixing": {**mixing, "linearisation_error": error}, **_noise_of(state.fit)}
         if not (mixing["rhat"] <= THRESHOLDS.mixed and mixing["ess"] >= self.options.effective / 2):
-            words = {"what": "chains", "unit": " draws", "remedy": "raise the budget"}
-            self.find(Code.NOT_MIXED, rhat=mixing["rhat"], ess=mixing["ess"], **words)
+            rhat, ess, remedy = mixing["rhat"], mixing["ess"], "raise the budget"
+            self.find(Code.NOT_MIXED, what="chains", rhat=rhat, ess=ess, unit=" draws", remedy=remedy)
         if error > tuning.nonlinear:
             chained = isinstance(self.windows(trajectories), Chain)
             self.find(Code.NONLINEAR_STATES if chained else Code.NONLINEAR_STARTS, error=error)
@@ -344,7 +345,7 @@ class MCMC(Estimator[MCMCState]):
             return 0.0
         cost = len(windows.trajectories) * target.check_cost
         count = min(tuning.checked, int(tuning.check_share * self.budget) // cost)
-        if count < _FEWEST_CHECKED or windows.rollouts + count * cost > self.budget:
+        if count < tuning.fewest_checked or windows.rollouts + count * cost > self.budget:
             return float("nan")
         points = walkers[np.linspace(0, len(walkers) - 1, count).astype(int)]
         return float(np.std([float(target(p[None])[0]) - target.refreshed(p) for p in points]))

@@ -61,3 +61,11 @@ def _chain(settings: StateSpace, simulator: Simulator | CallableSimulator, traje
     chain = Chain(settings, simulator, trajectories)
     chain.place(*indirect_positions(chain, chain.reference, chain.measured_directly))
     return chain
+
+
+def default_likelihood(simulator: Simulator | CallableSimulator) -> Segments:
+    """Windows of half a second; of a function white noise of the sd that it states, zero where it makes its own."""
+    if not isinstance(simulator, CallableSimulator):
+        return Segments()
+    sd = simulator.noise_sd or (0.0,) * len(simulator.environment.channels)
+    return Segments(None, noise="white", noise_sd=sd, starts="recorded")

@@ -54,8 +54,8 @@ mean lies beyond it, and the truncated density is right up to the bound.
       next starting point, or done
 
 With ``StateSpace`` every sample's state is unknown and ``state_space.search`` takes the place of ``window_search``, or
-``state_space.known_starts`` where the first states are known. All are a ``strategy.Strategy``: made of a ``SearchProblem``
-and the bound logs, with a frozen state of their own.
+``state_space.known_starts`` where the first states are known. All are a ``strategy.Strategy``: made of a
+``SearchProblem`` and the bound logs, with a frozen state of their own.
 
 **To change how steps are damped**, change ``levenberg_marquardt.DampingRule.after``: every search asks it and nothing
 else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbers of the search are the fields of

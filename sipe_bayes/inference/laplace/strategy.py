@@ -25,8 +25,6 @@ from sipe_bayes.likelihood.block_tridiagonal import inverse
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
-_DROP = 10.0  # nats below the best optimum: weight e^-10
-
 
 @dataclass(frozen=True)
 class Optimum:
@@ -132,15 +130,20 @@ class Strategy(Protocol[S]):
         """
 
 
-def distinct(optima: Sequence[Optimum]) -> list[int]:
-    """Places of the optima worth keeping, best first: within ``_DROP`` nats of the best, and not the same twice."""
+def distinct(optima: Sequence[Optimum], drop: float = 10.0) -> list[int]:
+    """Places of the optima worth keeping, best first, and not the same twice.
+
+    Args:
+        optima: of a search.
+        drop: nats below the best one at most; below it an optimum's weight is nothing.
+    """
     if not optima:
         return []
     evidence = np.array([one.evidence for one in optima])
     order = np.argsort(-evidence, kind="stable")
     kept: list[int] = []
     for m in map(int, order):
-        if evidence[m] < evidence[order[0]] - _DROP:
+        if evidence[m] < evidence[order[0]] - drop:
             continue
         if not any(optima[k].holds(optima[m]) for k in kept):
             kept.append(m)

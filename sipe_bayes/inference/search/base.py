@@ -188,8 +188,8 @@ class Search(Estimator[P]):
             )
         self.diagnostics.update(simulated=state.simulated, diverged=state.diverged)
         if state.diverged:
-            counts = {"count": state.diverged, "total": state.simulated}
-            self.find(Code.DIVERGED_COUNT_AS_WORST, failure=self.simulator.failure, **counts)
+            count, total, failure = state.diverged, state.simulated, self.simulator.failure
+            self.find(Code.DIVERGED_COUNT_AS_WORST, count=count, total=total, failure=failure)
 
     def check_width(self, sd: float) -> None:
         """A finding where the search distribution's largest sd says that the search was cut short."""

@@ -321,8 +321,8 @@ class BayesOpt(Estimator[BayesOptState]):
         if trajectories.states is None and not isinstance(self.simulator, CallableSimulator):
             self.find(Code.STARTS_NOT_RECORDED)
         if mixing["rhat"] > THRESHOLDS.mixed or mixing["ess"] < THRESHOLDS.mixed_draws:
-            values = {"rhat": mixing["rhat"], "ess": mixing["ess"], "unit": ""}
-            self.find(Code.NOT_MIXED, what="draws", remedy="evaluate more", **values)
+            rhat, ess = mixing["rhat"], mixing["ess"]
+            self.find(Code.NOT_MIXED, what="draws", rhat=rhat, ess=ess, unit="", remedy="evaluate more")
         margin = THRESHOLDS.best_at_bound
         at = [name for name, x in zip(self.space.names, best, strict=True) if min(x, 1 - x) < margin]
         if at:
