@@ -202,7 +202,7 @@ class Estimator(ABC, Generic[S]):
         super().__init_subclass__()
         if "options_type" in vars(cls) and "__init__" not in vars(cls):
             *common, _ = list(inspect.signature(Estimator.__init__).parameters.values())[1:]  # without self and options
-            cls.__signature__ = inspect.Signature([*common, *cls.options_type.parameters()])  # type: ignore[attr-defined]
+            cls.__signature__ = inspect.Signature(common + cls.options_type.parameters())  # type: ignore[attr-defined]
 
     @abstractmethod
     def start(self, trajectories: Trajectories) -> S:
