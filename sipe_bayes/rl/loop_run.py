@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.core.findings import Findings
+from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import whole
 from sipe_bayes.datasets.demonstrations import default_steps
@@ -207,6 +207,7 @@ class LoopRun:
         finally:
             self.estimator.budget = self.budget
             self.spent += self.estimator.rollouts
+        self.estimator.findings.drop(Code.TRAINED_ANEW)  # as at every update, whether interrupted before or not
 
     def _replayed(self, episodes: list[_Begun]) -> list[Trajectory]:
         """What the reference does from the episodes' starting states with their actions, as far as it is valid."""
