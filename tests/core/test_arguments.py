@@ -1,4 +1,7 @@
-"""What a user may get wrong is named in one line when an estimator is made, not in its fit; and the guide in the docstring runs."""
+"""What a user may get wrong is named in one line when an estimator is made, not in its fit.
+
+And the guide in the docstring runs.
+"""
 
 from __future__ import annotations
 

@@ -107,8 +107,10 @@ def logs(tmp_path_factory: pytest.TempPathFactory, unreported: None) -> Path:
 
 
 def test_one_log_after_the_other_is_both_together(logs: Path) -> None:
-    """Bayes' rule: the posterior of log 0 as the prior for log 1 against a fit of both. The noise is estimated in each fit
-    for itself, from 400 samples, which alone may move a width by a tenth."""
+    """Bayes' rule: the posterior of log 0 as the prior for log 1 against a fit of both.
+
+    The noise is estimated in each fit for itself, from 400 samples, which alone may move a width by a tenth.
+    """
     both = run(config(logs, "both", [0, 1], MASS), out=logs / "both")
     earlier = str(logs / "first" / "posterior")
     then = run(config(logs, "then", [1], MASS, prior=earlier), out=logs / "then")
@@ -132,7 +134,10 @@ def test_an_earlier_posterior_of_another_unit_is_refused(logs: Path, tmp_path: P
 
 
 def test_a_position_controlled_log_gives_its_gains(tmp_path: Path) -> None:
-    """The command is the set-point in rad; both gains within 4 posterior sds of the truth (false alarm 0.01 %) and sharp."""
+    """The command is the set-point in rad.
+
+    Both gains within 4 posterior sds of the truth (false alarm 0.01 %) and sharp.
+    """
     write(tmp_path, SERVO, 0.5, [0])
     found = run(config(tmp_path, "servo", [0], GAINS, unit="rad"), out=tmp_path / "out")
     for p, truth in zip(found.parameters, (8.0, 0.4), strict=True):

@@ -50,8 +50,11 @@ def actions(task: Adroit, seed: int, count: int = STEPS) -> Any:
 
 
 def published_episode(env: Any, task: Adroit, seed: int, refresh: bool) -> tuple[Any, Any, Any]:
-    """Observations, rewards and successes of the published class. It moves the door without refreshing MuJoCo's
-    constants, which leaves rounding in their last bits that contact may amplify: ``refresh`` does it there as well."""
+    """Observations, rewards and successes of the published class.
+
+    It moves the door without refreshing MuJoCo's constants, which leaves rounding in their last bits that contact may
+    amplify: ``refresh`` does it there as well.
+    """
     model, qpos_qvel = task.published, start(task, seed)
     state: dict[str, Any] = dict(zip(("qpos", "qvel"), qpos_qvel, strict=True))
     if task.name == "Door":
@@ -170,8 +173,10 @@ def test_in_place_equals_compiled(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["door_as_in_the_table", "relocate"])
 def test_each_parameter_changes_the_motion_over_its_whole_range(name: str) -> None:
-    """From a latch that turns back and a door that swings, and from a ball that falls on the hand. The frame's mass moves the
-    centre of mass about which MuJoCo computes: rounding, before contact amplifies it."""
+    """From a latch that turns back and a door that swings, and from a ball that falls on the hand.
+
+    The frame's mass moves the centre of mass about which MuJoCo computes: rounding, before contact amplifies it.
+    """
     task = TASKS[name]
     simulator, (qpos, qvel) = Simulator(task), start(task, 0)
     if task.name == "Door":

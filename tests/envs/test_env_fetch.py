@@ -113,8 +113,10 @@ def test_a_rollout_goes_on_from_any_recorded_sample(simulator: Simulator) -> Non
 
 
 def test_states_tell_the_controllers_memory(simulator: Simulator) -> None:
-    """Of a chain of states whose memory is forgotten, in every task to 1e-9, but where an episode starts at rest to 1e-5: the published
-    environment looks there before it has moved."""
+    """Of a chain of states whose memory is forgotten, in every task to 1e-9.
+
+    But where an episode starts, at rest, to 1e-5: the published environment looks there before it has moved.
+    """
     start, goals, actions = drive(simulator, 12, lanes=1)
     (motion,) = simulator.rollout([[0.3, 0.7]], actions, start, goals=goals)
     chain = bind(StateSpace(starts="recorded"), simulator, Trajectories.stack(motion))

@@ -88,8 +88,11 @@ def test_start_is_the_published_distribution(simulator: Simulator) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_in_place_equals_compiled(simulator: Simulator, seed: int) -> None:
-    """Every field; 500 control steps of quiet motion; each of 500 steps of wild motion from the same state, since there
-    a difference of 1e-15 in the start alone has grown to 1 after 500 physics steps."""
+    """Every field; 500 control steps of quiet motion.
+
+    Each of 500 steps of wild motion from the same state, since there a difference of 1e-15 in the start alone has grown
+    to 1 after 500 physics steps.
+    """
     task, rng = cheetah(simulator), np.random.default_rng(seed)
     theta = rng.uniform(-0.2, 1.2, len(task.space))
     expected, found = reference(task, theta), simulator.written(theta)

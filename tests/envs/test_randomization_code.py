@@ -1,4 +1,4 @@
-"""Generated randomisation: it compiles, holds the posterior's draws, and writes them into a model as the library does."""
+"""Generated randomisation: it compiles, holds the posterior's draws, and writes them as the library does."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ XML = """
 <mujoco><worldbody>
   <body name="arm"><joint name="hinge" axis="0 1 0" damping="0.1"/>
     <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.02" mass="0.5"/>
-    <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="0 0 1"/><geom size="0.03" mass="0.2"/></body></body>
+    <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="0 0 1"/>
+    <geom size="0.03" mass="0.2"/></body></body>
   </worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
 PARAMETERS = [
     Parameter("mass", 0.2, 1.0, targets=("body:arm.mass",)),
@@ -95,7 +96,8 @@ BODIES = """
     <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.02" mass="0.5"/>
     <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="1 0 0"/><joint name="twist" axis="1 1 1"/>
     <geom size="0.03" mass="0.2"/></body></body>
-  </worldbody><actuator><motor name="motor" joint="hinge"/><position name="servo" joint="twist" kp="2"/></actuator></mujoco>"""
+  </worldbody><actuator>
+  <motor name="motor" joint="hinge"/><position name="servo" joint="twist" kp="2"/></actuator></mujoco>"""
 
 
 class Bodies(Robot):
@@ -195,7 +197,10 @@ def test_unphysical_draws_are_left_out(case: tuple[MjcfEnvironment, np.ndarray])
 def test_friction_that_mjx_would_not_know_is_refused(
     case: tuple[MjcfEnvironment, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """MJX makes no friction rows where the loaded model has none. The refusal comes before JAX is used, which need not be there."""
+    """MJX makes no friction rows where the loaded model has none.
+
+    The refusal comes before JAX is used, which need not be there.
+    """
     jax = ModuleType("jax")
     jax.numpy = ModuleType("jax.numpy")  # type: ignore[attr-defined]
     for name, module in (("jax", jax), ("jax.numpy", jax.numpy)):  # type: ignore[attr-defined]

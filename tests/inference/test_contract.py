@@ -216,7 +216,10 @@ def test_trajectories_of_another_environment_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_diverging_simulations_are_survived(name: str) -> None:
-    """A tenth of the prior diverges: the fit says so and goes on, its mean within a quarter of the range of what it is without."""
+    """A tenth of the prior diverges.
+
+    The fit says so and goes on, its mean within a quarter of the range of what it is without.
+    """
     simulator, (_, sound) = Fragile(), undisturbed(name)
     fragile = get_estimator(simulator, name, seed=3, **quick(name))
     posterior = fragile.fit(recorded())

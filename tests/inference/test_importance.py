@@ -27,7 +27,7 @@ TUNING = ImportanceTuning()
 
 
 def skewed(rate: float = 3.0, size: int = 2) -> sipe.CallableSimulator:
-    """x = exp(-rate theta): the larger theta, the less is known of it."""
+    """``x = exp(-rate theta)``: the larger theta, the less is known of it."""
     space = sipe.ParameterSpace([sipe.Parameter(f"p{k}", 0.0, 1.0) for k in range(size)])
     return sipe.CallableSimulator(lambda v: np.exp(-rate * v), space, likelihood=SD * 0.2, name="skewed")
 
@@ -41,7 +41,10 @@ def exact(rate: float, x: float, levels: list[float]) -> np.ndarray:
 
 @pytest.mark.parametrize("x", [0.08, 0.15, 0.25])
 def test_skewed_posteriors_are_those_of_a_grid(x: float) -> None:
-    """Quantiles to .06 of the range (some 100 effective draws: a quantile's sd is .02), where the normal's are off by up to .3."""
+    """Quantiles to .06 of the range, where the normal's are off by up to .3.
+
+    Some 100 effective draws: a quantile's sd is .02.
+    """
     levels, estimator = [0.05, 0.5, 0.95], Laplace(skewed(), seed=1)
     found = estimator.fit(np.full(2, x)).quantile(levels).numpy()
     print(found.T, exact(3.0, x, levels), estimator.rollouts, estimator.diagnostics)
@@ -84,7 +87,11 @@ def test_the_probe_goes_two_sds_along_each_parameter() -> None:
 
 
 def test_an_open_direction_beside_a_sharp_one() -> None:
-    """Sds of 10 and 1e-5: the weighted variance of the sharp one is right to 3.5 standard errors (false alarm 1 in 2000), that of the open one the prior's."""
+    """Sds of 10 and 1e-5.
+
+    The weighted variance of the sharp one is right to 3.5 standard errors (false alarm 1 in 2000), that of the open one
+    the prior's.
+    """
     space = sipe.ParameterSpace([sipe.Parameter("sharp", 0.0, 1.0), sipe.Parameter("open", 0.0, 1.0)])
     found = GaussianMixture([0.0], np.full((1, 2), 0.5), np.diag([1e-10, 100.0])[None], space)
     draws, prior = Draws.none(2), default_prior(space)
@@ -103,8 +110,10 @@ def test_an_open_direction_beside_a_sharp_one() -> None:
 
 
 def test_kernels_at_a_bound_keep_the_draws_mean() -> None:
-    """Half-normal draws, eight times 400: the kernels' mean is that of the draws to 1 % (their picking leaves .3 %); cut as a whole, without each kernel's
-    own mass, it would be 2 to 3 % too large. The quartiles are right to a tenth."""
+    """Half-normal draws, eight times 400: the kernels' mean is that of the draws to 1 % (their picking leaves .3 %).
+
+    Cut as a whole, without each kernel's own mass, it would be 2 to 3 % too large. The quartiles are right to a tenth.
+    """
     space, ratios = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)]), []
     for seed in range(8):
         draws = np.abs(0.1 * np.random.default_rng(seed).standard_normal((400, 1)))
@@ -118,8 +127,10 @@ def test_kernels_at_a_bound_keep_the_draws_mean() -> None:
 
 
 def test_a_given_noise_is_not_made_larger() -> None:
-    """Stated sds of 1e-8 beside outputs of 1, less than what is taken for rounding where noise is estimated: no draws, and the sd that follows; of a slope with
-    which it is sharper than the search resolves, the least one."""
+    """Stated sds of 1e-8 beside outputs of 1, less than what is taken for rounding where noise is estimated.
+
+    No draws, and the sd that follows; of a slope with which it is sharper than the search resolves, the least one.
+    """
     space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
     for slope, wanted in ((5e-4, 2e-5), (1.0, 1e-6)):
         estimator = Laplace(sipe.CallableSimulator(lambda v, slope=slope: 1.0 + slope * v, space, likelihood=1e-8))
@@ -130,8 +141,11 @@ def test_a_given_noise_is_not_made_larger() -> None:
 
 
 def test_unknown_noise_of_a_log_is_integrated_out() -> None:
-    """A pendulum from a known start, 25 noisy samples, against a grid over mass and damping on which white noise of unknown sd is integrated out in closed
-    form: the target to .005 nats, the posterior's quantiles to .08 of the range."""
+    """A pendulum from a known start, 25 noisy samples, against a grid over mass and damping.
+
+    On the grid white noise of unknown sd is integrated out in closed form: the target to .005 nats, the posterior's
+    quantiles to .08 of the range.
+    """
     simulator, theta = pendulum(), np.array([0.4, 0.5])
     values = [p.value(t) for p, t in zip(simulator.space, theta, strict=True)]
     log = pendulum_log(simulator, values, 3, steps=25)
@@ -185,8 +199,10 @@ def test_resumes_between_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_weights_of_known_proposals_give_the_posterior_back() -> None:
-    """A density that is no normal in three dimensions: mean and sd by weighted draws within 3.5 standard errors of those on a grid (false
-    alarm 1 in 350 for six numbers)."""
+    """A density that is no normal in three dimensions.
+
+    Mean and sd by weighted draws within 3.5 standard errors of those on a grid (false alarm 1 in 350 for six numbers).
+    """
     space = sipe.ParameterSpace([sipe.Parameter(f"p{k}", 0.0, 1.0) for k in range(3)])
     prior = default_prior(space)
 

@@ -75,8 +75,11 @@ def exact_posterior(simulator: Simulator, trajectory: Trajectory, rho: float) ->
 
 @pytest.mark.parametrize("name", ["laplace", "mcmc"])
 def test_the_exact_posterior_of_a_linear_gaussian_system(name: str) -> None:
-    """Known white noise, unknown start. The chain's mean is good to 4 of its standard errors at 300 effective draws
-    (false-alarm rate 0.03 % for each number); Laplace is exact."""
+    """Known white noise, unknown start.
+
+    The chain's mean is good to 4 of its standard errors at 300 effective draws (false-alarm rate 0.03 % for each
+    number); Laplace is exact.
+    """
     simulator = cart()
     trajectory, _ = cart_log(simulator, 1)
     mean, covariance = exact_posterior(simulator, trajectory, 0.0)
@@ -103,8 +106,11 @@ def test_windows_lose_no_information_that_the_starts_do_not_take() -> None:
 
 
 def test_coloured_noise_widens_and_covers() -> None:
-    """40 logs with rho .9: the 90 % interval of the offset holds the truth in 30 or more (a right width fails with
-    probability 0.2 %); white noise's intervals hold it in fewer than 30."""
+    """40 logs with rho .9.
+
+    The 90 % interval of the offset holds the truth in 30 or more (a right width fails with probability 0.2 %); white
+    noise's intervals hold it in fewer than 30.
+    """
     simulator = cart()
     covered = {"ar1": 0, "sandwich": 0, "white": 0}
     for seed in range(40):
@@ -161,8 +167,11 @@ def test_wrong_input() -> None:
     "likelihood", [sipe.Segments(0.5, noise="white"), sipe.StateSpace()], ids=["segments", "states"]
 )
 def test_a_delay_of_none_is_found(likelihood: Any) -> None:
-    """The model as given has none either, and any delay up to one physics step acts as one: a slope taken there says nothing.
-    Intervals of 99 %: of the four, right ones fail with probability 4 %, and the seed is fixed."""
+    """The model as given has none either, and any delay up to one physics step acts as one.
+
+    A slope taken there says nothing. Intervals of 99 %: of the four, right ones fail with probability 4 %, and the seed
+    is fixed.
+    """
     delay = Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",))
     simulator = pendulum(delay)
     posterior = get_estimator(simulator, "laplace", likelihood=likelihood).fit(

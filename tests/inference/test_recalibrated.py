@@ -1,4 +1,6 @@
-"""Recalibrated posteriors against exact ones: too narrow, too wide, shifted, without correlation, points; what a refit costs.
+"""Recalibrated posteriors against exact ones: too narrow, too wide, shifted, without correlation, points.
+
+What a refit costs.
 
 x = M theta + noise of sd 0.05, so that with a flat prior theta given x is normal, well inside the cube.
 """
@@ -47,7 +49,10 @@ EXACT = GaussianMixture([0.0], np.linalg.solve(MIXING, OBSERVED)[None], COVARIAN
 
 
 class Planted(Estimator[Ended]):
-    """The exact posterior's mean, ``shift`` off, with ``width`` times its sds and no correlation; a point for a width of zero."""
+    """The exact posterior's mean, ``shift`` off, with ``width`` times its sds and no correlation.
+
+    A point for a width of zero.
+    """
 
     name = "planted"
     state_type = Ended
@@ -83,8 +88,10 @@ class Planted(Estimator[Ended]):
 
 @pytest.mark.parametrize("planted", [{"width": 0.5}, {"width": 2.0}, {"width": 0.0}, {"shift": 0.1}, {"width": 1.0}])
 def test_planted_errors_are_mended(planted: dict[str, float]) -> None:
-    """With 400 refits the sds are known to 4 % or so, the mean to a twentieth of them: tolerances are five times that, so a
-    right implementation fails once in 10^6."""
+    """With 400 refits the sds are known to 4 % or so, the mean to a twentieth of them.
+
+    Tolerances are five times that, so a right implementation fails once in 10^6.
+    """
     found = Recalibrated(Planted(**planted), refits=400, seed=3).fit(OBSERVED)
     off, ratio = (found.mean - EXACT.mean) / EXACT.stddev, found.stddev / EXACT.stddev
     correlation = float(found.covariance[0, 1] / found.stddev.prod())
@@ -133,7 +140,10 @@ def test_a_parameter_that_the_estimate_does_not_follow_comes_back_as_the_prior()
 
 
 def test_a_point_gets_a_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A trained network's point estimate, against the exact posterior; its own scatter may widen it. It is not trained again."""
+    """A trained network's point estimate, against the exact posterior; its own scatter may widen it.
+
+    It is not trained again.
+    """
     base = sipe.get_estimator(
         SIMULATOR, "regression", budget=600, iterations=1000, likelihood=Segments(noise_sd=(0.0, 0.0))
     )
@@ -166,8 +176,11 @@ def test_what_an_amortised_estimator_doubts_of_the_log_stays_in_doubt(amortised:
 
 
 def test_a_point_that_the_start_moves_more_than_theta_does() -> None:
-    """Four logs of a falling pole with 5 % noise, starts not recorded: were the starts taken for known, as they are estimated, some 40 %
-    of the 12 intervals would hold the truth. A right one fails once in two hundred, were the intervals, of 90 %, independent."""
+    """Four logs of a falling pole with 5 % noise, starts not recorded.
+
+    Were the starts taken for known, as they are estimated, some 40 % of the 12 intervals would hold the truth. A right
+    one fails once in two hundred, were the intervals, of 90 %, independent.
+    """
     simulator = sipe.Simulator(sipe.make_task("CartPole"), num_threads=1)
     base = sipe.get_estimator(simulator, "regression", budget=300, iterations=2000, seed=0)
     recalibrated, held = Recalibrated(base), 0
@@ -199,9 +212,12 @@ def test_coloured_noise_that_the_estimator_takes_for_white() -> None:
 
 @pytest.mark.parametrize("starts", ["estimated", "recorded"])
 def test_a_state_space_fit_is_recalibrated(starts: str) -> None:
-    """White noise and a right model: the posterior was right before, so its mean stays within two of its sds, and its sds, which
-    20 refits know to 16 %, within a factor of two. Also of noisy logs whose first state is known: that they have states does not mean that
-    they have no noise."""
+    """White noise and a right model.
+
+    The posterior was right before, so its mean stays within two of its sds, and its sds, which 20 refits know to 16 %,
+    within a factor of two. Also of noisy logs whose first state is known: that they have states does not mean that they
+    have no noise.
+    """
     simulator = pendulum()
     recorded = log(simulator, [0.6, 0.08], 1, steps=100)
     if starts == "recorded":
@@ -222,8 +238,11 @@ def test_a_state_space_fit_is_recalibrated(starts: str) -> None:
 
 
 def test_process_noise_is_in_the_replicas() -> None:
-    """A spring whose states are shaken twice as much as elsewhere here: the sd stays within a factor of two of the right one that
-    ``StateSpace`` has (13 refits know it to 20 %), and the truth, .35, within three."""
+    """A spring whose states are shaken twice as much as elsewhere here.
+
+    The sd stays within a factor of two of the right one that ``StateSpace`` has (13 refits know it to 20 %), and the
+    truth, .35, within three.
+    """
     for seed in range(3):
         base = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
         logs = spring_logs(seed, count=1, process=2 * PROCESS)

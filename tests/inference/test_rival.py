@@ -1,8 +1,9 @@
 """Three traps: a NaN in the log, a start that diverges, a cart of which only gear / mass shows.
 
-Ours returns a usable posterior and says what happened. Where mujoco.sysid can be imported, what it does in the same place
-is checked too: it returns the start, or dies. (That its answer depends on the start is a printed figure: `bench.py
-rival`.) Should a test of its behaviour fail, the rival has improved, and what the README says of it must change.
+Ours returns a usable posterior and says what happened. Where mujoco.sysid can be imported, what it does in the same
+place is checked too: it returns the start, or dies. (That its answer depends on the start is a printed figure:
+`bench.py rival`.) Should a test of its behaviour fail, the rival has improved, and what the README says of it must
+change.
 """
 
 from __future__ import annotations

@@ -34,7 +34,10 @@ def test_the_linear_gaussian_posterior(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["laplace", "mcmc", "npe", "bayessim"])
 def test_both_modes_of_a_squared_parameter(name: str) -> None:
-    """Modes at 0.2 and 0.8: each has a third of the draws or more, and hardly any lie between. Laplace says there are two."""
+    """Modes at 0.2 and 0.8: each has a third of the draws or more, and hardly any lie between.
+
+    Laplace says there are two.
+    """
     simulator, log, likelihood = squared_rod() if name in ("laplace", "mcmc") else squared_function()
     settings: dict[str, Any] = {"restarts": 4} if name in ("laplace", "mcmc") else SMALL[name]
     estimator = get_estimator(simulator, name, budget=2000, seed=1, likelihood=likelihood, **settings)

@@ -69,7 +69,10 @@ def test_inference_data_has_physical_units() -> None:
 
 
 def test_inference_data_holds_what_else_is_known(tmp_path: Path) -> None:
-    """Prior in units, what was observed, predictions and densities of each draw, what the sampler knows; also after storing."""
+    """Prior in units, what was observed, predictions and densities of each draw, what the sampler knows.
+
+    Also after storing.
+    """
     theta, lp = np.linspace(0, 1, 12).reshape(12, 1), np.arange(12.0)
     chains = Particles(theta, space_of(1), chains=3, sample_stats={"lp": lp})
     chains.save(tmp_path / "chains")

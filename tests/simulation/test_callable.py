@@ -42,7 +42,10 @@ def exact() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))
 def test_every_estimator_takes_an_observed_x(name: str) -> None:
-    """Those with a likelihood or a density find the exact posterior, mean to 0.4 sd and sds to 40 %; all give something."""
+    """Those with a likelihood or a density find the exact posterior, mean to 0.4 sd and sds to 40 %.
+
+    All give something.
+    """
     simulator = sipe.CallableSimulator(plain, SPACE, likelihood=SD)
     estimator = sipe.get_estimator(simulator, name, **{"seed": 0, "budget": 1500, **SMALL.get(name, {})})
     posterior = estimator.fit(X)
@@ -70,8 +73,11 @@ def test_noise_of_a_row_depends_on_theta_and_seed_alone() -> None:
 @pytest.mark.parametrize("units", [(1e3, 1e-3), (1e-9, 1e-9)])
 @pytest.mark.parametrize("name", [n for n in ESTIMATORS if n != "mcmc"])
 def test_units_of_the_outputs_do_not_matter(name: str, units: tuple[float, float]) -> None:
-    """x = (a, b) in units of any size: searches give the same theta to rounding, bayesopt's best point is b's as well, networks
-    find both to 0.25. (mcmc goes by laplace's likelihood.)"""
+    """``x = (a, b)`` in units of any size.
+
+    Searches give the same theta to rounding, bayesopt's best point is b's as well, networks find both to 0.25. (mcmc
+    goes by laplace's likelihood.)
+    """
     values, sd = np.array([0.6, -0.5]), np.array(units)
     simulator = sipe.CallableSimulator(lambda v: v * sd, SPACE, likelihood=SD * sd)
     settings = {"seed": 0, "budget": 400, **SMALL.get(name, {})}
@@ -178,7 +184,7 @@ def test_failed_simulations_are_named() -> None:
 
 
 def test_a_missing_output_is_skipped_where_it_can_be() -> None:
-    """laplace told to compare two of three outputs is wider, and right."""
+    """``laplace`` told to compare two of three outputs is wider, and right."""
     simulator, mean = sipe.CallableSimulator(plain, SPACE, likelihood=SD), exact()[0]
     missing, two = [X[0], X[1], np.nan], sipe.Segments(None, noise="white", noise_sd=(SD, SD, None), fit=("x0", "x1"))
     whole = sipe.get_estimator(simulator, "laplace").fit(X)
@@ -232,8 +238,10 @@ def test_wrong_input(call: Callable[[], Any], words: str) -> None:
 
 
 def test_many_candidates_find_a_narrow_valley() -> None:
-    """Of steps of a twentieth, where a slope tells nothing: with 100 candidates the search begins, over ten seeds, far closer than the
-    best of 100 draws of the prior is."""
+    """Of steps of a twentieth, where a slope tells nothing.
+
+    With 100 candidates the search begins, over ten seeds, far closer than the best of 100 draws of the prior is.
+    """
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "abcd")
     truth = np.array([0.31, 0.62, 0.83, 0.17])
 
@@ -254,8 +262,11 @@ def test_many_candidates_find_a_narrow_valley() -> None:
 
 
 def test_pattern_search_leaves_the_false_optima_of_a_rough_misfit() -> None:
-    """Kinks every 1e-3, as contact makes them: linearised steps alone stop in one for 4 of these 10 truths, the nearest 4e-5 off and 24
-    sd wrong; with the pattern search every truth is found."""
+    """Kinks every 1e-3, as contact makes them.
+
+    Linearised steps alone stop in one for 4 of these 10 truths, the nearest 4e-5 off and 24 sd wrong; with the pattern
+    search every truth is found.
+    """
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "ab")
     mix, phase = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0).uniform(size=30)
 
@@ -274,8 +285,11 @@ def test_pattern_search_leaves_the_false_optima_of_a_rough_misfit() -> None:
 
 
 def test_intervals_stay_honest_where_the_simulation_is_chaotic() -> None:
-    """A line with noise of sd .014 that is another one at every theta: the curvature that finite differences see says sd 1e-6, thousands of
-    times too narrow; the pattern search's intervals hold all of 10 truths within three sds, and still tell them to a tenth of the prior's range."""
+    """A line with noise of sd .014 that is another one at every theta.
+
+    The curvature that finite differences see says sd 1e-6, thousands of times too narrow; the pattern search's
+    intervals hold all of 10 truths within three sds, and still tell them to a tenth of the prior's range.
+    """
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "ab")
     mix, rate = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0).uniform(1e8, 1e9, size=(2, 30))
 
@@ -295,8 +309,10 @@ def test_intervals_stay_honest_where_the_simulation_is_chaotic() -> None:
 
 @pytest.mark.parametrize("budget", [60, 100])
 def test_a_search_that_the_budget_ends_is_no_surer_than_its_way_was_long(budget: int) -> None:
-    """A curve with teeth of a hundredth, of which the slope says sd 2e-6: before it has settled, or where no step finds what was foretold, the
-    truth lies within four sds."""
+    """A curve with teeth of a hundredth, of which the slope says sd 2e-6.
+
+    Before it has settled, or where no step finds what was foretold, the truth lies within four sds.
+    """
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "abcde")
     mix, phase = np.random.default_rng(1).normal(size=(5, 30)), np.random.default_rng(0).uniform(size=30)
 
@@ -320,7 +336,10 @@ def test_a_search_that_the_budget_ends_is_no_surer_than_its_way_was_long(budget:
 
 
 def test_poll_widens_to_what_fits_as_well() -> None:
-    """A contact that is not made below one half: the slope seen from there says sd .002, but a tenth below fits as well."""
+    """A contact that is not made below one half.
+
+    The slope seen from there says sd .002, but a tenth below fits as well.
+    """
     space = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=1.0)])
     simulator = sipe.CallableSimulator(lambda v: 50 * np.maximum(v - 0.5, 0.0), space, likelihood=0.1)
     posterior = Laplace(simulator, initial=np.array([[0.5]])).fit(np.zeros(1))
@@ -330,8 +349,11 @@ def test_poll_widens_to_what_fits_as_well() -> None:
 
 @pytest.mark.parametrize(("centre", "sd"), [(0.5, 0.0378), (0.5, 0.033), (0.45, 0.0005)])
 def test_poll_keeps_two_optima_apart(centre: float, sd: float) -> None:
-    """theta enters squared; an optimum of which another lies just where the pattern search looks stays narrow, and both are found. The saddle between,
-    where the search may begin, is none."""
+    """Theta enters squared.
+
+    An optimum of which another lies just where the pattern search looks stays narrow, and both are found. The saddle
+    between, where the search may begin, is none.
+    """
     space, away = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=1.0)]), 0.3 if centre == 0.5 else 0.05
     simulator = sipe.CallableSimulator(lambda v: (v - centre) ** 2, space, likelihood=sd)
     for initial in (None, np.array([[0.25], [0.75]])):

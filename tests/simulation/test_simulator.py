@@ -1,5 +1,4 @@
-"""The engine against a plain mj_step loop, bit for bit, whatever the threads, the batch, the order or what
-ran before."""
+"""The engine against a plain mj_step loop, bit for bit, whatever the threads, batch, order or what ran before."""
 
 from __future__ import annotations
 

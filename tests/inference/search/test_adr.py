@@ -39,8 +39,10 @@ def test_the_direction_is_the_plain_one() -> None:
 
 
 def test_particles_settle_on_a_gaussian_target() -> None:
-    """From a narrow cloud far away to mean and spread of N((1, -2), diag(1, 0.25)); 60 particles underestimate sds by less
-    than a fifth."""
+    """From a narrow cloud far away to mean and spread of N((1, -2), diag(1, 0.25)).
+
+    60 particles underestimate sds by less than a fifth.
+    """
     rng = np.random.default_rng(1)
     mean, sd = np.array([1.0, -2.0]), np.array([1.0, 0.5])
     particles = 4 + 0.1 * rng.standard_normal((60, 2))

@@ -82,7 +82,7 @@ def test_slopes_are_autograds() -> None:
 
 
 def test_fitted_hyper_parameters_predict() -> None:
-    """Standardised errors at fresh points are of order one, and a parameter that does nothing gets a long lengthscale."""
+    """Standardised errors at fresh points are of order one, and an idle parameter gets a long lengthscale."""
     rng = np.random.default_rng(0)
     x, fresh = (torch.from_numpy(rng.random((n, 3))) for n in (120, 200))
     value = lambda t: torch.sin(5 * t[:, 0]) + 2 * t[:, 1] ** 2  # noqa: E731
@@ -97,7 +97,10 @@ def test_fitted_hyper_parameters_predict() -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_the_density_integrates_to_one_and_draws_agree(n: int, tmp_path: Path) -> None:
-    """Five standard errors, of the normaliser too; the chains' means within five of theirs (effective draws as reported)."""
+    """Five standard errors, of the normaliser too.
+
+    The chains' means within five of theirs (effective draws as reported).
+    """
     prior = uniform(space_of(n))
     posterior = SurrogatePosterior.sampled(
         bowl(n), math.log(0.1 + 0.03 * n), prior, options=EnsembleOptions(effective=500)
@@ -137,7 +140,7 @@ def test_the_density_is_the_probability_of_another_simulation_below_epsilon() ->
 
 
 def test_epsilon_gives_a_quadratic_log_cost_its_gaussians_covariance() -> None:
-    """log C = log C_min + (theta - m)' S^-1 (theta - m) / n: theta uniform below epsilon have covariance S, to 8 %."""
+    """``log C = log C_min + (theta - m)' S^-1 (theta - m) / n``: theta below epsilon have covariance S, to 8 %."""
     rng, sd, residuals = np.random.default_rng(0), np.array([0.03, 0.05]), 40.0
     theta = rng.uniform(0.2, 0.8, (200_000, 2))
     cost = 0.02 * np.exp((((theta - 0.5) / sd) ** 2).sum(1) / residuals)
@@ -196,8 +199,11 @@ def test_other_trajectories_start_a_new_process() -> None:
 
 @pytest.mark.parametrize("acquisition", ["upper_confidence_bound", "expected_improvement"])
 def test_finds_the_optimum_within_the_budget(acquisition: str) -> None:
-    """Two parameters, 60 rollouts, no noise: the best theta is good to 0.02, the truth within 4 sds of the mean and half of the
-    posterior within 0.05 of it; a few far draws are what little was evaluated elsewhere."""
+    """Two parameters, 60 rollouts, no noise.
+
+    The best theta is good to 0.02, the truth within 4 sds of the mean and half of the posterior within 0.05 of it; a
+    few far draws are what little was evaluated elsewhere.
+    """
     simulator = pendulum()
     truth = simulator.space.normalise(TRUTH)
     estimator = BayesOpt(simulator, budget=BUDGET, acquisition=acquisition, effective_draws=200)

@@ -21,8 +21,10 @@ from tests.problems.searches import (
 
 
 def test_the_minimum_of_a_quadratic(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tilted quadratic of condition number 25: the last elites lie within 0.01 of its minimum, the cost's best within
-    300 evaluations, from three seeds."""
+    """A tilted quadratic of condition number 25.
+
+    The last elites lie within 0.01 of its minimum, the cost's best within 300 evaluations, from three seeds.
+    """
     simulator, trajectory, _ = problem()
     target, curvature = np.array([0.85, 0.2]), np.array([[1.0, 0.9], [0.9, 1.0]]) + 0.02 * np.eye(2)
 

@@ -26,7 +26,10 @@ TRUTH = np.array([[0.3, 0.6]])
 
 
 def whole_state(seeds: Iterable[int] = (3,)) -> Windows:
-    """Angle and velocity both recorded, from ``TRUTH``: single control steps tell mass and damping. seeds: of each log's actions."""
+    """Angle and velocity both recorded, from ``TRUTH``: single control steps tell mass and damping.
+
+    seeds: of each log's actions.
+    """
     plain = pendulum()
     channels = ["joint:hinge.position", "joint:hinge.velocity"]
     environment = MjcfEnvironment.build(XML, list(plain.space), ["motor"], channels)
@@ -66,7 +69,10 @@ def test_the_truth_is_rewarded_above_wrong_thetas() -> None:
 
 
 def test_starting_states_and_actions_need_not_match() -> None:
-    """Six recordings; it is trained on, and rewards, simulations under other actions from other states, which reach about the same."""
+    """Six recordings.
+
+    It is trained on, and rewards, simulations under other actions from other states, which reach about the same.
+    """
     recorded, other = whole_state(range(3, 9)), whole_state(range(50, 56))
     assert not np.isclose(recorded.actions, other.actions).any((1, 2)).all()
     assert not np.isclose(recorded.measured[:, 0], other.measured[:, 0])[recorded.start > 0].any()
@@ -80,7 +86,10 @@ def test_starting_states_and_actions_need_not_match() -> None:
 
 
 def test_noise_alone_rewards_nothing() -> None:
-    """Recorded and simulated steps from one distribution: rewards of different sets stay near log 1/2 and near each other."""
+    """Recorded and simulated steps from one distribution.
+
+    Rewards of different sets stay near log 1/2 and near each other.
+    """
     bound = windows()
     reward = LearnedReward(bound, RewardOptions(discriminator_updates=20))
     rng = np.random.default_rng(1)
@@ -94,8 +103,10 @@ def test_noise_alone_rewards_nothing() -> None:
 
 
 def test_noise_of_the_recording_does_not_give_simulations_away() -> None:
-    """With noise of a stated sd on the log, simulations at the truth get it too: the discriminator's loss stays near log 2;
-    without, it falls."""
+    """With noise of a stated sd on the log, simulations at the truth get it too.
+
+    The discriminator's loss stays near log 2; without, it falls.
+    """
     sd = 0.05
     losses = []
     for stated in (sd, 1e-9):
