@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sipe_bayes.benchmark.frame import source
+from sipe_bayes.benchmark.measurement import source
 
 
 def fits(path: Path) -> list[dict[str, Any]]:

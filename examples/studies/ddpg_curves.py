@@ -29,11 +29,11 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import to_json, write_text
-from sipe_bayes.report.drawing import CHAINS, _figure, _styled
-from sipe_bayes.report.show import _save
-from sipe_bayes.rl.evaluation import evaluate
+from sipe_bayes.report.drawing import CHAINS, new_figure, styled
+from sipe_bayes.report.show import save_figure
+from sipe_bayes.rl.evaluation import STARTS, evaluate
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.rl.train import _EVALUATION_SEED, read_curve, train
+from sipe_bayes.rl.train import read_curve, train
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "ddpg_curves"
@@ -67,7 +67,7 @@ def run_ours(seed: int, steps: int, folder: Path) -> dict[str, Any]:
     run: dict[str, Any] = {"evaluate_every": every, "evaluation_episodes": EPISODES, "checkpoint_every": every}
     train(TASK, steps, seed, folder / f"ours-{seed}", settings(steps), resume=True, **run)
     rows = read_curve(folder / f"ours-{seed}")
-    return {"seconds": rows[-1][4], "curve": [row[:2] for row in rows]}
+    return {"seconds": rows[-1].wall_seconds, "curve": [[row.step, row.return_mean] for row in rows]}
 
 
 def run_stable_baselines3(seed: int, steps: int, folder: Path) -> dict[str, Any]:
@@ -98,10 +98,8 @@ def run_stable_baselines3(seed: int, steps: int, folder: Path) -> dict[str, Any]
 
     def evaluated(*_: Any) -> bool:
         if model.num_timesteps % (steps // POINTS) == 0:
-            found = evaluate(
-                lambda seen: model.predict(seen, deterministic=True)[0], simulator, EPISODES, _EVALUATION_SEED
-            )
-            curve.append([model.num_timesteps, found["mean"]])
+            found = evaluate(lambda seen: model.predict(seen, deterministic=True)[0], simulator, EPISODES, STARTS.curve)
+            curve.append([model.num_timesteps, found.mean])
         return True
 
     begin = time.perf_counter()
@@ -139,7 +137,7 @@ def table(steps: int, folder: Path, results: Path) -> None:
         "versions": {p: version(p) for p in ("mujoco", "numpy", "torch", "stable-baselines3", "gymnasium")},
         "task": TASK,
         "steps": steps,
-        "settings": given.to_dict(),
+        "settings": given.plain(),
         "alike": ALIKE,
         "differences": DIFFERENCES,
         "missing_cells": [file.stem for file in files if not file.exists()],
@@ -148,7 +146,7 @@ def table(steps: int, folder: Path, results: Path) -> None:
     }
     write_text(results / "ddpg_curves.json", to_json(found, indent=1) + "\n")
     if cells:
-        _save(drawn(cells, given.start_steps), results / "ddpg_curves.png")
+        save_figure(drawn(cells, given.start_steps), results / "ddpg_curves.png")
     print(statement(found))
 
 
@@ -209,10 +207,10 @@ def statement(found: dict[str, Any]) -> str:
     )
 
 
-@_styled
+@styled
 def drawn(cells: list[dict[str, Any]], start_steps: int) -> Any:
     """Each seed's curve thin, each method's mean thick."""
-    figure = _figure(3.6, 6.4)
+    figure = new_figure(3.6, 6.4)
     axes = figure.subplots()
     axes.axvspan(0, start_steps / 1000, color="#EEEEEE", lw=0)
     axes.text(

@@ -22,6 +22,7 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ def run_cell(steps: int, budget: int, method: str, seed: int) -> None:
         "solved_reference": found.solved_reference,
         "scores": scored(found.posterior),
         "warnings": found.warnings,
-        "history": found.history,
+        "history": [asdict(row) for row in found.history],
     }
     write_text(out / "cell.json", to_json(record))
 

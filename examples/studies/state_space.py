@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 import sipe_bayes as sipe
-from sipe_bayes.benchmark.frame import source
+from sipe_bayes.benchmark.measurement import source
 from sipe_bayes.core.files import write_text
 from sipe_bayes.datasets import acting
 from sipe_bayes.datasets.demonstrations import behaviour_of

@@ -78,14 +78,14 @@ def trained(name: str, seed: int, steps: int, runs: Path) -> dict[str, Any]:
         checkpoint_every=every,
     )
     rows, curve = read_curve(folder), []
-    for step, *_ in rows:
-        met = evaluate(load_policy(folder / "policies" / f"{step}.safetensors"), task, 10, 1, TRUTH)
-        curve.append((step, met["mean"]))
+    for row in rows:
+        met = evaluate(load_policy(folder / "policies" / f"{row.step}.safetensors"), task, 10, 1, TRUTH)
+        curve.append((row.step, met.mean))
     found = evaluate(policy, task, EPISODES, 2, TRUTH)
     return {
         "name": name,
         "seed": seed,
-        "return": found["mean"],
+        "return": found.mean,
         "cpu_seconds": time.process_time() - began,
         "curve": curve,
     }

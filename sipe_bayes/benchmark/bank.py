@@ -1,8 +1,9 @@
 """The simulations of the prior that estimators of one cell group share: filled in shards, anywhere, and verified.
 
-A bank is a folder of ``inference.simulations.Cache``: its name is a hash of model, parameters, prior, seed, actions and starts, and row i
-follows from the seed and i alone. So shards made on different machines are the parts of one bank: merging is copying their files into
-one folder, and a lost file is made again bit for bit. ``shard-*.json`` beside the blocks says what a shard cost.
+A bank is a folder of ``inference.simulations.Cache``: its name is a hash of model, parameters, prior, seed, actions and
+starts, and row i follows from the seed and i alone. So shards made on different machines are the parts of one bank:
+merging is copying their files into one folder, and a lost file is made again bit for bit. ``shard-*.json`` beside the
+blocks says what a shard cost.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 
 FOLDER = "simulations"
-SHARD = 4  # blocks
+UNITS = "simulations/"  # what the names of shards begin with
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class Bank:
 
     @property
     def id(self) -> str:
+        """Such as ``Door/in_distribution/seed0/100``."""
         return f"{self.task}/{self.variant}/seed{self.seed}/{self.steps}"
 
 
@@ -49,13 +51,19 @@ class _Blocks(Cache):
     """A cache whose blocks are made in any order."""
 
     def block(self, number: int, rows: int) -> Simulations:
-        """The first ``rows`` of a block, read or made."""
+        """The first rows of a block, read or made.
+
+        Args:
+            number: of the block.
+            rows: how many.
+        """
         self._blocks = [self._none()] * number
         self._blocks.append(self._read(number) or self._none())
         made = self._blocks[number]
         return made if len(made) >= rows else self._extended(number, rows)
 
     def path(self, number: int) -> str:
+        """Of a block, in the folder of results."""
         return f"{FOLDER}/{self.key}/block-{number:06d}.npz"
 
 
@@ -68,34 +76,54 @@ def _opened(bank: Bank, folder: Path) -> _Blocks:
 
 
 def place(bank: Bank, folder: Path) -> Path:
-    """Where the blocks of a bank lie; its log is made to know that."""
+    """Where the blocks of a bank lie; its log is made to know that.
+
+    Args:
+        bank: which.
+        folder: of results.
+    """
     return folder / FOLDER / _opened(bank, folder / FOLDER).key
 
 
 def known_place(bank: Bank, folder: Path) -> Path | None:
-    """Where they lie as far as the shards that are there tell; None where there are none, or those of several logs."""
+    """Where they lie as far as the shards that are there tell.
+
+    Args:
+        bank: which.
+        folder: of results.
+
+    Returns:
+        None where there are none, or those of several logs.
+    """
     notes = (folder / FOLDER).glob("*/shard-*.json")
-    found = {path.parent for path in notes if json.loads(path.read_text(encoding="utf-8"))["bank"] == bank.id}
-    return found.pop() if len(found) == 1 else None
+    folders = {path.parent for path in notes if json.loads(path.read_text(encoding="utf-8"))["bank"] == bank.id}
+    return folders.pop() if len(folders) == 1 else None
 
 
-def shards(bank: Bank, budget: int, made: Path | None) -> list[Unit]:
-    """What is to be simulated of the first ``budget`` rows, without the blocks that lie in ``made``."""
+def shards(bank: Bank, budget: int, made: Path | None, size: int = 4) -> list[Unit]:
+    """What is to be simulated of the first rows of a bank.
+
+    Args:
+        bank: which.
+        budget: rows.
+        made: where blocks lie already.
+        size: blocks of a shard.
+    """
     rows = [min(BLOCK, budget - start) for start in range(0, whole("budget", budget), BLOCK)]
-    lacking = [k for k, count in enumerate(rows) if made is None or _rows(made / f"block-{k:06d}.npz") < count]
+    missing = [k for k, count in enumerate(rows) if made is None or _rows(made / f"block-{k:06d}.npz") < count]
     return [
         Unit(
-            f"simulations/{bank.id}/{part[0]}",
+            f"{UNITS}{bank.id}/{part[0]}",
             _simulate,
             {"bank": bank, "blocks": [(k, rows[k]) for k in part]},
             broken=_left_out,
         )
-        for part in (lacking[i : i + SHARD] for i in range(0, len(lacking), SHARD))
+        for part in (missing[i : i + size] for i in range(0, len(missing), size))
     ]
 
 
 def _left_out(bank: Bank, blocks: list[tuple[int, int]], why: str) -> Done:
-    """What a shard comes to that cannot be made: nothing; the cells that need it make it themselves, or fail by themselves."""
+    """What a shard comes to that cannot be made: nothing; the cells that need it make it themselves, or fail."""
     return Done((), f"left out: {why}", 0.0)
 
 
@@ -124,25 +152,39 @@ def _simulate(bank: Bank, blocks: list[tuple[int, int]]) -> Done:
 
 
 def cost(folder: Path, key: str) -> float:
-    """CPU seconds that the bank ``key`` took, as far as its shards are in ``folder``."""
+    """CPU seconds that a bank took, as far as its shards are there.
+
+    Args:
+        folder: of all banks.
+        key: the bank's name.
+    """
     return float(
         sum(json.loads(p.read_text(encoding="utf-8"))["cpu_seconds"] for p in (folder / key).glob("shard-*.json"))
     )
 
 
 def verify(bank: Bank, budget: int, folder: Path, again: int = 1) -> list[str]:
-    """What is wrong with the first ``budget`` rows in ``folder``/simulations: blocks that are missing, broken or hold other theta than
-    the seed gives, and of the first ``again`` rows of each block those that come out otherwise when they are simulated again."""
+    """What is wrong with the first rows of a bank.
+
+    Args:
+        bank: which.
+        budget: rows.
+        folder: of results.
+        again: rows of each block that are simulated again and compared.
+
+    Returns:
+        A line for each block that is missing, broken, holds other theta than the seed gives, or comes out otherwise.
+    """
     blocks, wrong = _opened(bank, folder / FOLDER), []
     for number, start in enumerate(range(0, budget, BLOCK)):
-        found = blocks._read(number)
+        kept = blocks._read(number)
         name, want = blocks.path(number), min(BLOCK, budget - start)
-        if found is None or len(found) < want:
-            wrong.append(f"{name}: holds {0 if found is None else len(found)} of {want} simulations; simulate again")
-        elif not np.array_equal(found.theta, blocks.drawn(number)[: len(found)]):
+        if kept is None or len(kept) < want:
+            wrong.append(f"{name}: holds {0 if kept is None else len(kept)} of {want} simulations; simulate again")
+        elif not np.array_equal(kept.theta, blocks.drawn(number)[: len(kept)]):
             wrong.append(f"{name}: its theta are not those of seed {bank.seed}; delete it and simulate again")
         else:
-            made = blocks.simulate(found.theta[:again])
-            if not np.array_equal(made.observations, found.observations[:again], equal_nan=True):
+            made = blocks.simulate(kept.theta[:again])
+            if not np.array_equal(made.observations, kept.observations[:again], equal_nan=True):
                 wrong.append(f"{name}: comes out otherwise here; delete it, or simulate on one kind of processor")
     return wrong

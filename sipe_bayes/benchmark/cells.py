@@ -1,25 +1,32 @@
 """Cells: what the benchmark measures, one estimate each, and the suites made of them.
 
 The benchmark of B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators"
-(https://arxiv.org/abs/2011.08985): an estimator gets trajectories of an environment whose theta is hidden. Its settings:
+(https://arxiv.org/abs/2011.08985): an estimator gets trajectories of an environment whose theta is hidden. Its
+settings:
 
 - direct: one recorded trajectory; the estimator compares states;
 - learned_reward: as direct, but a discriminator's reward takes the place of the difference of states;
-- policy, policy_learned_reward: the trajectories come from an agent that is trained meanwhile (``rl.policy_in_the_loop``);
+- policy, policy_learned_reward: the trajectories come from an agent that is trained meanwhile
+  (``rl.policy_in_the_loop``);
 - gradient_steps: MAML with 0 to 10 of them at test time;
-- sweep: the grid of the paper's search over hyper-parameters, tuned by mean accuracy on validation trajectories of FetchPush and Relocate;
+- sweep: the grid of the paper's search over hyper-parameters, tuned by mean accuracy on validation trajectories of
+  FetchPush and Relocate;
 - rollouts: direct with other budgets, for accuracy against rollouts.
 
-Tasks and estimators come from their registries, and which settings an estimator has follows from its arguments: a new method is
-its file and one line. The prior, its mean and ``laplace`` on full states are cells of every suite: no table and no plot stands without
-them.
+Tasks and estimators come from their registries, and which settings an estimator has follows from its arguments: a new
+method is its file and one line. The prior, its mean and ``laplace`` on full states are cells of every suite: no table
+and no plot stands without them.
 
-Deviations. The paper sweeps and runs its ablation on unnamed variants; here they are the in-distribution one, as the default model
-lies at the centre of the range, where knowing nothing is a perfect guess. Its five environments with a policy are not all named;
-here they are one of each kind. Its search is taken as a full grid, without the combinations in which a value has no effect. The settings with a
-policy train the agents of ``benchmark.transfer``. The humanoid's and the hand's trajectories take 100 control steps, not 250 and 200:
-each costs about a millisecond of CPU, ten times a half-cheetah's, and the first 100 determine what all do (``benchmark.log``), but
-for Door's frame in one of the logs.
+Deviations:
+
+- The paper sweeps and runs its ablation on unnamed variants; here they are the in-distribution one, as the default
+  model lies at the centre of the range, where knowing nothing is a perfect guess.
+- Its five environments with a policy are not all named; here they are one of each kind.
+- Its search is taken as a full grid, without the combinations in which a value has no effect.
+- The settings with a policy train the agents of ``benchmark.transfer``.
+- The humanoid's and the hand's trajectories take 100 control steps, not 250 and 200: each costs about a millisecond of
+  CPU, ten times a half-cheetah's, and the first 100 determine what all do (``benchmark.log``), but for Door's frame in
+  one of the logs.
 """
 
 from __future__ import annotations
@@ -29,8 +36,6 @@ import fnmatch
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import Any
 
 from sipe_bayes.datasets.acting import Split
 from sipe_bayes.datasets.demonstrations import default_steps
@@ -45,11 +50,35 @@ REFERENCE = "laplace"
 _BESIDE = (REFERENCE, "npe")  # measured beside the paper's
 _WITH_POLICY = ("FetchPush", "Relocate", "Door", "HalfCheetahLinks", "HumanoidLinks")
 _TUNED_ON = ("FetchPush", "Relocate")
-_SEEDS = range(3)
-_GRADIENT_STEPS = range(11)
-_BUDGETS = (100, 300, 1000, 3000)
-_SHORT = {"HumanoidLinks": 100, "HumanoidJoints": 100, "Door": 100, "Relocate": 100}
-_GRIDS: dict[str, tuple[dict[str, Sequence[Any]], ...]] = {  # the paper's appendix
+_COSTLY = ("HumanoidLinks", "HumanoidJoints", "Door", "Relocate")
+
+Value = bool | int | float | str
+"""Of an estimator's argument, as JSON keeps it."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much the suites measure.
+
+    Args:
+        seeds: of estimators and trajectories.
+        gradient_steps: of MAML, at test time.
+        budgets: rollouts, of the setting of that name.
+        costly_steps: control steps of the humanoid's and the hand's trajectories.
+        quick_budget: rollouts of a cell of the suite "quick".
+        quick_steps: control steps of its trajectories.
+    """
+
+    seeds: Sequence[int] = range(3)
+    gradient_steps: Sequence[int] = range(11)
+    budgets: Sequence[int] = (100, 300, 1000, 3000)
+    costly_steps: int = 100
+    quick_budget: int = 200
+    quick_steps: int = 50
+
+
+SIZES = Sizes()
+GRIDS: dict[str, tuple[dict[str, Sequence[Value]], ...]] = {  # the paper's appendix
     "regression": ({"batch": (320, 160, 80, 40), "learning_rate": (0.001, 0.01, 0.05, 0.005)},),
     "bayesopt": (
         {"acquisition": ("upper_confidence_bound",), "kappa": (2.5, 5.0, 10.0, 1.0, 0.5)},
@@ -73,16 +102,27 @@ _GRIDS: dict[str, tuple[dict[str, Sequence[Any]], ...]] = {  # the paper's appen
 
 @dataclass(frozen=True)
 class Cell:
-    """One estimate. variant: of the environment whose theta is hidden; seed: of the estimator and the trajectory; values: what is set of
-    the estimator; budget: rollouts; steps: control steps of the trajectory, None for an episode or its first 250, the humanoid's and the hand's first 100;
-    training: control steps of the agent's training, of the settings with a policy."""
+    """One estimate.
+
+    Args:
+        task: of ``sipe envs``.
+        estimator: its name, or that of a baseline.
+        setting: see the module.
+        variant: of the environment whose theta is hidden.
+        seed: of the estimator and the trajectory.
+        values: what is set of the estimator.
+        budget: rollouts.
+        steps: control steps of the trajectory; None for an episode or its first 250, the humanoid's and the hand's
+            first 100.
+        training: control steps of the agent's training, of the settings with a policy.
+    """
 
     task: str
     estimator: str
     setting: str = "direct"
     variant: Variant = "in_distribution"
     seed: int = 0
-    values: tuple[tuple[str, Any], ...] = ()
+    values: tuple[tuple[str, Value], ...] = ()
     budget: int = 1000
     steps: int | None = None
     training: int = 100_000
@@ -90,10 +130,11 @@ class Cell:
     @property
     def id(self) -> str:
         """Such as ``HalfCheetahLinks/bayessim/direct/in_distribution/seed0``."""
-        return f"{self.task}/{self.estimator}/{self._labelled}/{self.variant}/seed{self.seed}"
+        return f"{self.task}/{self.estimator}/{self.label}/{self.variant}/seed{self.seed}"
 
     @property
-    def _labelled(self) -> str:
+    def label(self) -> str:
+        """The setting with what is set of the estimator."""
         if self.setting == "gradient_steps":
             return f"gradient_steps={dict(self.values)['gradient_steps']}"
         if self.setting == "rollouts":
@@ -105,11 +146,12 @@ class Cell:
         """Control steps of the trajectory."""
         task = make_task(self.task)
         if self.steps is None:
-            return _SHORT.get(self.task, default_steps(task))
+            return SIZES.costly_steps if self.task in _COSTLY else default_steps(task)
         return min(self.steps, task.episode_steps)
 
     @property
     def with_policy(self) -> bool:
+        """Whether an agent is trained meanwhile."""
         return self.setting.startswith("policy")
 
     @property
@@ -118,29 +160,31 @@ class Cell:
         return "validation" if self.setting == "sweep" else "reference"
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Value]:
         """Arguments of the estimator."""
-        learned = {"reward": "learned"} if self.setting.endswith("learned_reward") else {}
+        learned: dict[str, Value] = {"reward": "learned"} if self.setting.endswith("learned_reward") else {}
         return {**learned, **dict(self.values)}
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Cells under one name."""
+    """Cells under one name, and what they are."""
 
     about: str
     cells: Callable[[], Iterator[Cell]]
 
 
-@cache
-def has(estimator: str, argument: str) -> bool:
-    """Whether an estimator takes an argument."""
-    return argument in arguments(estimator)
-
-
 def direct(
-    tasks: Iterable[str], estimators: Iterable[str], variants: Iterable[Variant], seeds: Iterable[int] = _SEEDS
+    tasks: Iterable[str], estimators: Iterable[str], variants: Iterable[Variant], seeds: Iterable[int] = SIZES.seeds
 ) -> Iterator[Cell]:
+    """Cells of the direct setting.
+
+    Args:
+        tasks: which environments.
+        estimators: which methods and baselines.
+        variants: of the environments.
+        seeds: which.
+    """
     for task, variant, seed, estimator in itertools.product(tasks, variants, seeds, list(estimators)):
         yield Cell(task, estimator, "direct", variant, seed)
 
@@ -154,40 +198,55 @@ def referenced(cells: Iterable[Cell]) -> Iterator[Cell]:
 
 
 def learned(tasks: Iterable[str], estimators: Iterable[str], setting: str = "learned_reward") -> Iterator[Cell]:
-    chosen = [name for name in estimators if has(name, "reward")]
-    for task, seed, estimator in itertools.product(tasks, _SEEDS, chosen):
+    """Cells of those estimators that can learn a reward.
+
+    Args:
+        tasks: which environments.
+        estimators: which methods.
+        setting: with a policy or without.
+    """
+    chosen = [name for name in estimators if "reward" in arguments(name)]
+    for task, seed, estimator in itertools.product(tasks, SIZES.seeds, chosen):
         yield Cell(task, estimator, setting, seed=seed)
 
 
 def gradient_steps(tasks: Iterable[str]) -> Iterator[Cell]:
-    chosen = [name for name in ESTIMATORS if has(name, "gradient_steps")]
-    for task, seed, estimator, steps in itertools.product(tasks, _SEEDS, chosen, _GRADIENT_STEPS):
+    """Cells of those estimators that take gradient steps at test time."""
+    chosen = [name for name in ESTIMATORS if "gradient_steps" in arguments(name)]
+    for task, seed, estimator, steps in itertools.product(tasks, SIZES.seeds, chosen, SIZES.gradient_steps):
         yield Cell(task, estimator, "gradient_steps", seed=seed, values=(("gradient_steps", steps),))
 
 
 def policy(tasks: Iterable[str], estimators: Iterable[str]) -> Iterator[Cell]:
-    for task, seed, estimator in itertools.product(tasks, _SEEDS, list(estimators)):
+    """Cells in which an agent is trained meanwhile.
+
+    Args:
+        tasks: which environments.
+        estimators: which methods.
+    """
+    for task, seed, estimator in itertools.product(tasks, SIZES.seeds, list(estimators)):
         yield Cell(task, estimator, "policy", seed=seed)
 
 
 def sweep() -> Iterator[Cell]:
-    for task, seed, (estimator, grids) in itertools.product(_TUNED_ON, _SEEDS, _GRIDS.items()):
+    """Cells of the search over hyper-parameters."""
+    for task, seed, (estimator, grids) in itertools.product(_TUNED_ON, SIZES.seeds, GRIDS.items()):
         for grid in grids:
             for values in itertools.product(*grid.values()):
                 yield Cell(task, estimator, "sweep", seed=seed, values=tuple(zip(grid, values, strict=True)))
 
 
 def rollouts() -> Iterator[Cell]:
-    for task, seed, estimator, budget in itertools.product(
-        ("FetchPush", "HalfCheetahLinks"), _SEEDS, ESTIMATORS, _BUDGETS
-    ):
+    """Cells of every estimator with several budgets."""
+    tasks = ("FetchPush", "HalfCheetahLinks")
+    for task, seed, estimator, budget in itertools.product(tasks, SIZES.seeds, ESTIMATORS, SIZES.budgets):
         yield Cell(task, estimator, "rollouts", seed=seed, budget=budget)
 
 
 def _quick() -> Iterator[Cell]:
     chosen = (*BASELINES, "laplace", "npe", "bayessim", "regression", "simopt", "adr")
     for cell in direct(("FetchPush", "Door", "HalfCheetahLinks"), chosen, ("in_distribution",), (0,)):
-        yield replace(cell, budget=200, steps=50)
+        yield replace(cell, budget=SIZES.quick_budget, steps=SIZES.quick_steps)
 
 
 def _direct_suite() -> Iterator[Cell]:
@@ -239,22 +298,48 @@ SUITES = {
 
 
 def suite(name: str, suites: Mapping[str, Suite] = SUITES) -> list[Cell]:
-    """The cells of a suite; raises ValueError for an unknown one."""
+    """The cells of a suite.
+
+    Args:
+        name: of the suite.
+        suites: those there are.
+
+    Raises:
+        ValueError: for an unknown one.
+    """
     if name not in suites:
         raise ValueError(f"--suite {name}: expected one of {', '.join(suites)}")
     return list(suites[name].cells())
 
 
 def select(name: str, patterns: Sequence[str] = ()) -> list[Cell]:
-    """The cells of a suite whose id matches one of the patterns, all without any; raises ValueError for a pattern that matches none.
+    """The cells of a suite whose id matches one of the patterns.
 
-    A pattern is a shell's (``half_cheetah*/adr/*``); capitals and underscores do not count, and it may stop at any ``/``."""
+    A pattern is a shell's (``half_cheetah*/adr/*``); capitals and underscores do not count, and it may stop at any
+    ``/``.
+
+    Args:
+        name: of the suite.
+        patterns: none for all cells.
+
+    Raises:
+        ValueError: for an unknown suite, and for a pattern that matches none.
+    """
     cells = suite(name)
     return matching(cells, patterns, lambda pattern: _no_match(name, cells, pattern))
 
 
 def matching(cells: list[Cell], patterns: Sequence[str], no_match: Callable[[str], str]) -> list[Cell]:
-    """Cells whose id matches one of the patterns, all without any; no_match: what the ValueError says of one that matches none."""
+    """Cells whose id matches one of the patterns.
+
+    Args:
+        cells: to choose from.
+        patterns: none for all cells.
+        no_match: what is said of a pattern that matches none.
+
+    Raises:
+        ValueError: for such a pattern.
+    """
     for pattern in patterns:
         if not any(matches(cell.id, pattern) for cell in cells):
             raise ValueError(f"--select {pattern}: {no_match(pattern)}")
@@ -262,8 +347,36 @@ def matching(cells: list[Cell], patterns: Sequence[str], no_match: Callable[[str
 
 
 def matches(cell_id: str, pattern: str) -> bool:
+    """Whether a cell's id matches a pattern of ``select``.
+
+    Args:
+        cell_id: the id.
+        pattern: the pattern.
+    """
     plain, wanted = _plain(cell_id), _plain(pattern).rstrip("/")
     return fnmatch.fnmatchcase(plain, wanted) or fnmatch.fnmatchcase(plain, wanted + "/*")
+
+
+def changed(
+    cells: Sequence[Cell], budget: int | None = None, steps: int | None = None, training: int | None = None
+) -> list[Cell]:
+    """Cells with another budget, length or training, where one is given.
+
+    Args:
+        cells: which cells.
+        budget: rollouts.
+        steps: control steps of the trajectory.
+        training: control steps of the agent's training.
+    """
+    return [
+        replace(
+            cell,
+            budget=cell.budget if budget is None else budget,
+            steps=cell.steps if steps is None else steps,
+            training=cell.training if training is None else training,
+        )
+        for cell in cells
+    ]
 
 
 def _plain(text: str) -> str:

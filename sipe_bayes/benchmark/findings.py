@@ -1,17 +1,17 @@
-"""What records and tables say, in words: the facts of a run, and sentences that hold outside noise or say that they do not."""
+"""What records and tables say, in words: the facts of a run, and sentences that hold outside noise or say so."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from sipe_bayes.benchmark.cells import BASELINES, SUITES, suite
+from sipe_bayes.benchmark.cells import BASELINES, REFERENCE, SUITES, suite
 from sipe_bayes.benchmark.records import Record, mixed
-from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, suite_of, together
+from sipe_bayes.benchmark.run_log import Run, Usage, by_suite, cpu_time, duration, percent, suite_of
 from sipe_bayes.benchmark.tables import (
     ALL,
     MEASURES,
@@ -19,19 +19,30 @@ from sipe_bayes.benchmark.tables import (
     Entry,
     Table,
     against,
+    best_of,
     competes,
     differ,
     order_estimators,
     order_tasks,
+    over_tasks,
 )
+from sipe_bayes.inference.registry import arguments
 
 # What was run
 
 
-def facts(records: Sequence[Record], runs: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """(label, text): what was run, on what, in how much time."""
+def facts(records: Sequence[Record], runs: Sequence[Run]) -> list[tuple[str, str]]:
+    """What was run, on what, in how much time.
+
+    Args:
+        records: of a folder.
+        runs: that made them.
+
+    Returns:
+        Labels and texts.
+    """
     estimators = order_estimators({r.estimator for r in records})
-    found = [
+    labelled = [
         ("environments", ", ".join(order_tasks({r.task for r in records}))),
         ("estimators", ", ".join(e for e in estimators if e not in BASELINES)),
         ("baselines", ", ".join(e for e in estimators if e in BASELINES) or "none was run: no figure shows the prior"),
@@ -51,7 +62,7 @@ def facts(records: Sequence[Record], runs: Sequence[dict[str, Any]]) -> list[tup
         ("not comparable", ", ".join(f"{group}: its cells were given different logs" for group in mixed(records))),
         ("commands", _commands(records)),
     ]
-    return [(label, text) for label, text in found if text]
+    return [(label, text) for label, text in labelled if text]
 
 
 def _suites(records: Sequence[Record]) -> str:
@@ -63,27 +74,25 @@ def _suites(records: Sequence[Record]) -> str:
         for name in SUITES
         if name in asked - {"all"}
     }
-    found = ", ".join(f"{name} {len(done & cells):,} of {len(cells):,}" for name, cells in counts.items())
-    return f"{found}, each in its own sizes" if found else ""
+    shares = ", ".join(f"{name} {len(done & cells):,} of {len(cells):,}" for name, cells in counts.items())
+    return f"{shares}, each in its own sizes" if shares else ""
 
 
-def _wall_time(runs: Sequence[dict[str, Any]]) -> str:
+def _wall_time(runs: Sequence[Run]) -> str:
     """Of all runs, as far as ``runs.json`` has them."""
     if not runs:
         return ""
-    every = together(runs)
-    parts = ", ".join(f"{name} {duration(row['seconds'])}" for name, row in by_suite(runs).items())
-    text = (
-        f"{duration(every['seconds'])} on {every['workers']} cores, cells that were measured again included ({parts})"
-    )
-    share = every["cpu_use_simulating"]
+    every = Usage.of(runs)
+    parts = ", ".join(f"{name} {duration(usage.seconds)}" for name, usage in by_suite(runs).items())
+    text = f"{duration(every.seconds)} on {every.workers} cores, cells that were measured again included ({parts})"
+    share = every.cpu_use_simulating
     return text if share is None else f"{text}; CPU use {percent(share)} while simulating"
 
 
 def _sources(records: Sequence[Record]) -> str:
     """Where several states of the package's code made the records; older records do not say by which they were made."""
-    found = Counter(r.checksums.get("source", "not kept") for r in records if r.done)
-    return ", ".join(f"{name} ({count:,} cells)" for name, count in found.most_common()) if len(found) > 1 else ""
+    states = Counter(r.checksums.get("source", "not kept") for r in records if r.done)
+    return ", ".join(f"{name} ({count:,} cells)" for name, count in states.most_common()) if len(states) > 1 else ""
 
 
 def _commands(records: Sequence[Record]) -> str:
@@ -129,17 +138,17 @@ def unequal(records: Sequence[Record]) -> str:
     mine = [r for r in records if r.estimator not in BASELINES]
     budgets = sorted({r.budget for r in mine})
     lengths = [t for t in order_tasks({r.task for r in mine}) if len({r.steps for r in mine if r.task == t}) > 1]
-    found = []
+    sentences = []
     if len(budgets) > 1:
-        found.append(f"budgets differ ({_numbers(budgets)} rollouts)")
+        sentences.append(f"budgets differ ({_numbers(budgets)} rollouts)")
     if lengths:
-        found.append(f"trajectories differ in length on {', '.join(lengths)}")
-    return f"The rows do not compare: {' and '.join(found)}." if found else ""
+        sentences.append(f"trajectories differ in length on {', '.join(lengths)}")
+    return f"The rows do not compare: {' and '.join(sentences)}." if sentences else ""
 
 
 def table_findings(tables: Sequence[Table]) -> list[str]:
     """What the tables say, over all environments where they are complete."""
-    found = []
+    sentences = []
     for table in tables:
         if table.measure.name not in ("accuracy", "CRPS skill", "CRPS"):
             continue
@@ -152,18 +161,20 @@ def table_findings(tables: Sequence[Table]) -> list[str]:
         first = max(mine, key=lambda name: sign * mine[name].mean)
         where = "over all environments" if column == ALL else f"on {column}"
         if all(len(entry.values) < 2 for entry in mine.values()):
-            found.append(f"Best {table.measure.name} {where}: {first}, {text(mine[first])}; one seed tells no more.")
+            sentences.append(
+                f"Best {table.measure.name} {where}: {first}, {text(mine[first])}; one seed tells no more."
+            )
             continue
         noise = (
             "ahead of every other outside noise"
             if mine[first].best
             else "not ahead of every other and of the baselines outside noise"
         )
-        found.append(f"Best {table.measure.name} {where}: {first}, {text(mine[first])}; {noise}.")
+        sentences.append(f"Best {table.measure.name} {where}: {first}, {text(mine[first])}; {noise}.")
         reference = "prior_mean" if table.measure.name == "accuracy" else "prior"
         if reference in rows:
-            found.append(_against(table.measure.name, sign, reference, rows[reference].mean, mine))
-    return found
+            sentences.append(_against(table.measure.name, sign, reference, rows[reference].mean, mine))
+    return sentences
 
 
 def _against(measure: str, sign: int, reference: str, level: float, mine: dict[str, Entry]) -> str:
@@ -177,47 +188,111 @@ def _against(measure: str, sign: int, reference: str, level: float, mine: dict[s
 
 
 def pair_findings(left: Sequence[Record], right: Sequence[Record], labels: tuple[str, str]) -> list[str]:
-    """For each estimator what a setting gains in mean accuracy over another, paired by environment and seed; its error and the test
-    are over the seeds that have every shared environment in both."""
-    found = []
+    """For each estimator what a setting gains in mean accuracy over another, paired by environment and seed.
+
+    The gain's error and its test are over the seeds that have every shared environment in both.
+
+    Args:
+        left: of one setting.
+        right: of the other.
+        labels: their names.
+    """
+    sentences = []
     for estimator in order_estimators({r.estimator for r in right}):
         one, two = (
-            {(r.task, r.seed): float(r.scores["mean_accuracy"]) for r in rows if r.estimator == estimator}
+            {(r.task, r.seed): r.scored.mean_accuracy for r in rows if r.estimator == estimator}
             for rows in (left, right)
         )
         tasks = order_tasks({task for task, _ in one.keys() & two.keys()})
         seeds = sorted({seed for _, seed in two if all((t, seed) in one and (t, seed) in two for t in tasks)})
         if not seeds:
-            found.append(
-                f"{estimator}: no seed has every environment with {labels[0]} and with {labels[1]}; nothing is compared."
+            sentences.append(
+                f"{estimator}: no seed has every environment with {labels[0]} and with {labels[1]}; nothing is "
+                "compared."
             )
             continue
         gains = {t: [two[t, s] - one[t, s] for s in seeds] for t in tasks}
         over = tuple(float(np.mean([gains[t][k] for t in tasks])) for k in range(len(seeds)))
         verdict = {1: "a gain outside noise", -1: "a loss outside noise", 0: "not told from none"}[against(over, 0.0)]
         ahead = sum(float(np.mean(g)) > 0 for g in gains.values())
-        found.append(
-            f"{estimator}: mean accuracy with {labels[1]} less that with {labels[0]} is {text(Entry(over, 3))}, {verdict}; "
-            f"it is positive on {ahead} of {len(tasks)} environments."
+        sentences.append(
+            f"{estimator}: mean accuracy with {labels[1]} less that with {labels[0]} is {text(Entry(over, 3))}, "
+            f"{verdict}; it is positive on {ahead} of {len(tasks)} environments."
         )
-    return found
+    return sentences
 
 
-def sweep_findings(rows: Sequence[tuple[str, str, Entry, bool]]) -> list[str]:
+# The search over hyper-parameters
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Values that the search over hyper-parameters tried.
+
+    Args:
+        estimator: whose.
+        values: in words; empty for what is held against them.
+        entry: mean accuracy over the tasks that it was tuned on.
+        default: whether these are the library's defaults.
+    """
+
+    estimator: str
+    values: str
+    entry: Entry
+    default: bool
+
+
+def sweep_rows(records: Sequence[Record]) -> list[Tried]:
+    """The search over hyper-parameters by estimator, the best values first.
+
+    Only combinations that were run on every task and seed of the search are comparable. Last, without values, come the
+    baselines and ``laplace`` in the direct setting.
+    """
+    tried: dict[tuple[str, str], dict[str, dict[int, float]]] = {}
+    ours: dict[tuple[str, str], bool] = {}
+    tuned = {record.task for record in records if record.setting == "sweep"}
+    for record in records:
+        searched = record.setting == "sweep"
+        where = (record.setting, record.variant) == ("direct", "in_distribution")
+        beside = where and record.estimator in (*BASELINES, REFERENCE) and record.task in tuned
+        if not record.done or not (searched or beside):
+            continue
+        values = ", ".join(f"{k} = {v}" for k, v in record.values.items())
+        key = (record.estimator if searched else f"{record.estimator}, direct", values)
+        tried.setdefault(key, {}).setdefault(record.task, {})[record.seed] = record.scored.mean_accuracy
+        ours[key] = searched and _are_defaults(record)
+    rows = []
+    for estimator in order_estimators({e for e, _ in tried}):
+        mine = {key: row for key, row in tried.items() if key[0] == estimator}
+        values_of = {key[1]: over for key, row in mine.items() if (over := over_tasks(row, sorted(tuned)))}
+        best = best_of(values_of, 1)
+        ranked = sorted(values_of, key=lambda v: -float(np.mean(values_of[v])))
+        rows += [Tried(estimator, v, Entry(values_of[v], 3, v == best), ours[estimator, v]) for v in ranked]
+    return rows
+
+
+def _are_defaults(record: Record) -> bool:
+    """Whether a cell sets its estimator's arguments to what they are by default."""
+    taken = arguments(record.estimator)
+    return all(name in taken and taken[name].default == value for name, value in record.values.items())
+
+
+def sweep_findings(rows: Sequence[Tried]) -> list[str]:
     """Whether the search over hyper-parameters chooses the defaults."""
-    found = []
-    for estimator in dict.fromkeys(row[0] for row in rows):
-        mine = [row for row in rows if row[0] == estimator]
-        defaults, first = next((row for row in mine if row[3]), None), mine[0]
-        if first[3]:
-            found.append(f"{estimator}: the search chooses the defaults, {first[1]}.")
+    sentences = []
+    for estimator in dict.fromkeys(row.estimator for row in rows):
+        mine = [row for row in rows if row.estimator == estimator]
+        defaults, first = next((row for row in mine if row.default), None), mine[0]
+        if first.default:
+            sentences.append(f"{estimator}: the search chooses the defaults, {first.values}.")
         elif defaults is not None:
-            told = "outside noise" if differ(first[2].values, defaults[2].values) else "within noise"
-            found.append(
-                f"{estimator}: the search would choose {first[1]} ({text(first[2])}), the best of {len(mine)}, and not the defaults, "
-                f"{defaults[1]} ({text(defaults[2])}); they differ {told}, of which being the best of so many takes a part."
+            outside = "outside noise" if differ(first.entry.values, defaults.entry.values) else "within noise"
+            sentences.append(
+                f"{estimator}: the search would choose {first.values} ({text(first.entry)}), the best of {len(mine)}, "
+                f"and not the defaults, {defaults.values} ({text(defaults.entry)}); they differ {outside}, of which "
+                "being the best of so many takes a part."
             )
-    return found
+    return sentences
 
 
 def text(entry: Entry) -> str:

@@ -1,10 +1,11 @@
 """The recorded trajectory that a cell of the benchmark is given, and which parameters it determines.
 
-A trajectory is what ``sipe.demonstrations`` gives: an expert's, or an excitation policy's where no expert is installed; noise-free,
-with recorded states. It depends on task, variant, seed, length and split alone, so every estimator gets the same one.
+A trajectory is what ``sipe.demonstrations`` gives: an expert's, or an excitation policy's where no expert is installed;
+noise-free, with recorded states. It depends on task, variant, seed, length and split alone, so every estimator gets the
+same one.
 
-A parameter counts as determined where the Fisher information of the trajectory's control steps at the truth, under noise of 0.1 % of
-each channel's spread, leaves less than half of the prior's sd, whatever the methods say.
+A parameter counts as determined where the Fisher information of the trajectory's control steps at the truth, under
+noise of 0.1 % of each channel's spread, leaves less than half of the prior's sd, whatever the methods say.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import Split
 from sipe_bayes.datasets.demonstrations import demonstrations
@@ -26,38 +27,44 @@ from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
-
-_NOISE = 1e-3  # of a channel's spread
-_DETERMINED = 0.5  # of the prior's sd
-
 
 @dataclass(frozen=True)
 class Log:
-    """truth (N,): theta; trajectories: one; determined (N,), None out of distribution; source: "expert" or "excitation"."""
+    """What a cell is given, and what it is scored by.
+
+    Args:
+        truth: theta (N,).
+        trajectories: one.
+        determined: (N,); None out of distribution.
+        source: "expert" or "excitation".
+    """
 
     truth: FloatArray
     trajectories: Trajectories
-    determined: NDArray[np.bool_] | None
+    determined: BoolArray | None
     source: str
-
-    @property
-    def steps(self) -> int:
-        return self.trajectories.actions.shape[1]
 
 
 @lru_cache(maxsize=4)
 def recorded(task: str, variant: Variant, seed: int, steps: int, split: Split = "reference") -> Log:
-    """The log of a task's variant."""
+    """The log of a task's variant.
+
+    Args:
+        task: of ``sipe envs``.
+        variant: whose theta is the truth.
+        seed: of the trajectory.
+        steps: its control steps.
+        split: of the trajectories.
+    """
     made = make_task(task)
     simulator = Simulator(made, num_threads=1)
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = demonstrations(simulator, split=split, variant=variant, count=1, seed=seed, steps=steps)
-    source = "excitation" if any("excitation" in str(w.message) for w in said) else "expert"
+        trajectories = demonstrations(simulator, split=split, variant=variant, count=1, seed=seed, steps=steps)
+    source = "excitation" if any("excitation" in str(w.message) for w in caught) else "expert"
     truth = made.theta(variant)
     inside = bool(((truth >= 0) & (truth <= 1)).all())
-    return Log(truth, found, determined(simulator, truth, found) if inside else None, source)
+    return Log(truth, trajectories, determined(simulator, truth, trajectories) if inside else None, source)
 
 
 def one_step(simulator: Simulator) -> Segments:
@@ -65,14 +72,24 @@ def one_step(simulator: Simulator) -> Segments:
     return Segments(simulator.dt, noise="white", starts="recorded")
 
 
-def determined(simulator: Simulator, truth: FloatArray, trajectories: Trajectories) -> NDArray[np.bool_]:
-    """Which parameters (N,) the trajectories determine; see the module's docstring."""
+def determined(
+    simulator: Simulator, truth: FloatArray, trajectories: Trajectories, noise: float = 1e-3, share: float = 0.5
+) -> BoolArray:
+    """Which parameters (N,) trajectories determine; see the module.
+
+    Args:
+        simulator: of the task.
+        truth: theta (N,).
+        trajectories: with recorded states.
+        noise: sd, as a share of each channel's spread.
+        share: of the prior's sd, below which a parameter counts as determined.
+    """
     windows = bind(one_step(simulator), simulator, trajectories)
     jacobian = windows.linearise(truth, windows.no_starts()).jacobian
     spread = np.concatenate([t.observations for t in trajectories]).std(0)
-    sd = _NOISE * np.maximum(spread, _NOISE * np.median(spread[spread > 0]))
+    sd = noise * np.maximum(spread, noise * np.median(spread[spread > 0]))
     rows = (jacobian / sd[:, None]).reshape(-1, len(truth))
     before = prior(simulator.space)
     information = rows.T @ rows + np.diag(1 / before.variance.numpy())
     left = np.sqrt(np.diag(np.linalg.inv(information)))
-    return np.asarray(left < _DETERMINED * before.stddev.numpy())
+    return np.asarray(left < share * before.stddev.numpy())

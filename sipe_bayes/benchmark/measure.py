@@ -1,12 +1,9 @@
-"""Measuring one cell: its log, its estimate, its scores, its record."""
+"""Measuring one cell of the benchmark: its log, its estimate, its scores, its record."""
 
 from __future__ import annotations
 
 import tempfile
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +12,9 @@ import torch
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
-from sipe_bayes.benchmark.executors.work import Done
-from sipe_bayes.benchmark.frame import Files, blank, failed, measured
 from sipe_bayes.benchmark.log import Log, one_step, recorded
-from sipe_bayes.benchmark.records import Record, file_name, posterior_path
+from sipe_bayes.benchmark.measurement import POLICIES, Clock, Files, Measurement, entries
+from sipe_bayes.benchmark.records import Look, Record, file_name, posterior_path
 from sipe_bayes.core.findings import Findings
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.envs.registry import make_task
@@ -29,137 +25,137 @@ from sipe_bayes.inference.registry import estimator_class, get_estimator
 from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.simulation.simulator import Simulator
 
-POLICIES, CHECKPOINTS = "policies", "checkpoint"  # a checkpoint holds a replay buffer, which nothing needs at the end
-_ALONG = (0.1, 0.25, 0.5)  # of the budget, where the history looks at an estimate
-_CANDIDATES = 0.1  # of the budget: starting points of the methods that search a likelihood
+
+@dataclass(frozen=True)
+class Shares:
+    """Of an estimator's budget.
+
+    Args:
+        looks: where the history looks at an estimate.
+        candidates: starting points of the methods that search a likelihood.
+    """
+
+    looks: tuple[float, ...] = (0.1, 0.25, 0.5)
+    candidates: float = 0.1
+
+
+SHARES = Shares()
 
 
 @dataclass(frozen=True)
-class _Found:
-    """An estimate, what it cost and what was said; more: entries of the record."""
+class _Estimate:
+    """A posterior, what it cost, what was found on the way; the rest as of ``Record``."""
 
     posterior: Posterior
-    seconds: float | None
-    cpu_seconds: float | None
-    rollouts: int
-    warnings: list[str]
-    history: list[dict[str, Any]]
-    more: dict[str, Any]
+    seconds: float | None = 0.0
+    cpu_seconds: float | None = 0.0
+    rollouts: int = 0
+    warnings: list[str] = field(default_factory=list)
+    history: list[Look] = field(default_factory=list)
+    simulation_cpu_seconds: float = 0.0
+    converged: bool | None = None
+    solved_reference: bool | None = None
 
 
-def run(cell: Cell, folder: Path, command: str) -> Done:
-    """Measure a cell. folder: of the results; read for simulations, and a training's checkpoints are kept in it. Where it is not there,
-    as this is another machine, the cell makes what it needs for itself."""
-    with at_hand(folder) as here:
-        spent = f"{POLICIES}/{file_name(cell.id)}/{CHECKPOINTS}" if cell.with_policy else ""
-        return measured(blank_record(cell, command), lambda record: _measured(cell, record, here), spent)
+class EstimateMeasurement(Measurement[Record]):
+    """An estimator on the recorded trajectory of its cell, or on those of an agent that is trained meanwhile."""
+
+    record_type = Record
+
+    def blank(self, cell: Cell, command: str = "") -> Record:
+        """See ``Measurement``."""
+        about: Any = entries(cell, command)
+        if not cell.with_policy:
+            return Record(**about)
+        from sipe_bayes.benchmark.transfer.study import agent_of
+
+        return Record(**about, training=cell.training, agent=agent_of(cell).deviations())
+
+    def trained_in(self, cell: Cell) -> str:
+        """See ``Measurement``."""
+        return f"{POLICIES}/{file_name(cell.id)}" if cell.with_policy else ""
+
+    def measured(self, cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, str]:
+        """See ``Measurement``."""
+        log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
+        simulator = Simulator(make_task(cell.task), num_threads=1)
+        if cell.estimator in BASELINES:
+            estimate = _baseline(cell, simulator)
+        elif cell.with_policy:
+            estimate = _with_policy(cell, simulator, folder / self.trained_in(cell))
+        else:
+            estimate = _estimated(cell, simulator, log, folder)
+        posterior = estimate.posterior
+        scores = score(posterior, log.truth)
+        before = [look for look in estimate.history if look.rollouts < estimate.rollouts]
+        record = replace(
+            record,
+            **{k: v for k, v in vars(estimate).items() if k not in ("posterior", "history")},
+            history=[*before, Look(estimate.rollouts, scores.mean_accuracy, scores.mean_crps)],
+            names=list(simulator.space.names),
+            truth=log.truth.tolist(),
+            mean=posterior.mean.tolist(),
+            sd=posterior.stddev.tolist(),
+            scores=scores,
+            determined=None if log.determined is None or cell.with_policy else log.determined.tolist(),
+            log="policy" if cell.with_policy else log.source,
+            checksums={**record.checksums, "model": simulator.checksum(), "log": digest(log.trajectories)},
+        )
+        line = f"accuracy {scores.mean_accuracy:.3f}, CRPS {scores.mean_crps:.3f}"
+        line += "" if estimate.seconds is None else f", {estimate.seconds:.1f} s"
+        return record, ((str(posterior_path(Path(), cell.id)), netcdf(posterior, cell.seed)),), line
 
 
-@contextmanager
-def at_hand(folder: Path) -> Iterator[Path]:
-    """The folder, or where it is not there an empty one for the time being."""
-    if folder.is_dir():
-        yield folder
-    else:
-        with tempfile.TemporaryDirectory() as instead:
-            yield Path(instead)
+ESTIMATES = EstimateMeasurement()
 
 
-def died(cell: Cell, folder: Path, command: str, why: str) -> Done:
-    """What a cell comes to whose process does not live to tell."""
-    return failed(blank_record(cell, command), why)
-
-
-def blank_record(cell: Cell, command: str) -> Record:
-    """A cell's record before it is measured."""
-    if not cell.with_policy:
-        return blank(Record, cell, command)
-    from sipe_bayes.benchmark.transfer.study import agent_of
-
-    return blank(Record, cell, command, training=cell.training, agent=agent_of(cell).deviations())
-
-
-def _measured(cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, str]:
-    task = make_task(cell.task)
-    log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
-    simulator = Simulator(task, num_threads=1)
-    if cell.estimator in BASELINES:
-        found = _baseline(cell, simulator)
-    elif cell.with_policy:
-        found = _with_policy(cell, simulator, folder)
-    else:
-        found = _estimated(cell, simulator, log, folder)
-    posterior = found.posterior
-    scores = score(posterior, log.truth)
-    last = {"rollouts": found.rollouts, "mean_accuracy": scores.mean_accuracy, "mean_crps": scores.mean_crps}
-    rows = [row for row in found.history if row["rollouts"] < found.rollouts]
-    record = replace(
-        record,
-        seconds=found.seconds,
-        cpu_seconds=found.cpu_seconds,
-        rollouts=found.rollouts,
-        warnings=found.warnings,
-        names=list(simulator.space.names),
-        truth=log.truth.tolist(),
-        mean=posterior.mean.tolist(),
-        sd=posterior.stddev.tolist(),
-        scores=scores.to_dict(),
-        determined=None if log.determined is None or cell.with_policy else log.determined.tolist(),
-        history=[*rows, last],
-        log="policy" if cell.with_policy else log.source,
-        checksums={**record.checksums, "model": simulator.checksum(), "log": digest(log.trajectories)},
-        **found.more,
-    )
-    line = f"accuracy {scores.mean_accuracy:.3f}, CRPS {scores.mean_crps:.3f}"
-    line += "" if found.seconds is None else f", {found.seconds:.1f} s"
-    return record, ((str(posterior_path(Path(), cell.id)), _netcdf(posterior, cell.seed)),), line
-
-
-def _baseline(cell: Cell, simulator: Simulator) -> _Found:
+def _baseline(cell: Cell, simulator: Simulator) -> _Estimate:
     space = simulator.space
-    posterior = prior(space) if cell.estimator == "prior" else Dirac(np.full(len(space), 0.5), space)
-    return _Found(posterior, 0.0, 0.0, 0, [], [], {})
+    return _Estimate(prior(space) if cell.estimator == "prior" else Dirac(np.full(len(space), 0.5), space))
 
 
-def _estimator(cell: Cell, simulator: Simulator, **settings: Any) -> Estimator:
+def _estimator(cell: Cell, simulator: Simulator, **settings: object) -> Estimator:
     if estimator_class(cell.estimator).searches:
-        settings.update(candidates=int(_CANDIDATES * cell.budget), likelihood=one_step(simulator))
-    return get_estimator(simulator, cell.estimator, budget=cell.budget, seed=cell.seed, **settings, **cell.settings)
+        settings |= {"candidates": int(SHARES.candidates * cell.budget), "likelihood": one_step(simulator)}
+    every: Any = {**settings, **cell.settings}
+    return get_estimator(simulator, cell.estimator, budget=cell.budget, seed=cell.seed, **every)
 
 
-def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Found:
+def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Estimate:
     """Step by step; the looks at the estimate along the way cost the method nothing and change nothing."""
     shares = issubclass(estimator_class(cell.estimator), PriorSampling)
     simulations = folder / bank.FOLDER
     estimator = _estimator(cell, simulator, **({"cache": simulations} if shares else {}))
-    clock, history = _Clock(), []
-    more: dict[str, Any] = {}
+    clock, history, simulated = Clock(), list[Look](), 0.0
     if isinstance(estimator, PriorSampling):
-        more["simulation_cpu_seconds"] = _simulated(estimator, cell, log, simulations)
-    looks = [] if shares else [share * cell.budget for share in _ALONG]
-    while not _over(estimator):
+        simulated = _simulated(estimator, cell, log, simulations)
+    looks = [] if shares else [share * cell.budget for share in SHARES.looks]
+    while not estimator.ended:
         clock.time(lambda: estimator.update_parameter_estimate(log.trajectories))
-        if looks and estimator.rollouts >= looks[0] and not _over(estimator):
+        if looks and estimator.rollouts >= looks[0] and not estimator.ended:
             looks = [share for share in looks if share > estimator.rollouts]
             history += _look(estimator, log)
     posterior = clock.time(lambda: estimator.get_parameter_estimate(log.trajectories))
-    said = list(estimator.warnings)
-    return _Found(posterior, clock.seconds, clock.cpu_seconds, estimator.rollouts, said, history, more)
+    return _Estimate(
+        posterior,
+        clock.seconds,
+        clock.cpu_seconds,
+        estimator.rollouts,
+        list(estimator.warnings),
+        history,
+        simulation_cpu_seconds=simulated,
+    )
 
 
 def _simulated(estimator: PriorSampling, cell: Cell, log: Log, folder: Path) -> float:
-    """See that the simulations which the method shares with others are there; the CPU seconds that they took, here or before."""
-    simulations, clock = estimator.prior_simulations(log.trajectories), _Clock()
+    """See that the simulations which the method shares with others are there; the CPU seconds that they took."""
+    simulations, clock = estimator.prior_simulations(log.trajectories), Clock()
     clock.time(lambda: simulations.first(cell.budget))
     return bank.cost(folder, simulations.key) or clock.cpu_seconds
 
 
-def _over(estimator: Estimator) -> bool:
-    return estimator.ended
-
-
-def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
-    """A row of the history, if there is an estimate yet; the estimator stays as it is."""
+def _look(estimator: Estimator, log: Log) -> list[Look]:
+    """At the estimate, if there is one yet; the estimator stays as it is."""
     before = list(estimator.findings)
     try:
         scores = score(estimator.get_parameter_estimate(log.trajectories), log.truth)
@@ -167,17 +163,16 @@ def _look(estimator: Estimator, log: Log) -> list[dict[str, Any]]:
         return []
     finally:
         estimator.findings = Findings(before)
-    return [{"rollouts": estimator.rollouts, "mean_accuracy": scores.mean_accuracy, "mean_crps": scores.mean_crps}]
+    return [Look(estimator.rollouts, scores.mean_accuracy, scores.mean_crps)]
 
 
-def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
+def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Estimate:
     from sipe_bayes.benchmark.transfer.study import agent_of, demonstrations_of
     from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, train_in_the_loop
 
-    own = folder / POLICIES / file_name(cell.id)
-    fresh, clock = not (own / CHECKPOINT).exists(), _Clock()
+    fresh, clock = not (folder / CHECKPOINT).exists(), Clock()
     estimator = _estimator(cell, simulator)
-    found = clock.time(
+    result = clock.time(
         lambda: train_in_the_loop(
             estimator,
             cell.variant,
@@ -185,35 +180,32 @@ def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Found:
             trajectory_steps=cell.horizon,
             settings=agent_of(cell),
             demonstrations=demonstrations_of(cell, simulator, estimator.prior),
-            folder=own,
+            folder=folder,
             resume=True,
         )
     )
-    history: list[dict[str, Any]] = [
-        {"rollouts": row["rollouts"], "mean_accuracy": row["accuracy"], "mean_crps": None} for row in found.history
-    ]
-    seconds, cpu = (clock.seconds, clock.cpu_seconds) if fresh else (None, None)
-    more = {"converged": found.converged, "solved_reference": found.solved_reference}
-    return _Found(found.posterior, seconds, cpu, history[-1]["rollouts"], list(found.warnings), history, more)
+    return _Estimate(
+        result.posterior,
+        clock.seconds if fresh else None,
+        clock.cpu_seconds if fresh else None,
+        result.history[-1].rollouts,
+        list(result.warnings),
+        [Look(row.rollouts, row.accuracy) for row in result.history],
+        converged=result.converged,
+        solved_reference=result.solved_reference,
+    )
 
 
-class _Clock:
-    """Seconds and CPU seconds spent in what is timed."""
+def netcdf(posterior: Posterior, seed: int) -> bytes:
+    """A posterior's netCDF.
 
-    def __init__(self) -> None:
-        self.seconds = self.cpu_seconds = 0.0
+    Args:
+        posterior: what is written.
+        seed: of its draws.
 
-    def time(self, call: Callable[[], Any]) -> Any:
-        began, cpu = time.perf_counter(), time.process_time()
-        try:
-            return call()
-        finally:
-            self.seconds += time.perf_counter() - began
-            self.cpu_seconds += time.process_time() - cpu
-
-
-def _netcdf(posterior: Posterior, seed: int) -> bytes:
-    """The bytes of the posterior's netCDF, the same for the same posterior."""
+    Returns:
+        The file's bytes, the same for the same posterior.
+    """
     data = posterior.to_inference_data(generator=torch.Generator().manual_seed(seed))
     for group in data.groups():
         data[group].attrs.pop("created_at", None)

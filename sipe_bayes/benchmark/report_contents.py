@@ -13,15 +13,22 @@ from matplotlib.figure import Figure
 
 from sipe_bayes.benchmark import figures
 from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
-from sipe_bayes.benchmark.findings import facts, pair_findings, sweep_findings, table_findings, unequal
-from sipe_bayes.benchmark.records import Record, load_all, planned
-from sipe_bayes.benchmark.spent import runs
+from sipe_bayes.benchmark.findings import (
+    Tried,
+    facts,
+    pair_findings,
+    sweep_findings,
+    sweep_rows,
+    table_findings,
+    unequal,
+)
+from sipe_bayes.benchmark.records import Record, planned
+from sipe_bayes.benchmark.run_log import read_runs
 from sipe_bayes.benchmark.tables import (
     BESIDE,
     OUTSIDE,
     VARIANT_NAMES,
     Context,
-    Entry,
     Table,
     competes,
     counted,
@@ -30,10 +37,10 @@ from sipe_bayes.benchmark.tables import (
     renamed,
     results,
     score_table,
-    sweep_rows,
     warning_counts,
 )
-from sipe_bayes.report.sipe_plot import COMPARED, settings_plot, sipe_plot
+from sipe_bayes.report.drawing import equal_parts
+from sipe_bayes.report.sipe_plot import LOOKS, settings_plot, sipe_plot
 
 SETTINGS = {
     "direct": "Direct estimation",
@@ -45,21 +52,49 @@ SETTINGS = {
 _PAIRS = (
     ("direct", "policy", ("demonstrations", "policy"), "Policy against demonstrations"),
     ("direct", "learned_reward", ("state differences", "learned rewards"), "Learned rewards against state differences"),
-    ("policy", "policy_learned_reward", ("state differences", "learned rewards"), "The same, with a policy in the loop"),
-)  # fmt: skip
+    (
+        "policy",
+        "policy_learned_reward",
+        ("state differences", "learned rewards"),
+        "The same, with a policy in the loop",
+    ),
+)
 _NOTES = {
-    "default": "The truth is the centre of every range here, where knowing nothing is a perfect guess: neither accuracy nor CRPS skill tells learning from not learning, so nothing is set in bold. Judge by the other variants.",
-    "in_distribution": "accuracy is 1 - |mean - truth|, each parameter in units of its range. Each environment has one truth, .1 to .4 of the range from its centre in every parameter; logs and estimators differ with the seed. Standard errors are over seeds, so they do not tell how another truth would come out.",
-    OUTSIDE: "The truth lies outside every range here, so only CRPS, the energy score and whether a method noticed mean anything.",
+    "default": "The truth is the centre of every range here, where knowing nothing is a perfect guess: neither "
+    "accuracy nor CRPS skill tells learning from not learning, so nothing is set in bold. Judge by the other variants.",
+    "in_distribution": "accuracy is 1 - |mean - truth|, each parameter in units of its range. Each environment has one "
+    "truth, .1 to .4 of the range from its centre in every parameter; logs and estimators differ with the seed. "
+    "Standard errors are over seeds, so they do not tell how another truth would come out.",
+    OUTSIDE: "The truth lies outside every range here, so only CRPS, the energy score and whether a method noticed "
+    "mean anything.",
 }
-_PER_FIGURE = 3  # estimators
-_SIGHT = "laplace simulates single control steps from the recorded states, which are free of noise here, and a tenth of its rollouts find its starting points; regression and maml learn from single steps, too, the others from statistics of the log or windows of it."
-_RADARS = "Radars: the radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 it is drawn at the centre."
+_SIGHT = (
+    "laplace simulates single control steps from the recorded states, which are free of noise here, and a tenth of its "
+    "rollouts find its starting points; regression and maml learn from single steps, too, the others from statistics "
+    "of the log or windows of it."
+)
+_ON_THE_WAY = (
+    ". Searches are looked at on the way, from when each seed has an estimate; methods that train once are known at "
+    "the end alone."
+)
+RADARS = (
+    "Radars: the radius is the value, on one spoke per environment; dashed is the prior mean, dotted laplace where it "
+    "has no line of its own. CRPS skill is 0 on the grey ring for the prior and 1 on the rim for the truth; below −1 "
+    "it is drawn at the centre."
+)
+SPREADS = 3
+"""Estimators of one figure with worst and best parameters."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a report, laid out once for all files; name: of its file, without the ending."""
+    """A figure of a report, laid out once for all files.
+
+    Args:
+        name: of its file, without the ending.
+        caption: below it.
+        figure: what is drawn.
+    """
 
     name: str
     caption: str
@@ -72,7 +107,17 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """in_depth: figures that a reader opens when wanted."""
+    """Of a report.
+
+    Args:
+        anchor: its name in links.
+        title: its heading.
+        sentences: what is to be said.
+        tables: of measures.
+        pictures: figures.
+        in_depth: figures that a reader opens when wanted.
+        sweep: of the search over hyper-parameters.
+    """
 
     anchor: str
     title: str
@@ -80,13 +125,22 @@ class Section:
     tables: list[Table] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
     in_depth: list[Picture] = field(default_factory=list)
-    sweep: list[tuple[str, str, Entry, bool]] = field(default_factory=list)
+    sweep: list[Tried] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Contents:
-    """facts: what was run, (label, text). missing: (setting, estimator, count, tasks). failed: (id, last line of the
-    traceback). warnings: (estimator, text, how often)."""
+    """Everything that a report says.
+
+    Args:
+        headline: how far the folder is.
+        facts: what was run, (label, text).
+        sections: in order.
+        missing: (setting, estimator, count, tasks).
+        failed: (id, last line of the traceback).
+        warnings: (estimator, text, how often).
+        planned: how many cells were asked for.
+    """
 
     headline: str
     facts: list[tuple[str, str]]
@@ -98,8 +152,15 @@ class Contents:
 
 
 def contents(folder: Path) -> Contents:
-    """Everything a report shows of a folder of results; raises RecordError for one without records."""
-    records = load_all(folder)
+    """Everything a report shows of a folder of results.
+
+    Args:
+        folder: of results.
+
+    Raises:
+        RecordError: for one without records.
+    """
+    records = Record.all_in(folder)
     wanted = planned(folder)
     known = {r.id for r in records}
     missing = [cell for cell in wanted if cell not in known]
@@ -111,7 +172,7 @@ def contents(folder: Path) -> Contents:
     )
     return Contents(
         headline=", ".join(state),
-        facts=facts(records, runs(folder)),
+        facts=facts(records, read_runs(folder)),
         sections=[s for s in _sections(done) if s.tables or s.pictures or s.sweep],
         missing=_grouped(missing),
         failed=failed,
@@ -139,7 +200,9 @@ def _sections(done: Sequence[Record]) -> Iterator[Section]:
         for variant, words in VARIANT_NAMES.items():
             group = [r for r in done if (r.setting, r.variant) == (setting, variant)]
             if any(r.estimator not in BASELINES for r in group):
-                yield _group(f"{setting}-{variant}", f"{title}, {words}", _with_baselines(group, done), context)
+                yield setting_section(
+                    f"{setting}-{variant}", f"{title}, {words}", _with_baselines(group, done), context
+                )
     for first, second, labels, title in _PAIRS:
         yield _pair(done, first, second, labels, title, context)
     yield _along(done, "gradient_steps", "Gradient steps of MAML", "gradient steps at test time")
@@ -156,18 +219,25 @@ def _with_baselines(group: Sequence[Record], done: Sequence[Record]) -> list[Rec
     return [*group, *baselines, *held_against]
 
 
-def _group(anchor: str, title: str, records: Sequence[Record], context: Context) -> Section:
-    """Tables and SiPE plots of one setting and variant; in depth for direct estimation within the bounds."""
+def setting_section(anchor: str, title: str, records: Sequence[Record], context: Context) -> Section:
+    """Tables and SiPE plots of one setting and variant; in depth for direct estimation within the bounds.
+
+    Args:
+        anchor: of the section.
+        title: of the section.
+        records: with what they are held against.
+        context: of all records.
+    """
     shown, sentence = counted(records)
     variant = next(r.variant for r in shown if r.estimator not in BASELINES)
     tables = [t for name in measures(variant) if (t := score_table(shown, name, context)) is not None]
     notes = [_NOTES[variant], sentence, unequal(shown)]
-    found = [] if variant == "default" else table_findings(tables)
+    findings = [] if variant == "default" else table_findings(tables)
     if any(r.estimator == REFERENCE for r in shown):
         notes.append(_SIGHT)
-    section = Section(anchor, title, [*(n for n in notes if n), *found], tables)
+    section = Section(anchor, title, [*(n for n in notes if n), *findings], tables)
     if variant != OUTSIDE:
-        section.sentences.append(_RADARS)
+        section.sentences.append(RADARS)
         section.pictures.extend(_radars(anchor, shown))
     if anchor == "direct-in_distribution":
         section.in_depth.extend(_parameters(shown))
@@ -175,27 +245,21 @@ def _group(anchor: str, title: str, records: Sequence[Record], context: Context)
 
 
 def _radars(anchor: str, records: Sequence[Record]) -> Iterator[Picture]:
-    found = results(records)
-    beside = {name: found[name] for name in found if name in BASELINES or _is_reference(name)}
+    scores = results(records)
+    beside = {name: scores[name] for name in scores if name in BASELINES or _is_reference(name)}
     reference = next((name for name in beside if _is_reference(name)), None)
-    mine = [name for name in found if competes(name)]
-    for k, part in enumerate(_parts(mine, COMPARED)):
-        drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, "mean", None if reference in part else reference)
+    mine = [name for name in scores if competes(name)]
+    for k, part in enumerate(equal_parts(mine, len(LOOKS))):
+        drawn = sipe_plot({**{n: scores[n] for n in part}, **beside}, "mean", None if reference in part else reference)
         yield Picture(f"{anchor}-compared{k}", f"Means over parameters and seeds: {', '.join(part)}.", drawn)
-    for k, part in enumerate(_parts(mine, _PER_FIGURE)):
+    for k, part in enumerate(equal_parts(mine, SPREADS)):
         caption = f"Mean (green), worst (blue) and best (orange) parameter of each environment: {', '.join(part)}."
-        drawn = sipe_plot({**{n: found[n] for n in part}, **beside}, None, None if reference in part else reference)
+        drawn = sipe_plot({**{n: scores[n] for n in part}, **beside}, None, None if reference in part else reference)
         yield Picture(f"{anchor}-spread{k}", caption, drawn)
 
 
 def _is_reference(name: str) -> bool:
     return name.split(",")[0] == REFERENCE
-
-
-def _parts(names: list[str], size: int) -> list[list[str]]:
-    """Parts of nearly equal length, none longer than ``size``."""
-    count = -(-len(names) // size)
-    return [names[len(names) * k // count : len(names) * (k + 1) // count] for k in range(count)]
 
 
 def _parameters(records: Sequence[Record]) -> Iterator[Picture]:
@@ -227,12 +291,12 @@ def _pair(
     beside = _with_baselines(left, done)[len(left) :]
     rows = [*renamed(left, labels[0]), *renamed(right, labels[1]), *beside]
     section.tables.extend(t for n in ("accuracy", "spread", "CRPS skill") if (t := score_table(rows, n, context)))
-    said = [f"With {label}: {s}" for label, s in zip(labels, (of_one, of_two), strict=True) if s]
-    section.sentences.extend([*said, unequal(rows)] if unequal(rows) else said)
-    section.sentences.extend([*pair_findings(left, right, labels), _RADARS])
+    section.sentences.extend(f"With {label}: {s}" for label, s in zip(labels, (of_one, of_two), strict=True) if s)
+    section.sentences.extend([unequal(rows)] if unequal(rows) else [])
+    section.sentences.extend([*pair_findings(left, right, labels), RADARS])
     everything = results([*left, *beside])
     names = [n for n in everything if competes(n)]
-    for k, part in enumerate(_parts(names, _PER_FIGURE)):
+    for k, part in enumerate(equal_parts(names, SPREADS)):
         shown = {n: everything[n] for n in everything if n in part or n not in names}
         figure = settings_plot(shown, results(right), labels, BESIDE if BESIDE in everything else None)
         caption = (
@@ -243,7 +307,7 @@ def _pair(
 
 
 def _along(done: Sequence[Record], setting: str, title: str, what: str) -> Section:
-    """Accuracy against gradient steps or rollouts; for rollouts, what was known on the way where no other budget was run."""
+    """Accuracy against gradient steps or rollouts; for these what was known on the way where nothing else was run."""
     section = Section(setting.replace("_", "-"), title)
     mine = [r for r in done if r.setting == setting]
     whole = bool(mine)
@@ -256,18 +320,13 @@ def _along(done: Sequence[Record], setting: str, title: str, what: str) -> Secti
     across = (*BASELINES, REFERENCE)
     beside = [r for r in done if r.setting == "direct" and r.estimator in across and r not in mine]
     beside = [r for r in beside if r.task in tasks and r.variant in variants]
-    draw = figures.gradient_step_ablation if setting == "gradient_steps" else figures.accuracy_against_rollouts
+    steps = setting == "gradient_steps"
+    draw = figures.gradient_step_ablation if steps else figures.accuracy_against_rollouts
     caption = f"Mean accuracy against {what}: mean over seeds, shaded their range; dashed the prior mean"
-    caption += (
-        ", dotted laplace."
-        if setting == "gradient_steps"
-        else "."
-        if whole
-        else ". Searches are looked at on the way, from when each seed has an estimate; methods that train once are known at the end alone."
-    )
+    caption += ", dotted laplace." if steps else "." if whole else _ON_THE_WAY
     section.pictures.append(Picture(section.anchor, caption, draw([*mine, *beside])))
-    if setting == "gradient_steps":
-        few, many = (f([r.values["gradient_steps"] for r in mine]) for f in (min, max))
+    if steps:
+        few, many = (f([int(r.values["gradient_steps"]) for r in mine]) for f in (min, max))
         with_few, with_many = ([r for r in mine if r.values["gradient_steps"] == n] for n in (few, many))
         labels = (f"{few} gradient steps", f"{many} gradient steps")
         section.sentences.extend(pair_findings(with_few, with_many, labels))
@@ -276,6 +335,6 @@ def _along(done: Sequence[Record], setting: str, title: str, what: str) -> Secti
 
 def _sweep(done: Sequence[Record]) -> Section:
     rows = sweep_rows(done)
-    searched = [row for row in rows if row[1]]
+    searched = [row for row in rows if row.values]
     title = "Search over hyper-parameters"
     return Section("sweep", title, sweep_findings(searched), sweep=rows if searched else [])

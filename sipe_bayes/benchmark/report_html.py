@@ -7,24 +7,17 @@ from __future__ import annotations
 
 import base64
 
-import jinja2
-
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents
 from sipe_bayes.benchmark.tables import Table
 from sipe_bayes.report.drawing import png
 from sipe_bayes.report.sipe_plot import two_lines
+from sipe_bayes.report.templates import html_templates
 
 
 def render(contents: Contents) -> str:
     """The page."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sipe_bayes.benchmark", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = html_templates("sipe_bayes.benchmark")
     environment.filters.update(
         two_lines=two_lines,
         label=label,

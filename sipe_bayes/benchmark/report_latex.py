@@ -14,21 +14,20 @@ import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
-import jinja2
-
 from sipe_bayes.benchmark import report_html
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents, Picture
 from sipe_bayes.benchmark.tables import Entry, Table
 from sipe_bayes.core.files import write_bytes, write_text
+from sipe_bayes.report.drawing import equal_parts
+from sipe_bayes.report.templates import latex_templates
 
-_COLUMNS = 5  # of a table, side by side on A4
 _SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}",
     "−": "$-$", "±": r"$\pm$", "–": "--", "…": r"\dots{}", "'": "'", '"': "''", "`": r"\textasciigrave{}",
 }  # fmt: skip
-_TIMEOUT = 300
 
 
 class Raw(str):
@@ -54,37 +53,31 @@ def _letter(letter: str) -> str:
     return "".join(_SPECIAL.get(c, c) for c in plain) or "?"
 
 
-def render(found: Contents) -> str:
+def render(contents: Contents) -> str:
     """The document; its figures are read from ``figures/``."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sipe_bayes.benchmark", "templates"),
-        autoescape=False,
-        finalize=escaped,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        block_start_string="<%",
-        block_end_string="%>",
-        variable_start_string="<<",
-        variable_end_string=">>",
-        comment_start_string="<#",
-        comment_end_string="#>",
-    )
+    environment = latex_templates("sipe_bayes.benchmark", escaped)
     environment.filters["label"] = report_html.label
     environment.globals.update(parts=parts, cell=cell, raw=Raw, breakable=breakable, baselines=BASELINES)
-    return environment.get_template("report.tex.j2").render(contents=found)
+    return environment.get_template("report.tex.j2").render(contents=contents)
 
 
-def parts(table: Table) -> Iterator[Table]:
-    """The table in parts that fit the page side by side."""
-    count = -(-len(table.columns) // _COLUMNS)
-    for k in range(count):
-        low, high = (len(table.columns) * i // count for i in (k, k + 1))
-        yield table.part(range(low, high))
+def parts(table: Table, columns: int = 5) -> Iterator[Table]:
+    """The table in parts that fit on A4.
+
+    Args:
+        table: of all columns.
+        columns: side by side, at most.
+    """
+    return (table.part(part) for part in equal_parts(range(len(table.columns)), columns))
 
 
 def cell(entry: Entry | None, table: Table | None) -> Raw:
-    """An entry: mean, standard error, and the seeds where there are fewer than elsewhere in its table."""
+    """An entry: mean, standard error, and the seeds where there are fewer than elsewhere in its table.
+
+    Args:
+        entry: None for a dash.
+        table: that it stands in, if any.
+    """
     if entry is None:
         return Raw("--")
     mean, error = (text.replace("-", "$-$") for text in entry.texts())
@@ -96,6 +89,7 @@ def cell(entry: Entry | None, table: Table | None) -> Raw:
 
 
 def breakable(cell_id: str) -> Raw:
+    """A cell's id that may be broken at the end of a line."""
     return Raw(escaped(cell_id).replace("/", r"/\allowbreak{}").replace(r"\_", r"\_\allowbreak{}"))
 
 
@@ -106,11 +100,18 @@ def pdf(picture: Picture) -> bytes:
     return buffer.getvalue()
 
 
-def write_reports(found: Contents, out: Path) -> tuple[list[Path], str]:
-    """``report.html``, ``report.tex`` with ``figures/``, and ``report.pdf``; returns their paths and why there is no PDF, if there is
-    none. Everything is drawn before the first file is written."""
-    page, document = report_html.render(found), render(found)
-    drawn = {p.name: pdf(p) for section in found.sections for p in (*section.pictures, *section.in_depth)}
+def write_reports(contents: Contents, out: Path) -> tuple[list[Path], str]:
+    """Write ``report.html``, ``report.tex`` with ``figures/``, and ``report.pdf``; all is drawn first.
+
+    Args:
+        contents: what they say.
+        out: the folder.
+
+    Returns:
+        Their paths, and why there is no PDF, if there is none.
+    """
+    page, document = report_html.render(contents), render(contents)
+    drawn = {p.name: pdf(p) for section in contents.sections for p in (*section.pictures, *section.in_depth)}
     figures = out / "figures"
     figures.mkdir(parents=True, exist_ok=True)
     for name, content in drawn.items():
@@ -122,8 +123,16 @@ def write_reports(found: Contents, out: Path) -> tuple[list[Path], str]:
     return (written, note) if note else ([*written, out / "report.pdf"], "")
 
 
-def compile_pdf(folder: Path) -> str:
-    """``report.pdf`` from ``report.tex``; returns why not, or nothing."""
+def compile_pdf(folder: Path, seconds: int = 300) -> str:
+    """Make ``report.pdf`` from ``report.tex``.
+
+    Args:
+        folder: of both.
+        seconds: after which pdflatex is given up.
+
+    Returns:
+        Why there is none, empty where there is one.
+    """
     program = shutil.which("pdflatex")
     if program is None:
         return "report.pdf not made: pdflatex is not installed (Debian: texlive-latex-recommended)"
@@ -132,10 +141,10 @@ def compile_pdf(folder: Path) -> str:
         for _ in range(3):  # contents, then the page numbers that they moved
             try:
                 done = subprocess.run(
-                    command, cwd=folder, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT
+                    command, cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds
                 )
             except subprocess.TimeoutExpired:
-                return f"report.pdf not made: pdflatex took longer than {_TIMEOUT} s on {folder / 'report.tex'}"
+                return f"report.pdf not made: pdflatex took longer than {seconds} s on {folder / 'report.tex'}"
             if done.returncode:
                 error = next((line for line in done.stdout.splitlines() if line.startswith("!")), "no reason given")
                 return f"report.pdf not made: pdflatex on {folder / 'report.tex'} says {error!r}"

@@ -1,7 +1,8 @@
-"""Running cells: what is not there yet is measured, each result is written once, and the same command goes on after any interruption.
+"""Running cells: what is missing is measured, each result is written once, and the same command goes on after a stop.
 
-First the simulations that several estimators share (``bank``), then the cells. Units of work return their files, and this process alone
-writes them, each under a temporary name and renamed, a record after its posterior: a record that exists is whole.
+First the simulations that several estimators share (``bank``), then the estimates, then the agents that need them.
+Units of work return their files, and this process alone writes them, each under a temporary name and renamed, a record
+after its posterior: a record that exists is whole.
 """
 
 from __future__ import annotations
@@ -11,62 +12,100 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
-from sipe_bayes.benchmark import bank, measure, spent
+from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import BASELINES, Cell
 from sipe_bayes.benchmark.executors.work import Done, Executor, Unit
+from sipe_bayes.benchmark.measure import ESTIMATES
+from sipe_bayes.benchmark.measurement import Measurement
 from sipe_bayes.benchmark.records import Record, plan
+from sipe_bayes.benchmark.run_log import Run, read_runs, write_runs
+from sipe_bayes.benchmark.transfer.study import TransferRecord
 from sipe_bayes.core.files import OutputError, write_bytes
 
 _LOCK = ".lock"
 Report = Callable[[str], None]
+AnyMeasurement = Measurement[Record] | Measurement[TransferRecord]
 
 
-def run(
-    cells: Sequence[Cell],
-    folder: Path,
-    start: Callable[[], Executor],
-    command: str = "",
-    retry_failed: bool = False,
-    report: Report = print,
-) -> int:
-    """Measure the cells that have no record in ``folder`` yet; returns how many failed, now or before. start: makes the executor, once
-    the folder is found fit. retry_failed: measure failed ones again. Raises OutputError for a folder with records of other versions,
-    budgets, lengths or agents, or that another run is at work in, and OSError where it cannot be written."""
+@dataclass(frozen=True)
+class Order:
+    """How cells are to be measured.
+
+    Args:
+        folder: of results.
+        start: makes the executor, once the folder is found fit.
+        command: that asks for them.
+        retry_failed: measure failed ones again.
+        report: is told each result.
+    """
+
+    folder: Path
+    start: Callable[[], Executor]
+    command: str = ""
+    retry_failed: bool = False
+    report: Report = print
+
+
+def run(cells: Sequence[Cell], order: Order, kind: AnyMeasurement | None = None) -> int:
+    """Measure the cells that have no record yet, after the estimates that they need.
+
+    Args:
+        cells: which.
+        order: how.
+        kind: what is measured of a cell; default estimates.
+
+    Returns:
+        How many failed, now or before.
+
+    Raises:
+        OutputError: for a folder with records of other versions, budgets, lengths or agents, or that another run is at
+            work in.
+        OSError: where it cannot be written.
+    """
+    if kind is None:
+        return run(cells, order, ESTIMATES)
+    folder = order.folder
     with claimed(folder):
-        left = lacking(cells, folder, retry_failed)
-        plan(folder, [cell.id for cell in cells])
-        before = failures(cells, left, folder)
-        report(there_already(cells, left, before))
+        left = without_record(cells, order, kind)
+        estimates = {e.id: e for cell in left if (e := kind.needs(cell)) is not None}
+        first = without_record(list(estimates.values()), order, ESTIMATES)
+        plan(folder / kind.record_type.FOLDER, [cell.id for cell in cells])
+        before = _failures(cells, left, folder, kind.record_type)
+        text = f"{len(cells)} cells, {len(cells) - len(left)} of them there already" + f", {before} failed" * bool(
+            before
+        )
+        order.report(text if kind is ESTIMATES else f"{text}; {len(first)} estimates to make first")
         if not left:
             return before
-        return before + carried_out(units_of(left, folder, command), folder, start, command, report)
+        if first:
+            plan(folder, [cell.id for cell in first])
+        units = _estimate_units(left if kind is ESTIMATES else first, order)
+        units += [] if kind is ESTIMATES else _units(left, first, order, kind)
+        return before + _carried_out(units, order)
 
 
-def failures(cells: Sequence[Cell], left: Sequence[Cell], folder: Path, kind: type[Record] = Record) -> int:
-    """How many of the cells that are not measured now have failed before."""
-    there = {cell.id for cell in cells} - {cell.id for cell in left}
-    return sum(not record.done for record in kind.every(folder) if record.id in there)
+def simulate(which: Bank, budget: int, order: Order) -> int:
+    """Fill the first rows of a bank of simulations.
 
+    Args:
+        which: bank.
+        budget: rows.
+        order: how.
 
-def there_already(cells: Sequence[Cell], left: Sequence[Cell], failed: int) -> str:
-    text = f"{len(cells)} cells, {len(cells) - len(left)} of them there already"
-    return f"{text}, {failed} failed" if failed else text
+    Returns:
+        How many shards there were to make.
 
-
-def simulate(
-    which: Bank, budget: int, folder: Path, start: Callable[[], Executor], command: str, report: Report
-) -> int:
-    """Fill the first ``budget`` rows of a bank; returns how many shards there were to make. Raises as ``run``."""
-    with claimed(folder):
-        units = bank.shards(which, budget, bank.place(which, folder))
+    Raises:
+        OutputError: as ``run``.
+    """
+    with claimed(order.folder):
+        units = bank.shards(which, budget, bank.place(which, order.folder))
         if units:
-            carried_out(units, folder, start, command, report)
+            _carried_out(units, order)
         return len(units)
 
 
@@ -78,7 +117,7 @@ def not_a_file(folder: Path) -> None:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, for one run at a time."""
+    """The folder, made if need be, for one run at a time; raises OutputError where another one is at work."""
     not_a_file(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / _LOCK).open("w") as lock:
@@ -91,65 +130,91 @@ def claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def lacking(
-    cells: Iterable[Cell], folder: Path, retry_failed: bool, blank: Callable[[Cell, str], Record] = measure.blank_record
-) -> list[Cell]:
-    """The cells that have no record in a folder of results, or with retry_failed a failed one. blank: makes their records. Raises
-    OutputError for a record with other entries than its cell's, and for one of any cell that other versions made."""
-    asked = [(cell, blank(cell, "")) for cell in cells]
-    if not asked:
+def without_record(cells: Sequence[Cell], order: Order, kind: AnyMeasurement) -> list[Cell]:
+    """The cells that have no record in a folder of results, or a failed one that is to be measured again.
+
+    Args:
+        cells: which.
+        order: how; of it the folder and ``retry_failed``.
+        kind: of the records.
+
+    Raises:
+        OutputError: for a record with other entries than its cell's, and for one of any cell that other versions made.
+    """
+    blanks = [kind.blank(cell) for cell in cells]
+    if not blanks:
         return []
-    kind = asked[0][1]
-    there = {record.id: record for record in kind.every(folder)}
-    for record in there.values():
-        _alike(record, kind, ("versions",), folder)
-    for _, mine in asked:
-        if mine.id in there:
-            _alike(there[mine.id], mine, mine.FIXED, folder)
-    return [cell for cell, mine in asked if mine.id not in there or (retry_failed and not there[mine.id].done)]
+    records = {record.id: record for record in kind.record_type.every(order.folder)}
+    for record in records.values():
+        _check_alike(record, blanks[0], ("versions",), order.folder)
+    for blank in blanks:
+        if blank.id in records:
+            _check_alike(records[blank.id], blank, blank.FIXED, order.folder)
+    missing = {b.id for b in blanks if b.id not in records or (order.retry_failed and not records[b.id].done)}
+    return [cell for cell in cells if cell.id in missing]
 
 
-def _alike(found: Record, mine: Record, names: Iterable[str], folder: Path) -> None:
+def _check_alike(record: Record, blank: Record, names: Iterable[str], folder: Path) -> None:
     for name in names:
-        there, here = getattr(found, name), getattr(mine, name)
-        if there != here:
+        kept, asked = getattr(record, name), getattr(blank, name)
+        if kept != asked:
             raise OutputError(
-                f"--out {folder}: holds {found.id} with {name} {_differing(there, here)} and not {_differing(here, there)}; "
-                "choose another folder"
+                f"--out {folder}: holds {record.id} with {name} {_difference(kept, asked)} and not "
+                f"{_difference(asked, kept)}; choose another folder"
             )
 
 
-def _differing(one: Any, other: Any) -> Any:
+def _difference(one: object, other: object) -> object:
     """Of two dictionaries, what differs in the first."""
-    if not isinstance(one, dict):
+    if not isinstance(one, dict) or not isinstance(other, dict):
         return one
     return ", ".join(f"{k} {v}" for k, v in one.items() if other.get(k) != v) or "fewer entries"
 
 
-def units_of(cells: Sequence[Cell], folder: Path, command: str) -> list[Unit]:
-    """Shards of simulations first, and then the cells, which wait for theirs."""
+def _failures(cells: Sequence[Cell], left: Sequence[Cell], folder: Path, kind: type[Record]) -> int:
+    """How many of the cells that are not measured now have failed before."""
+    kept = {cell.id for cell in cells} - {cell.id for cell in left}
+    return sum(not record.done for record in kind.every(folder) if record.id in kept)
+
+
+# Units of work
+
+
+def _estimate_units(cells: Sequence[Cell], order: Order) -> list[Unit]:
+    """Shards of simulations first, and then the estimates, which wait for theirs."""
     banks: dict[Bank, int] = {}
     for cell in cells:
-        which = _bank(cell)
+        which = bank_of(cell)
         if which is not None:
             banks[which] = max(banks.get(which, 0), cell.budget)
-    made = {which: bank.shards(which, budget, bank.known_place(which, folder)) for which, budget in banks.items()}
-    units = [shard for shards in made.values() for shard in shards]
+    shards = {which: bank.shards(which, size, bank.known_place(which, order.folder)) for which, size in banks.items()}
+    units = [shard for made in shards.values() for shard in made]
     for cell in cells:
-        which = _bank(cell)
-        needs = [shard.name for shard in made[which]] if which is not None else []
-        units.append(unit(measure, cell, folder, command, needs))
+        which = bank_of(cell)
+        needs = [] if which is None else [shard.name for shard in shards[which]]
+        units.append(_unit(ESTIMATES, cell, order, needs))
     return units
 
 
-def unit(kind: ModuleType, cell: Cell, folder: Path, command: str, needs: Iterable[str] = ()) -> Unit:
-    """Measuring a cell. kind: ``measure``, or another module with its ``run`` and ``died``."""
-    arguments = {"cell": cell, "folder": folder.resolve(), "command": command}
+def _units(cells: Sequence[Cell], first: Sequence[Cell], order: Order, kind: AnyMeasurement) -> list[Unit]:
+    """Cells which wait for their estimate, and for the cell that shares their training."""
+    now, estimates = {cell.id for cell in cells}, {cell.id for cell in first}
+    units = []
+    for cell in cells:
+        estimate, trained = kind.needs(cell), kind.alike(cell)
+        needs = [estimate.id] if estimate is not None and estimate.id in estimates else []
+        needs += [trained.id] if trained != cell and trained.id in now else []
+        units.append(_unit(kind, cell, order, needs))
+    return units
+
+
+def _unit(kind: AnyMeasurement, cell: Cell, order: Order, needs: Iterable[str]) -> Unit:
+    arguments = {"cell": cell, "folder": order.folder.resolve(), "command": order.command}
     return Unit(cell.id, kind.run, arguments, kind.died, frozenset(needs))
 
 
-def _bank(cell: Cell) -> Bank | None:
-    """The simulations that a cell shares with others."""
+def bank_of(cell: Cell) -> Bank | None:
+    """The simulations that a cell shares with others, if any."""
     from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
     from sipe_bayes.inference.registry import estimator_class
 
@@ -159,24 +224,25 @@ def _bank(cell: Cell) -> Bank | None:
     return Bank(cell.task, cell.variant, cell.seed, cell.horizon)
 
 
-def carried_out(units: list[Unit], folder: Path, start: Callable[[], Executor], command: str, report: Report) -> int:
+def _carried_out(units: Sequence[Unit], order: Order) -> int:
     """Submit what needs nothing more, write what comes back, until nothing is left; returns the number of failures."""
     waiting, written, failed = {unit.name: unit for unit in units}, set[str](), 0
-    with start() as executor:
-        log = _Log(folder, command, executor.workers, sum(unit.name.startswith("simulations/") for unit in units))
-        flying = 0
-        while waiting or flying:
+    with order.start() as executor:
+        log, running = _Log(order, executor.workers), 0
+        while waiting or running:
+            # hand over every unit whose needs are met
             for unit in [u for u in waiting.values() if not (u.needs - written)]:
                 executor.submit(waiting.pop(unit.name))
-                flying += 1
+                running += 1
+            # write the next one that ends
             unit, done = executor.next()
-            flying -= 1
-            _write(done, folder)
+            running -= 1
+            _write(done, order.folder)
             written.add(unit.name)
             failed += done.failed
             log.add(unit, done)
             mark = "failed: " if done.failed else ""
-            report(f"{len(written)}/{len(units)} {unit.name} {mark}{done.line}")
+            order.report(f"{len(written)}/{len(units)} {unit.name} {mark}{done.line}")
     return failed
 
 
@@ -188,33 +254,15 @@ def _write(done: Done, folder: Path) -> None:
 
 
 class _Log:
-    """``runs.json``: what each run took, kept up to date: seconds and CPU seconds, also of its simulations alone."""
+    """``runs.json``: what each run took, kept up to date."""
 
-    def __init__(self, folder: Path, command: str, workers: int, shards: int) -> None:
-        self._folder, self._began, self._shards = folder, time.perf_counter(), shards
-        self._before = spent.runs(folder)
-        self._row: dict[str, Any] = {
-            "command": command,
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "workers": workers,
-            "units": 0,
-            "seconds": 0.0,
-            "cpu_seconds": 0.0,
-            "simulating": {"seconds": 0.0, "cpu_seconds": 0.0},
-        }
+    def __init__(self, order: Order, workers: int) -> None:
+        self._folder, self._began = order.folder, time.perf_counter()
+        self._before = read_runs(order.folder)
+        self._run = Run(order.command, time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), workers)
 
     def add(self, unit: Unit, done: Done) -> None:
-        now = time.perf_counter() - self._began
-        self._row = {**self._row, "units": self._row["units"] + 1, "seconds": now}
-        self._row["cpu_seconds"] += done.cpu_seconds
-        if self._shards and unit.name.startswith("simulations/"):
-            self._shards -= 1
-            cpu = self._row["simulating"]["cpu_seconds"] + done.cpu_seconds
-            self._row["simulating"] = {"seconds": now, "cpu_seconds": cpu}
-        spent.keep(self._folder, [*self._before, self._row])
-
-
-def changed(cells: Sequence[Cell], **changes: Any) -> list[Cell]:
-    """Cells with another budget, length or training, where one is given."""
-    given = {name: value for name, value in changes.items() if value is not None}
-    return [replace(cell, **given) for cell in cells] if given else list(cells)
+        """Count a unit in."""
+        now, simulation = time.perf_counter() - self._began, unit.name.startswith(bank.UNITS)
+        self._run = self._run.and_unit(now, done.cpu_seconds, simulation)
+        write_runs(self._folder, [*self._before, self._run])

@@ -3,32 +3,88 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from sipe_bayes.benchmark.records import Record, mixed
-from sipe_bayes.benchmark.spent import by_suite, cpu_time, duration, percent, runs, together
-
-_SHOWN = 20  # missing cells that are named
-_RUNS = 3  # latest runs that are shown
+from sipe_bayes.benchmark.records import Progress, Record, mixed
+from sipe_bayes.benchmark.run_log import Run, Usage, by_suite, cpu_time, duration, percent, read_runs
 
 
-def summary(folder: Path) -> dict[str, Any]:
-    """Of a folder of results, as plain data; raises RecordError for another one."""
-    records, found = Record.progress(folder)
-    rows = runs(folder)
-    return {
-        **found,
-        "mixed": mixed(records),
-        "converged": _converged(records),
-        "cpu_time": cpu_time(records),
-        "runs": [{**row, **together([row])} for row in rows],
-        "suites": by_suite(rows),
-        "all": together(rows),
-    }
+@dataclass(frozen=True)
+class Summary(Progress):
+    """How far a folder is, and what it took.
+
+    Args:
+        mixed: groups of cells that do not compare.
+        converged: by task and estimator, how many of the seeds with a policy solve their environment.
+        cpu_time: in words.
+        runs: each that was started.
+        suites: what the runs of each suite took.
+        all: what all took.
+    """
+
+    mixed: list[str]
+    converged: dict[str, str]
+    cpu_time: str
+    runs: list[Run]
+    suites: dict[str, Usage]
+    all: Usage
+
+    def to_dict(self) -> dict[str, object]:
+        """As JSON has it."""
+        return {**asdict(self), "runs": [{**asdict(run), **asdict(Usage.of([run]))} for run in self.runs]}
+
+    def lines(self, named: int = 20, latest: int = 3) -> list[str]:
+        """To be read.
+
+        Args:
+            named: missing cells that are listed.
+            latest: runs that are shown.
+        """
+        text = [self.headline, *(f"failed: {cell}: {why}" for cell, why in self.failed.items())]
+        text += [f"missing: {cell}" for cell in self.missing[:named]]
+        if len(self.missing) > named:
+            text.append(f"missing: {len(self.missing) - named} more")
+        text += [
+            f"mixed: {group}: its cells were given different logs; delete their records, and run again"
+            for group in self.mixed
+        ]
+        text += [f"converged: {name}: {count} seeds" for name, count in self.converged.items()]
+        if self.failed:
+            text.append("the same command with --retry-failed measures those that failed again")
+        if self.done:
+            text.append(f"CPU time of these cells: {self.cpu_time}")
+        text += [_one_run(run) for run in self.runs[-latest:]]
+        if len(self.runs) > latest:
+            text.append(f"and {len(self.runs) - latest} runs before; --json has them all")
+        if len(self.runs) > 1:
+            text += [f"{name}: {_time(usage)}" for name, usage in (*self.suites.items(), ("all runs", self.all))]
+        return text
 
 
-def _converged(records: list[Record]) -> dict[str, str]:
+def summary(folder: Path) -> Summary:
+    """Of a folder of results.
+
+    Args:
+        folder: of results.
+
+    Raises:
+        RecordError: for one in which no run was started.
+    """
+    records, runs = Record.every(folder), read_runs(folder)
+    return Summary(
+        **vars(Progress.of(Record, records, folder)),
+        mixed=mixed(records),
+        converged=_converged(records),
+        cpu_time=cpu_time(records),
+        runs=runs,
+        suites=by_suite(runs),
+        all=Usage.of(runs),
+    )
+
+
+def _converged(records: Sequence[Record]) -> dict[str, str]:
     """By task and estimator: how many of the seeds with a policy solve their environment."""
     asked, solved = Counter[str](), Counter[str]()
     for record in records:
@@ -39,47 +95,18 @@ def _converged(records: list[Record]) -> dict[str, str]:
     return {name: f"{solved[name]} of {count}" for name, count in asked.items()}
 
 
-def lines(found: dict[str, Any]) -> list[str]:
-    """``summary`` to be read."""
-    missing = found["missing"]
-    said = [headline(found), *(f"failed: {cell}: {why}" for cell, why in found["failed"].items())]
-    said += [f"missing: {cell}" for cell in missing[:_SHOWN]]
-    if len(missing) > _SHOWN:
-        said.append(f"missing: {len(missing) - _SHOWN} more")
-    said += [
-        f"mixed: {group}: its cells were given different logs; delete their records, and run again"
-        for group in found["mixed"]
-    ]
-    said += [f"converged: {name}: {count} seeds" for name, count in found["converged"].items()]
-    if found["failed"]:
-        said.append("the same command with --retry-failed measures those that failed again")
-    if found["done"]:
-        said.append(f"CPU time of these cells: {found['cpu_time']}")
-    for row in found["runs"][-_RUNS:]:
-        use = f"{row['units']} units in {row['seconds']:.0f} s, CPU use {percent(row['cpu_use'])} of {row['workers']} workers"
-        said.append(f"{row['started']}: {use}{_simulating(row)}: {row['command']}")
-    if len(found["runs"]) > _RUNS:
-        said.append(f"and {len(found['runs']) - _RUNS} runs before; --json has them all")
-    if len(found["runs"]) > 1:
-        said += [f"{name}: {_time(row)}" for name, row in (*found["suites"].items(), ("all runs", found["all"]))]
-    return said
+def _one_run(run: Run) -> str:
+    usage = Usage.of([run])
+    share = f"CPU use {percent(usage.cpu_use)} of {run.workers} workers"
+    return f"{run.started}: {run.units} units in {run.seconds:.0f} s, {share}{_simulating(usage)}: {run.command}"
 
 
-def _time(row: dict[str, Any]) -> str:
-    """Of runs together."""
-    return f"{duration(row['seconds'])}, {duration(row['cpu_seconds'])} of CPU{_simulating(row)}"
+def _time(usage: Usage) -> str:
+    return f"{duration(usage.seconds)}, {duration(usage.cpu_seconds)} of CPU{_simulating(usage)}"
 
 
-def _simulating(row: dict[str, Any]) -> str:
-    share = row["cpu_use_simulating"]
-    return (
-        f", CPU use {percent(share)} while simulating ({duration(row['simulating_seconds'])})"
-        if share is not None
-        else ""
-    )
-
-
-def headline(found: dict[str, Any]) -> str:
-    """The counts of a summary."""
-    counts = f"{found['done']} done, {len(found['failed'])} failed, {len(found['missing'])} missing"
-    return f"{found['folder']}: {found['cells']} cells, {counts}"
+def _simulating(usage: Usage) -> str:
+    share = usage.cpu_use_simulating
+    if share is None:
+        return ""
+    return f", CPU use {percent(share)} while simulating ({duration(usage.simulating_seconds)})"

@@ -1,14 +1,16 @@
 """Tables of the benchmark: one number per estimator and environment, as mean and standard error over seeds.
 
-An entry is set apart as the best of its column only when that is outside noise: it must be the best mean and differ from every
-other estimator's by Welch's t-test at 5 % (B. Welch 1947, "The generalization of 'Student's' problem when several different
-population variances are involved", Biometrika 34, https://doi.org/10.1093/biomet/34.1-2.28). It follows that a column of
-equally good estimators has a best one in less than 5 % of cases, and that one seed never has one. Baselines do not compete, but the
-best must beat the prior mean and the prior too, by a one-sample t-test, as they are the same with every seed. On the default variant
-nothing is the best: its truth is the prior mean, so that no measure tells learning from knowing nothing.
+An entry is set apart as the best of its column only when that is outside noise: it must be the best mean and differ
+from every other estimator's by Welch's t-test at 5 % (B. Welch 1947, "The generalization of 'Student's' problem when
+several different population variances are involved", Biometrika 34, https://doi.org/10.1093/biomet/34.1-2.28). It
+follows that a column of equally good estimators has a best one in less than 5 % of cases, and that one seed never has
+one. Baselines do not compete, but the best must beat the prior mean and the prior too, by a one-sample t-test, as they
+are the same with every seed. On the default variant nothing is the best: its truth is the prior mean, so that no
+measure tells learning from knowing nothing.
 
-A run with a policy counts only if the policy solved simulators drawn from the estimate, as in the paper (Mehta, Handa, Fox, Ramos
-2020, https://arxiv.org/abs/2011.08985, Section 3.2); where no run of a setting did, all count, and the report says so.
+A run with a policy counts only if the policy solved simulators drawn from the estimate, as in the paper (Mehta, Handa,
+Fox, Ramos 2020, https://arxiv.org/abs/2011.08985, Section 3.2); where no run of a setting did, all count, and the
+report says so.
 """
 
 from __future__ import annotations
@@ -18,15 +20,16 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
 from sipe_bayes.benchmark.records import Record
+from sipe_bayes.diagnostics.scores import Scores
 
-LEVEL = 0.05
+LEVEL = 0.05  # of every test
+_EQUAL = 1e-9  # difference of two means that is rounding
 OUTSIDE = "out_of_distribution"
 ALL = "mean of all"
 BESIDE = f"{REFERENCE}, direct"
@@ -40,15 +43,14 @@ Key = tuple[str, str, int]
 class Context:
     """What a value may need beside its record: the prior's CRPS (N,) by task, variant and seed."""
 
-    prior_crps: dict[Key, list[float]]
+    prior_crps: dict[Key, tuple[float, ...]]
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> Context:
-        return cls(
-            {(r.task, r.variant, r.seed): r.scores["crps"] for r in records if r.done and r.estimator == "prior"}
-        )
+        """Of all records of a folder."""
+        return cls({(r.task, r.variant, r.seed): r.scored.crps for r in records if r.done and r.estimator == "prior"})
 
-    def crps(self, record: Record) -> list[float] | None:
+    def crps(self, record: Record) -> tuple[float, ...] | None:
         """The prior's, on the same truth; of another seed where this one was not scored: the truth is the same."""
         same = (
             crps
@@ -60,7 +62,15 @@ class Context:
 
 @dataclass(frozen=True)
 class Measure:
-    """A column's number. better: 1 where larger is better, -1 where smaller is, 0 where nothing is the best."""
+    """A column's number.
+
+    Args:
+        name: of the measure.
+        meaning: in a few words.
+        better: 1 where larger is better, -1 where smaller is, 0 where nothing is the best.
+        digits: behind the point.
+        value: of a finished record; None where it has none.
+    """
 
     name: str
     meaning: str
@@ -69,8 +79,8 @@ class Measure:
     value: Value
 
 
-def _of_scores(key: str) -> Value:
-    return lambda record, _: record.scores.get(key)
+def _of_scores(value: Callable[[Scores], float | None]) -> Value:
+    return lambda record, _: value(record.scored)
 
 
 def _determined_skill(record: Record, context: Context) -> float | None:
@@ -80,35 +90,76 @@ def _determined_skill(record: Record, context: Context) -> float | None:
         return None
     known = np.array(record.determined)
     worst = float(np.array(reference)[known].mean())
-    return 1 - float(np.array(record.scores["crps"])[known].mean()) / worst if worst > 0 else None
+    return 1 - float(np.array(record.scored.crps)[known].mean()) / worst if worst > 0 else None
 
 
-def _spread(record: Record, _: Context) -> float | None:
-    return float(record.scores["max_accuracy"]) - float(record.scores["min_accuracy"])
-
-
-def _noticed(record: Record, _: Context) -> float | None:
+def _noticed(scores: Scores) -> float | None:
     """Share of the parameters whose truth lies outside that put their median on that bound."""
-    outside = [float(n) for n in record.scores["noticed"] if n is not None]
+    outside = [float(n) for n in scores.noticed if n is not None]
     return float(np.mean(outside)) if outside else None
 
 
 MEASURES = {
     m.name: m
     for m in (
-        Measure("accuracy", "1 - |mean - truth|, mean over parameters", 1, 3, _of_scores("mean_accuracy")),
-        Measure("worst accuracy", "the same of the worst parameter", 1, 3, _of_scores("min_accuracy")),
-        Measure("spread", "accuracy of the best parameter less that of the worst", -1, 3, _spread),
-        Measure("CRPS skill", "1 - CRPS / CRPS of the prior; 0 is the prior, 1 the truth", 1, 3, _of_scores("skill_over_prior")),
-        Measure("CRPS skill, determined", "the same over the parameters that the log determines", 1, 3, _determined_skill),
-        Measure("CRPS", "continuous ranked probability score in theta, mean over parameters", -1, 4, _of_scores("mean_crps")),
-        Measure("energy score", "of all parameters together, in theta", -1, 3, _of_scores("energy")),
-        Measure("coverage", "share of parameters whose 90 % interval holds the truth; the prior's hold all, as the truths lie well inside", 0, 2, lambda r, _: r.scores["coverage"]["0.9"]),
-        Measure("contraction", "1 - sd / sd of the prior, mean over parameters", 0, 2, _of_scores("mean_contraction")),
-        Measure("noticed", "share of parameters outside the bounds whose median sits on that bound", 1, 2, _noticed),
-        Measure("CPU seconds", "of the method, simulations included unless they were shared", 0, 0, lambda r, _: r.cpu_seconds),
+        Measure("accuracy", "1 - |mean - truth|, mean over parameters", 1, 3, _of_scores(lambda s: s.mean_accuracy)),
+        Measure("worst accuracy", "the same of the worst parameter", 1, 3, _of_scores(lambda s: s.min_accuracy)),
+        Measure(
+            "spread",
+            "accuracy of the best parameter less that of the worst",
+            -1,
+            3,
+            _of_scores(lambda s: s.max_accuracy - s.min_accuracy),
+        ),
+        Measure(
+            "CRPS skill",
+            "1 - CRPS / CRPS of the prior; 0 is the prior, 1 the truth",
+            1,
+            3,
+            _of_scores(lambda s: s.skill_over_prior),
+        ),
+        Measure(
+            "CRPS skill, determined", "the same over the parameters that the log determines", 1, 3, _determined_skill
+        ),
+        Measure(
+            "CRPS",
+            "continuous ranked probability score in theta, mean over parameters",
+            -1,
+            4,
+            _of_scores(lambda s: s.mean_crps),
+        ),
+        Measure("energy score", "of all parameters together, in theta", -1, 3, _of_scores(lambda s: s.energy)),
+        Measure(
+            "coverage",
+            "share of parameters whose 90 % interval holds the truth; the prior's hold all, as the truths lie well "
+            "inside",
+            0,
+            2,
+            _of_scores(lambda s: s.coverage(0.9)),
+        ),
+        Measure(
+            "contraction",
+            "1 - sd / sd of the prior, mean over parameters",
+            0,
+            2,
+            _of_scores(lambda s: s.mean_contraction),
+        ),
+        Measure(
+            "noticed",
+            "share of parameters outside the bounds whose median sits on that bound",
+            1,
+            2,
+            _of_scores(_noticed),
+        ),
+        Measure(
+            "CPU seconds",
+            "of the method, simulations included unless they were shared",
+            0,
+            0,
+            lambda r, _: r.cpu_seconds,
+        ),
     )
-}  # fmt: skip
+}
 _INSIDE_MEASURES = (
     "accuracy",
     "worst accuracy",
@@ -124,7 +175,7 @@ _OUTSIDE_MEASURES = ("CRPS", "energy score", "noticed", "CPU seconds")
 
 @dataclass(frozen=True)
 class Entry:
-    """values: of the seeds. best: set apart."""
+    """Of a table: the seeds' values, and whether it is set apart as the best."""
 
     values: tuple[float, ...]
     digits: int
@@ -132,6 +183,7 @@ class Entry:
 
     @property
     def mean(self) -> float:
+        """Over seeds."""
         return float(np.mean(self.values))
 
     @property
@@ -148,7 +200,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Table:
-    """rows: (estimator, an entry or None for each column)."""
+    """A measure by estimator and environment; rows: (estimator, an entry or None for each column)."""
 
     measure: Measure
     columns: tuple[str, ...]
@@ -160,6 +212,12 @@ class Table:
         return Table(self.measure, tuple(self.columns[c] for c in columns), rows)
 
     def entry(self, row: str, column: str) -> Entry | None:
+        """The entry of an estimator on an environment.
+
+        Args:
+            row: the estimator.
+            column: the environment.
+        """
         return dict(self.rows)[row][self.columns.index(column)]
 
 
@@ -169,50 +227,64 @@ def measures(variant: str) -> tuple[str, ...]:
 
 
 def score_table(records: Sequence[Record], name: str, context: Context) -> Table | None:
-    """A table over the tasks of ``records``, all of one setting and variant; None where no record has the measure."""
-    measure = MEASURES[name]
-    columns = order_tasks({r.task for r in records})
-    default = all(r.variant == "default" for r in records)
+    """A table over the tasks of records.
+
+    Args:
+        records: all of one setting and variant.
+        name: of the measure.
+        context: of all records.
+
+    Returns:
+        The table; None where no record has the measure.
+    """
+    measure, default = MEASURES[name], all(r.variant == "default" for r in records)
     rows: dict[str, dict[str, dict[int, float]]] = {e: {} for e in order_estimators({r.estimator for r in records})}
     for record in records:
         value = measure.value(record, context) if record.done else None
         if value is not None and math.isfinite(value):
             rows[record.estimator].setdefault(record.task, {})[record.seed] = float(value)
-    columns = [c for c in columns if any(c in row for row in rows.values())]
+    rows = {estimator: row for estimator, row in rows.items() if row}
+    columns = [c for c in order_tasks({r.task for r in records}) if any(c in row for row in rows.values())]
     if not columns:
         return None
-    rows = {estimator: row for estimator, row in rows.items() if row}
     whole = [ALL] if len(columns) > 1 else []
     entries = {
-        e: [*(_seeds(row.get(c, {})) for c in columns), *(_over_tasks(row, columns) for _ in whole)]
+        e: [*(_seeds(row.get(c, {})) for c in columns), *(over_tasks(row, columns) for _ in whole)]
         for e, row in rows.items()
     }
     better = 0 if default else measure.better
-    best = [_best({e: v[k] for e, v in entries.items()}, better) for k in range(len(columns) + len(whole))]
-    return Table(
-        measure,
-        (*columns, *whole),
-        tuple(
-            (e, tuple(Entry(v, measure.digits, best[k] == e) if v else None for k, v in enumerate(values)))
-            for e, values in entries.items()
-        ),
-    )
+    best = [best_of({e: v[k] for e, v in entries.items()}, better) for k in range(len(columns) + len(whole))]
+    made = {
+        e: tuple(Entry(v, measure.digits, best[k] == e) if v else None for k, v in enumerate(values))
+        for e, values in entries.items()
+    }
+    return Table(measure, (*columns, *whole), tuple(made.items()))
 
 
 def _seeds(values: dict[int, float]) -> tuple[float, ...]:
     return tuple(values[seed] for seed in sorted(values))
 
 
-def _over_tasks(row: dict[str, dict[int, float]], columns: Sequence[str]) -> tuple[float, ...]:
-    """Means over all tasks, of the seeds that have them all."""
+def over_tasks(row: dict[str, dict[int, float]], columns: Sequence[str]) -> tuple[float, ...]:
+    """Means over all tasks, of the seeds that have them all.
+
+    Args:
+        row: task -> seed -> value.
+        columns: the tasks.
+    """
     if not all(c in row for c in columns):
         return ()
     seeds = set.intersection(*(set(row[c]) for c in columns))
     return tuple(float(np.mean([row[c][seed] for c in columns])) for seed in sorted(seeds))
 
 
-def _best(column: dict[str, tuple[float, ...]], better: int) -> str | None:
-    """The estimator that is the best outside noise, if there is one."""
+def best_of(column: dict[str, tuple[float, ...]], better: int) -> str | None:
+    """The estimator that is the best outside noise, if there is one.
+
+    Args:
+        column: values of the seeds, by estimator.
+        better: as of ``Measure``.
+    """
     mine = {e: v for e, v in column.items() if competes(e) and v}
     if better == 0 or len(mine) < 2:
         return None
@@ -224,24 +296,37 @@ def _best(column: dict[str, tuple[float, ...]], better: int) -> str | None:
 
 
 def competes(name: str) -> bool:
-    """Whether a row is an estimator of the table's own setting: neither a baseline nor what stands beside from the direct one."""
+    """Whether a row is an estimator of the table's own setting, and not what it is held against."""
     return name not in (*BASELINES, BESIDE)
 
 
 def differ(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Whether two means differ outside noise, by Welch's test; never with one seed on either side."""
+    """Whether two means differ outside noise, by Welch's test; never with one seed on either side.
+
+    Args:
+        a: values of seeds.
+        b: values of seeds.
+    """
     if len(a) < 2 or len(b) < 2:
         return False
     if np.ptp(a) == 0 and np.ptp(b) == 0:  # deterministic
-        return bool(abs(a[0] - b[0]) > 1e-9)
+        return bool(abs(a[0] - b[0]) > _EQUAL)
     moments = [m for v in (a, b) for m in (np.mean(v), np.std(v, ddof=1), len(v))]
     return bool(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue < LEVEL)
 
 
 def against(values: Sequence[float], constant: float) -> int:
-    """1 or -1 where the mean is above or below a constant outside noise, by a one-sample t-test, else 0; 0 with one seed."""
+    """Whether a mean differs from a constant outside noise, by a one-sample t-test.
+
+    Args:
+        values: of the seeds.
+        constant: that they are held against.
+
+    Returns:
+        1 or -1 where the mean is above or below it, else 0; 0 with one seed.
+    """
     above = float(np.mean(values)) - constant
-    if len(values) < 2 or abs(above) <= 1e-9:
+    if len(values) < 2 or abs(above) <= _EQUAL:
         return 0
     if np.ptp(values) > 0 and stats.ttest_1samp(values, constant).pvalue >= LEVEL:
         return 0
@@ -262,6 +347,7 @@ def counted(records: Sequence[Record]) -> tuple[list[Record], str]:
 
 
 def order_tasks(tasks: set[str]) -> list[str]:
+    """As in the registry."""
     from sipe_bayes.envs.registry import TASKS
 
     return _ordered(tasks, list(TASKS))
@@ -278,22 +364,29 @@ def _ordered(names: set[str], order: list[str]) -> list[str]:
     return sorted(names, key=lambda n: (order.index(n) if n in order else len(order) - len(BASELINES) - 0.5, n))
 
 
-def results(records: Sequence[Record]) -> dict[str, dict[str, list[dict[str, Any]]]]:
+def results(records: Sequence[Record]) -> dict[str, dict[str, list[Scores]]]:
     """What the SiPE plot wants: estimator -> task -> scores of each seed."""
-    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    by_estimator: dict[str, dict[str, list[Scores]]] = {}
     for estimator in order_estimators({r.estimator for r in records}):
         mine = [r for r in records if r.estimator == estimator and r.done]
-        found[estimator] = {t: [r.scores for r in mine if r.task == t] for t in order_tasks({r.task for r in mine})}
-    return found
+        by_estimator[estimator] = {
+            t: [r.scored for r in mine if r.task == t] for t in order_tasks({r.task for r in mine})
+        }
+    return by_estimator
 
 
 def renamed(records: Sequence[Record], label: str) -> list[Record]:
-    """The same records with the setting in the estimator's name, so that two settings stand in one table."""
+    """The same records with the setting in the estimator's name, so that two settings stand in one table.
+
+    Args:
+        records: of one setting.
+        label: what it is called.
+    """
     return [replace(r, estimator=f"{r.estimator}, {label}") for r in records if r.estimator not in BASELINES]
 
 
 def warning_counts(records: Sequence[Record]) -> list[tuple[str, str, int]]:
-    """Estimator, warning and how often, the most frequent first; parameters and numbers left out, so that like counts as like."""
+    """Estimator, warning without parameters and numbers, and how often, the most frequent first."""
 
     def general(record: Record, warning: str) -> str:
         for name in sorted(record.names, key=len, reverse=True):
@@ -302,40 +395,3 @@ def warning_counts(records: Sequence[Record]) -> list[tuple[str, str, int]]:
 
     count = Counter((r.estimator, general(r, w)) for r in records for w in r.warnings)
     return [(estimator, text, times) for (estimator, text), times in count.most_common()]
-
-
-def sweep_rows(records: Sequence[Record]) -> list[tuple[str, str, Entry, bool]]:
-    """Of the search over hyper-parameters: estimator, values, mean accuracy over the tasks it was tuned on, whether these are the
-    library's defaults; the best first. Only combinations that were run on every task and seed of the search are comparable. Last, without
-    values, the baselines and ``laplace`` in the direct setting."""
-    tried: dict[tuple[str, str], dict[str, dict[int, float]]] = {}
-    ours: dict[tuple[str, str], bool] = {}
-    tuned = {record.task for record in records if record.setting == "sweep"}
-    for record in records:
-        searched = record.setting == "sweep"
-        beside = record.estimator in (*BASELINES, REFERENCE) and record.task in tuned
-        if not record.done or not (searched or (beside and _where(record) == ("direct", "in_distribution"))):
-            continue
-        values = ", ".join(f"{k} = {v}" for k, v in record.values.items())
-        key = (record.estimator if searched else f"{record.estimator}, direct", values)
-        tried.setdefault(key, {}).setdefault(record.task, {})[record.seed] = record.scores["mean_accuracy"]
-        ours[key] = searched and all(_default(record.estimator, k) == v for k, v in record.values.items())
-    found = []
-    for estimator in order_estimators({e for e, _ in tried}):
-        mine = {key: row for key, row in tried.items() if key[0] == estimator}
-        values_of = {key[1]: over for key, row in mine.items() if (over := _over_tasks(row, sorted(tuned)))}
-        best = _best(values_of, 1)
-        ranked = sorted(values_of, key=lambda v: -float(np.mean(values_of[v])))
-        found += [(estimator, v, Entry(values_of[v], 3, v == best), ours[estimator, v]) for v in ranked]
-    return found
-
-
-def _where(record: Record) -> tuple[str, str]:
-    return record.setting, record.variant
-
-
-def _default(estimator: str, argument: str) -> Any:
-    from sipe_bayes.inference.registry import arguments
-
-    taken = arguments(estimator)
-    return taken[argument].default if argument in taken else None

@@ -1,0 +1,1 @@
+"""The command ``sipe``, one file per command group."""

@@ -14,8 +14,8 @@ from sipe_bayes.cli import data as data_commands
 from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
+from sipe_bayes.cli.errors import check_least, exit_on_error
 from sipe_bayes.cli.progress import Progress
-from sipe_bayes.cli.refusing import refusing
 from sipe_bayes.inference.registry import ESTIMATORS
 
 if TYPE_CHECKING:
@@ -84,10 +84,9 @@ def calibrate(
     from sipe_bayes.calibration.run import run
     from sipe_bayes.core.files import to_json
 
-    with refusing("; the same command goes on"), Progress(quiet=as_json) as progress:
-        _check("--seed", seed, 0)
-        _check("--budget", budget, 1)
-        _check("--threads", threads, 1)
+    with exit_on_error("; the same command goes on"), Progress(quiet=as_json) as progress:
+        check_least(0, seed=seed)
+        check_least(1, budget=budget, threads=threads)
         calibration = run(config, estimator, seed, budget, out, threads, progress.update)
     if as_json:
         print(to_json(calibration.to_dict()))
@@ -104,7 +103,7 @@ def envs(
     from sipe_bayes.core.files import to_json
     from sipe_bayes.diagnostics.catalogue import describe, tasks, to_json_row
 
-    with refusing():  # assets may not be installed
+    with exit_on_error():  # assets may not be installed
         rows, one = (tasks(), None) if name is None else (None, describe(name))
     if as_json:
         print(to_json(rows if one is None else to_json_row(one)))
@@ -112,11 +111,6 @@ def envs(
         print_tasks(rows or [])
     else:
         print_task(one)
-
-
-def _check(option: str, value: int | None, least: int) -> None:
-    if value is not None and value < least:
-        raise ValueError(f"{option} {value}: expected at least {least}; raise it or leave it out")
 
 
 def _console() -> Console:

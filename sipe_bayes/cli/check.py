@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sipe_bayes.cli.refusing import refusing
+from sipe_bayes.cli.errors import exit_on_error
 from sipe_bayes.core.validation import at_least, whole
 from sipe_bayes.inference.registry import ESTIMATORS
 
@@ -31,7 +31,7 @@ def check(
     """Simulation-based calibration: do the estimator's intervals hold the truth on this model, noise and commands?
 
     Exit code 1 where they do not."""
-    with refusing("; the same command goes on"):
+    with exit_on_error("; the same command goes on"):
         from sipe_bayes.calibration import check as checks
         from sipe_bayes.calibration import study as studies
         from sipe_bayes.core.files import to_json

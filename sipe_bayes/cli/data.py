@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sipe_bayes.cli.refusing import BAD_INPUT, refusing
+from sipe_bayes.cli.errors import BAD_INPUT, check_least, check_one_of, command_line, exit_on_error
+
+if TYPE_CHECKING:
+    from sipe_bayes.datasets.trajectory_sets import SetName
 
 app = typer.Typer(name="data", help="Trajectories of the benchmark: make, check, export.", no_args_is_help=True)
 
@@ -37,16 +39,17 @@ def generate(
     from sipe_bayes.datasets.generation import generate as made_one_by_one
 
     made, missing = 0, 0
-    with refusing():
-        _at_least(1, count=count, steps=steps, threads=threads)
-        _at_least(0, seed=seed)
-        for found in made_one_by_one(_names(task, variant, split, type), out, count, steps, seed, _command(), threads):
-            if found.missing:
+    with exit_on_error():
+        check_least(1, count=count, steps=steps, threads=threads)
+        check_least(0, seed=seed)
+        names = _names(task, variant, split, type)
+        for one in made_one_by_one(names, out, count, steps, seed, command_line(), threads):
+            if one.missing:
                 missing += 1
-                print(f"{found.name.file}: not made: {found.missing}")
+                print(f"{one.name.file}: not made: {one.missing}")
             else:
                 made += 1
-                print(f"{found.name.file}: {found.size / 1e3:.0f} kB, {found.seconds:.1f} s", flush=True)
+                print(f"{one.name.file}: {one.size / 1e3:.0f} kB, {one.seconds:.1f} s", flush=True)
     print(f"{made} sets in {out}, {missing} not made")
     if not made:
         raise typer.Exit(BAD_INPUT)
@@ -60,9 +63,9 @@ def verify(
     from sipe_bayes.datasets import trajectory_sets
 
     chosen = folder or trajectory_sets.SHIPPED
-    with refusing():
+    with exit_on_error():
         wrong = trajectory_sets.verify(chosen)
-        sizes = [entry["bytes"] for entry in trajectory_sets.manifest(chosen).values()]
+        sizes = [entry.bytes for entry in trajectory_sets.manifest(chosen).values()]
     for line in wrong:
         print(f"sipe: {line}", file=sys.stderr)
     if wrong:
@@ -90,16 +93,18 @@ def export(
     from sipe_bayes.datasets.demonstrations import demonstrations
     from sipe_bayes.datasets.minari_data import to_minari
 
-    words: Any = (type, split, variant)
-    with refusing(), warnings.catch_warnings(record=True) as said:
+    with exit_on_error(), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = demonstrations(task, *words, count=count, seed=seed, steps=steps, folder=folder)
+        (one,) = _names([task], [variant], [split], [type])
+        made = demonstrations(
+            task, one.type, one.split, one.variant, count=count, seed=seed, steps=steps, folder=folder
+        )
         about = f"{type} trajectories of {task} ({variant}, {split})."
-        stand_in = [str(w.message) for w in said if "excitation" in str(w.message)]
-        written = to_minari(found, minari, task, " ".join([about, *stand_in]), _command())
+        stand_in = [str(w.message) for w in caught if "excitation" in str(w.message)]
+        written = to_minari(made, minari, task, " ".join([about, *stand_in]), command_line())
     for line in stand_in:
         print(f"sipe: {line}", file=sys.stderr)
-    print(f"{len(found)} episodes of {found.actions.shape[1]} steps in {written}")
+    print(f"{len(made)} episodes of {made.actions.shape[1]} steps in {written}")
 
 
 @app.command()
@@ -116,43 +121,34 @@ def demonstrate(
     from sipe_bayes.cli.progress import Progress
     from sipe_bayes.rl.demonstrate import make
 
-    with refusing():
-        _at_least(1, count=count, threads=threads)
-        _at_least(0, seed=seed)
+    with exit_on_error():
+        check_least(1, count=count, threads=threads)
+        check_least(0, seed=seed)
         if out.suffix != ".npz":
             raise ValueError(f"--out {out}: expected a name that ends in .npz; call it {out.stem}.npz")
         with Progress(unit="iterations") as progress:
-            facts = make(task, count, seed, out, _command(), threads, progress.update)
-    print(f"{count} of {facts['attempts']} attempts kept, mean return {facts['return_mean']:.1f}: {out}")
+            facts = make(task, count, seed, out, command_line(), threads, progress.update)
+    print(f"{count} of {facts.attempts} attempts kept, mean return {facts.return_mean:.1f}: {out}")
 
 
-def _names(*given: list[str] | None) -> Any:
+def _names(
+    tasks: list[str] | None, variants: list[str] | None, splits: list[str] | None, types: list[str] | None
+) -> list[SetName]:
     """The sets of the tasks, variants, splits and types given; raises ValueError for an unknown one."""
     from sipe_bayes.datasets import trajectory_sets
     from sipe_bayes.datasets.acting import AGENTS, SPLITS
     from sipe_bayes.envs.registry import TASKS
     from sipe_bayes.envs.task import VARIANTS
 
-    chosen: list[Any] = []
-    known: tuple[tuple[str, Any], ...] = (
-        ("task", tuple(TASKS)),
-        ("variant", VARIANTS),
-        ("split", SPLITS),
-        ("type", AGENTS),
-    )
-    for (option, legal), values in zip(known, given, strict=True):
+    legal = {"task": tuple(TASKS), "variant": VARIANTS, "split": SPLITS, "type": AGENTS}
+    for (option, known), values in zip(legal.items(), (tasks, variants, splits, types), strict=True):
         for value in values or ():
-            if value not in legal:
-                raise ValueError(f"--{option} {value}: expected one of {', '.join(legal)}")
-        chosen.append(values or (trajectory_sets.TASKS if option == "task" else legal))
-    return trajectory_sets.names(*chosen)
-
-
-def _at_least(least: int, **options: int | None) -> None:
-    for option, value in options.items():
-        if value is not None and value < least:
-            raise ValueError(f"--{option} {value}: expected at least {least}; raise it or leave it out")
-
-
-def _command() -> str:
-    return shlex.join(["sipe", *sys.argv[1:]])
+            check_one_of(option, value, known)
+    return list(
+        trajectory_sets.names(
+            tasks or trajectory_sets.TASKS,
+            [v for v in VARIANTS if v in (variants or VARIANTS)],
+            [s for s in SPLITS if s in (splits or SPLITS)],
+            [t for t in AGENTS if t in (types or AGENTS)],
+        )
+    )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sipe_bayes.cli.refusing import refusing
+from sipe_bayes.cli.errors import exit_on_error
 from sipe_bayes.core.validation import positive, whole
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def suggest(
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
 ) -> None:
     """Which experiment next: command sequences ranked by the expected contraction of the parameters' sds."""
-    with refusing():
+    with exit_on_error():
         import numpy as np
 
         from sipe_bayes.calibration.problem import prepare
@@ -152,8 +152,9 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
         slack = 1e-6 * (high - low)
         if model.actuator_ctrllimited[actuator] and not low - slack <= values.min() <= values.max() <= high + slack:
             raise ValueError(
-                f"--given {file}: {command.column!r} makes {command.actuator} go from {values.min():.4g} to {values.max():.4g}, beyond its "
-                f"control range, {low:.4g} to {high:.4g}, in the model's unit; make it smaller"
+                f"--given {file}: {command.column!r} makes {command.actuator} go from {values.min():.4g} to "
+                f"{values.max():.4g}, beyond its control range, {low:.4g} to {high:.4g}, in the model's unit; "
+                "make it smaller"
             )
     return Plan(np.stack(columns, axis=1), dt, name=str(file))
 

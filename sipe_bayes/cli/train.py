@@ -4,35 +4,37 @@ from __future__ import annotations
 
 import inspect
 import platform
-import shlex
-import sys
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, get_type_hints
 
 import typer
 
-from sipe_bayes.cli.refusing import refusing
+from sipe_bayes.cli.errors import check_least, command_line, exit_on_error
 from sipe_bayes.rl.settings import Settings
+
+if TYPE_CHECKING:
+    from sipe_bayes.rl.evaluation import Evaluation
 
 
 def _with_settings(command: Callable[..., None]) -> Callable[..., None]:
-    """``command`` with an option for each of ``Settings``' numbers, which it gets as keywords."""
+    """``command`` with an option for each of ``Settings``' fields, which it gets as keywords."""
     hints = get_type_hints(Settings)
     own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.kind != p.VAR_KEYWORD]
     for f in fields(Settings):
-        default, hint, more = f.default, hints[f.name], dict[str, Any]()
+        default, hint, metavar = f.default, hints[f.name], None
         if isinstance(default, tuple):
-            default, hint, more = [",".join(map(str, default))], list[str], {"metavar": "N,N"}
-        option = typer.Option(default, help=f.metadata["help"], **more)
+            default, hint, metavar = [",".join(map(str, default))], list[str], "N,N"
+        option = typer.Option(default, help=f.metadata["limits"].why, metavar=metavar)
         own.append(inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=hint))
     command.__signature__ = inspect.Signature(own)  # type: ignore[attr-defined]
     command.__annotations__ = {p.name: p.annotation for p in own}
     return command
 
 
-def _sizes(given: list[str]) -> tuple[int, ...]:
+def _sizes(given: object) -> tuple[int, ...]:
+    assert isinstance(given, list)
     *before, text = given
     if before:
         raise ValueError(f"--hidden {text}: given {len(given)} times; write all layers at once, such as 400,300")
@@ -65,10 +67,10 @@ def train(
     episodes: Annotated[int, typer.Option(help="Episodes of the cards' evaluation.")] = 100,
     threads: Annotated[int, typer.Option(help="Native threads, of simulation and networks.")] = 1,
     device: Annotated[str | None, typer.Option(help="cpu or cuda; default cuda where there is a GPU.")] = None,
-    **settings: Any,
+    **settings: object,
 ) -> None:
     """Train an agent by DDPG: expert, suboptimal agent and their cards, learning curve, checkpoint."""
-    with refusing():
+    with exit_on_error():
         import torch
 
         from sipe_bayes.cli.progress import Progress
@@ -76,11 +78,10 @@ def train(
         from sipe_bayes.rl.randomization import load_randomization
         from sipe_bayes.rl.train import train as run
 
-        if threads < 1:
-            raise ValueError(f"--threads {threads}: expected at least 1; raise it or leave it out")
+        check_least(1, threads=threads)
         torch.set_num_threads(threads)
         folder = out or Path("runs") / f"{task}-ddpg-{seed}"
-        chosen = Settings(**{**settings, "hidden": _sizes(settings["hidden"])})
+        chosen = Settings.of({**settings, "hidden": _sizes(settings["hidden"])}, "train")
         shown = None if demonstrations is None else Trajectories.load(demonstrations)
         drawn = None if randomization is None else load_randomization(randomization)
         with Progress(unit="steps") as progress:
@@ -97,7 +98,7 @@ def train(
                 report=progress.update,
             )
         for name, card in _write_cards(folder, task, seed, steps, chosen, episodes, demonstrations).items():
-            print(f"{name}: {_earned(card['evaluation'])}, {folder / name}.safetensors")
+            print(f"{name}: {_earned(card)}, {folder / name}.safetensors")
 
 
 def agents(
@@ -106,9 +107,10 @@ def agents(
     install: Annotated[bool, typer.Option("--install", help="First ship FOLDER's pair, made by `sipe train`.")] = False,
 ) -> None:
     """Evaluate each agent anew and compare with its card; exit code 1 where one is beyond two standard errors."""
-    with refusing():
+    with exit_on_error():
+        from sipe_bayes.datasets.demonstrations import AGENT_FILES
         from sipe_bayes.rl import evaluation
-        from sipe_bayes.rl.evaluation import AGENTS, check_agents
+        from sipe_bayes.rl.evaluation import check_agents
 
         if install:
             if folder is None:
@@ -116,44 +118,46 @@ def agents(
             for path in evaluation.install(folder):
                 print(f"installed {path}")
         differing = 0
-        for row in check_agents(folder or AGENTS, episodes):
-            verdict = "within two standard errors" if row["agrees"] else "BEYOND two standard errors"
-            print(f"{row['agent']}: {_earned(row['found'])}; card {_earned(row['card'])}: {verdict}", flush=True)
-            differing += not row["agrees"]
+        for check in check_agents(folder or AGENT_FILES, episodes):
+            verdict = "within two standard errors" if check.agrees else "BEYOND two standard errors"
+            print(f"{check.agent}: {_earned(check.now)}; card {_earned(check.card)}: {verdict}", flush=True)
+            differing += not check.agrees
     if differing:
         raise typer.Exit(1)
 
 
-def _earned(found: dict[str, Any]) -> str:
-    rate = "" if found["success_rate"] is None else f", success {found['success_rate']:.2f}"
-    return f"return {found['mean']:.1f} ± {found['standard_error']:.1f} (sd {found['sd']:.1f}){rate}"
+def _earned(by: Evaluation) -> str:
+    rate = "" if by.success_rate is None else f", success {by.success_rate:.2f}"
+    return f"return {by.mean:.1f} ± {by.standard_error:.1f} (sd {by.sd:.1f}){rate}"
 
 
 def _write_cards(
     folder: Path, task: str, seed: int, steps: int, settings: Settings, episodes: int, demonstrations: Path | None
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, Evaluation]:
     from importlib.metadata import version
 
     from sipe_bayes.envs.registry import make_task
     from sipe_bayes.rl.demonstrate import facts_of
-    from sipe_bayes.rl.evaluation import beside, write_card
+    from sipe_bayes.rl.evaluation import references, write_card
     from sipe_bayes.rl.train import choose, read_curve
 
-    rows = read_curve(folder)
+    curve = read_curve(folder)
     packages = {name: version(name) for name in ("sipe-bayes", "mujoco", "numpy", "torch")}
     facts = {
-        "command": shlex.join(["sipe", *sys.argv[1:]]),
+        "command": command_line(),
         "seed": seed,
         "steps": steps,
-        "wall_seconds": rows[-1][4],
+        "wall_seconds": curve[-1].wall_seconds,
         "deviations": settings.deviations(),
-        "settings": settings.to_dict(),
+        "settings": settings.plain(),
         "demonstrations": None if demonstrations is None else facts_of(demonstrations),
         "versions": {"python": platform.python_version(), **packages},
     }
-    made, cards = make_task(task), {}
-    others = beside(made, episodes)
-    for name, step in choose(rows, steps).items():
-        more = {"agent": name, "kept_at_step": step, **facts}
-        cards[name] = write_card(folder / f"{name}.safetensors", made, more, others, episodes)
-    return cards
+    made = make_task(task)
+    others = references(made, episodes)
+    return {
+        name: write_card(
+            folder / f"{name}.safetensors", made, {"agent": name, "kept_at_step": step, **facts}, others, episodes
+        )
+        for name, step in choose(curve, steps).items()
+    }

@@ -3,36 +3,40 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sipe_bayes.cli.benchmark import (
+from sipe_bayes.cli.errors import check_least, exit_on_error
+from sipe_bayes.cli.studies import (
     Address,
-    AsJson,
-    Folder,
     Jobs,
-    OneSuite,
     Out,
     Retry,
     Where,
-    about,
-    asked,
-    at_least_one,
-    command_line,
+    add_status_and_cells,
     executor_of,
-    exit_if_failed,
-    needs_suite,
-    print_status,
-    say,
+    measure,
+    named_suite,
 )
-from sipe_bayes.cli.refusing import refusing
+
+if TYPE_CHECKING:
+    from sipe_bayes.benchmark.studies import Study
 
 app = typer.Typer(
     name="transfer",
     help="Train agents where an estimator believes the target to be, and test them there.",
     no_args_is_help=True,
 )
+
+
+def _study() -> Study:
+    from sipe_bayes.benchmark.studies import TRANSFER
+
+    return TRANSFER
+
+
+add_status_and_cells(app, _study, "How far a transfer is, what failed, and what each agent earns in the target.")
 
 
 @app.command()
@@ -63,42 +67,23 @@ def run(
     address: Address = None,
     retry_failed: Retry = False,
 ) -> None:
-    """Measure the cells of a suite that have no record yet, and first the estimates that they need; exit code 1 if one failed."""
-    with refusing("; the same command goes on"):
-        from sipe_bayes.benchmark.run import changed
-        from sipe_bayes.benchmark.transfer import run as transfer_run
-        from sipe_bayes.benchmark.transfer.study import select as chosen
+    """Measure a suite's cells that have no record yet, after the estimates that they need; exit code 1 if one failed."""
+    with exit_on_error("; the same command goes on"):
+        from sipe_bayes.benchmark.cells import changed
         from sipe_bayes.benchmark.transfer.study import varied
 
-        at_least_one(
-            training=training,
-            budget=budget,
-            steps=steps,
-            jobs=jobs,
-            action_delay=action_delay,
-            wider=wider,
-            particles=particles,
-        )
+        check_least(1, training=training, budget=budget, steps=steps, jobs=jobs)
+        check_least(1, action_delay=action_delay, wider=wider, particles=particles)
         if observation_noise is not None and not 0 < observation_noise < float("inf"):
             raise ValueError(f"--observation-noise {observation_noise}: expected an sd above 0; leave it out for none")
-        cells = changed(chosen(asked(suite), select or ()), training=training, budget=budget, steps=steps)
+        study = _study()
+        cells = changed(study.select(named_suite(suite), select or ()), budget, steps, training)
         if point and particles is not None:
             raise ValueError(f"--particles {particles}: does not go with --point; leave one of them out")
         cells = varied(cells, point="mean" if point else None, particles=particles)
         cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
-        start = executor_of(executor, jobs, address)
-        failed = transfer_run.run(cells, out, start, command_line(), retry_failed, say)
-    exit_if_failed("unit", failed, f"transfer status {out}")
-
-
-@app.command()
-def status(folder: Folder = Path("results"), as_json: AsJson = False) -> None:
-    """How far a transfer is, what failed, and what each agent earns in the target."""
-    with refusing():
-        from sipe_bayes.benchmark.transfer.run import lines, summary
-
-        found = summary(folder)
-    print_status(found, lines, as_json)
+        end = measure(study, cells, out, executor_of(executor, jobs, address), retry_failed)
+    end()
 
 
 @app.command()
@@ -107,7 +92,7 @@ def report(
     out: Annotated[Path | None, typer.Option(help="Where to write; default transfer/ in the same folder.")] = None,
 ) -> None:
     """transfer.md, transfer.csv, the bars of the paper's Figure 6 and learning curves."""
-    with refusing():
+    with exit_on_error():
         from sipe_bayes.benchmark.run import not_a_file
         from sipe_bayes.benchmark.transfer.report import write
 
@@ -116,19 +101,3 @@ def report(
         written = write(folder, out)
     for path in written:
         print(path)
-
-
-@app.command()
-def cells(
-    suite: OneSuite = None,
-    select: Annotated[list[str] | None, typer.Option(help="As of `sipe transfer run`.")] = None,
-) -> None:
-    """The suites, or the ids of a suite's cells."""
-    with refusing():
-        from sipe_bayes.benchmark.transfer.study import SUITES
-        from sipe_bayes.benchmark.transfer.study import select as chosen
-
-        needs_suite(suite, select)
-        cells = [] if suite is None else chosen(suite, select or ())
-        found = about(SUITES) if suite is None else [f"{c.id} ({c.training:,} control steps)" for c in cells]
-    print("\n".join(found))

@@ -1,0 +1,1 @@
+"""Trajectories of the benchmark's tasks: demonstrations, the sets that are stored, and Minari."""

@@ -1,18 +1,20 @@
 """How an agent, a random policy or an excitation policy acts in a task, and the trajectories that come of it.
 
-Each trajectory has a random generator of its own, ``default_rng([seed, split, number, ...])``, so that more of them begin with
-the same ones and splits are disjoint; expert, suboptimal and random ones have different ones as well. The variants of a task
-share theirs: trajectory i of each starts alike, which pairs comparisons between variants.
+Each trajectory has a random generator of its own, ``default_rng([seed, split, number, ...])``, so that more of them
+begin with the same ones and splits are disjoint; expert, suboptimal and random ones have different ones as well. The
+variants of a task share theirs: trajectory i of each starts alike, which pairs comparisons between variants.
 
-- An agent acts on what it observes, in closed loop. It is deterministic: in a task that always starts from the same state
-  (the Adroit hand's) all its trajectories would be one, so there its actions get Gaussian noise of 0.05 of the half range.
+- An agent acts on what it observes, in closed loop. It is deterministic: in a task that always starts from the same
+  state (the Adroit hand's) all its trajectories would be one, so there its actions get Gaussian noise of 0.05 of the
+  half range.
 - The random policy draws every action anew, uniform between the bounds.
-- The excitation policy is the task's own where it has one (Fetch: the hand moves the object), else smooth and open loop:
-  for each action a sum of five sines between 0.1 and 2 Hz with random frequencies, phases and shares of an amplitude of 0.8 of
-  the half range, so that the bounds are kept. It shows the dynamics, not the task.
+- The excitation policy is the task's own where it has one (Fetch: the hand moves the object), else smooth and open
+  loop: for each action a sum of five sines between 0.1 and 2 Hz with random frequencies, phases and shares of an
+  amplitude of 0.8 of the half range, so that the bounds are kept. It shows the dynamics, not the task.
 
 Agents' and random actions are rounded to float32, in which trajectory sets keep them: what is stored is what was done.
-Nothing ends an episode: a robot may fall and an arm may miss its object, and it goes on for the number of steps asked for.
+Nothing ends an episode: a robot may fall and an arm may miss its object, and it goes on for the number of steps asked
+for.
 """
 
 from __future__ import annotations
@@ -22,13 +24,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
 Agent = Literal["expert", "suboptimal", "random"]
 Split = Literal["reference", "validation", "test"]
 Policy = Callable[[FloatArray], FloatArray]
@@ -36,15 +37,40 @@ Policy = Callable[[FloatArray], FloatArray]
 
 AGENTS: tuple[Agent, ...] = ("expert", "suboptimal", "random")
 SPLITS: tuple[Split, ...] = ("reference", "validation", "test")
-_SINES, _SLOWEST, _FASTEST, _AMPLITUDE = 5, 0.1, 2.0, 0.8  # number, Hz, Hz, of half the action's range
-_ACTION_NOISE = 0.05  # sd of an agent's actions where every episode starts alike, of half the action's range
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Smooth actions, and an agent's where every episode starts alike.
+
+    Args:
+        sines: of each action.
+        slowest: of them, Hz.
+        fastest: of them, Hz.
+        amplitude: of their sum, of half the action's range.
+        noise: sd of an agent's actions where every episode starts alike, of half the action's range.
+    """
+
+    sines: int = 5
+    slowest: float = 0.1
+    fastest: float = 2.0
+    amplitude: float = 0.8
+    noise: float = 0.05
+
+
+EXCITATION = Excitation()
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What decides the actions. plan: (steps, generator) -> (T, A) before the start. respond: (observations (1, O), the planned
-    action (A,), generator) -> (A,), or None in open loop. key: what its generators are seeded with besides seed, split and
-    number. single: whether actions are rounded to float32."""
+    """What decides the actions.
+
+    Args:
+        plan: (steps, generator) -> (T, A) before the start.
+        respond: (observations (1, O), the planned action (A,), generator) -> (A,), or None in open loop.
+        key: what its generators are seeded with besides seed, split and number.
+        single: whether actions are rounded to float32.
+    """
 
     plan: Callable[[int, np.random.Generator], FloatArray]
     respond: Callable[[FloatArray, FloatArray, np.random.Generator], FloatArray] | None = None
@@ -53,7 +79,13 @@ class Behaviour:
 
 
 def agent(task: Task, policy: Policy, type: Agent) -> Behaviour:
-    """A deterministic policy's, one observation at a time: the bits do not depend on how many lanes there are."""
+    """A deterministic policy's, one observation at a time: the bits do not depend on how many trajectories there are.
+
+    Args:
+        task: which.
+        policy: actions (B, A) of observations (B, O).
+        type: of the agent.
+    """
     low, high, size = task.action_low, task.action_high, task.num_actions
     noise = action_noise(task)
     return Behaviour(
@@ -72,7 +104,12 @@ def random(task: Task) -> Behaviour:
 
 
 def excitation(task: Task, dt: float) -> Behaviour:
-    """The excitation policy's."""
+    """The excitation policy's.
+
+    Args:
+        task: which.
+        dt: of a control step, s.
+    """
 
     def respond(seen: FloatArray, planned: FloatArray, rng: np.random.Generator) -> FloatArray:
         chosen = task.excitation(seen, rng)
@@ -83,28 +120,51 @@ def excitation(task: Task, dt: float) -> Behaviour:
 
 
 def smooth_actions(task: Task, dt: float, steps: int, rng: np.random.Generator) -> FloatArray:
-    """The open-loop excitation's actions (T, A), within the task's bounds."""
-    shape = (task.num_actions, _SINES)
-    frequency = np.exp(rng.uniform(np.log(_SLOWEST), np.log(_FASTEST), shape))
-    phase, share = rng.uniform(0, 2 * np.pi, shape), rng.dirichlet(np.ones(_SINES), task.num_actions)
+    """The open-loop excitation's actions (T, A), within the task's bounds.
+
+    Args:
+        task: which.
+        dt: of a control step, s.
+        steps: T.
+        rng: of frequencies, phases and shares.
+    """
+    of = EXCITATION
+    shape = (task.num_actions, of.sines)
+    frequency = np.exp(rng.uniform(np.log(of.slowest), np.log(of.fastest), shape))
+    phase, share = rng.uniform(0, 2 * np.pi, shape), rng.dirichlet(np.ones(of.sines), task.num_actions)
     time = np.arange(steps)[:, None, None] * dt
     wave = (share * np.sin(2 * np.pi * frequency * time + phase)).sum(-1)
     centre, half = (task.action_low + task.action_high) / 2, (task.action_high - task.action_low) / 2
-    return np.asarray(centre + _AMPLITUDE * half * wave)
+    return np.asarray(centre + of.amplitude * half * wave)
 
 
 def simulate(
     simulator: Simulator, theta: FloatArray, behaviour: Behaviour, split: Split, count: int, seed: int, steps: int
 ) -> tuple[Trajectories, FloatArray | None]:
-    """``count`` trajectories of ``steps`` control steps at theta (N,), and their goals (B, G) or None; raises RuntimeError
-    where a simulation diverges."""
+    """Trajectories of a behaviour.
+
+    Args:
+        simulator: of a task.
+        theta: (N,).
+        behaviour: how it acts.
+        split: of the trajectories.
+        count: how many.
+        seed: of all.
+        steps: control steps.
+
+    Returns:
+        The trajectories, and their goals (B, G) or None.
+
+    Raises:
+        RuntimeError: where a simulation diverges.
+    """
     task = simulator.environment
     assert isinstance(task, Task)
     rngs = [np.random.default_rng([seed, SPLITS.index(split), i, *behaviour.key]) for i in range(count)]
     drawn = [task.initial_states(rng, 1) for rng in rngs]
     states = np.concatenate([state for state, _ in drawn])
-    found = [goal for _, goal in drawn if goal is not None]
-    goals = np.concatenate(found) if found else None
+    given = [goal for _, goal in drawn if goal is not None]
+    goals = np.concatenate(given) if given else None
     actions = np.stack([behaviour.plan(steps, rng) for rng in rngs])
     if behaviour.respond is not None:
         actions = _closed_loop(simulator, theta, behaviour, states, goals, actions, rngs)
@@ -128,8 +188,10 @@ def _closed_loop(
     planned: FloatArray,
     rngs: list[np.random.Generator],
 ) -> FloatArray:
-    """Actions (B, T, A) from starting states (B, S), control step by control step. The state is Markov: rolled out whole they
-    give the same motion to the last bit."""
+    """Actions (B, T, A) from starting states (B, S), control step by control step.
+
+    The state is Markov: rolled out whole they give the same motion to the last bit.
+    """
     respond, actions, rows = behaviour.respond, np.empty_like(planned), np.tile(theta, (len(states), 1))
     assert respond is not None
     seen = simulator.rollout(rows, np.zeros_like(planned[:, :1]), states, allow_outside=True, goals=goals).observations
@@ -159,4 +221,4 @@ def action_noise(task: Task) -> float:
     """Sd of the noise on a deterministic agent's actions: zero but where every episode starts alike."""
     first, second = (task.initial_states(np.random.default_rng(seed), 1) for seed in (0, 1))
     alike = all(a is b or np.array_equal(np.asarray(a), np.asarray(b)) for a, b in zip(first, second, strict=True))
-    return _ACTION_NOISE * (task.action_high - task.action_low) / 2 if alike else 0.0
+    return EXCITATION.noise * (task.action_high - task.action_low) / 2 if alike else 0.0

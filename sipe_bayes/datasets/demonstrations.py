@@ -2,10 +2,10 @@
 
 ``sipe.demonstrations(env, type="expert")``. In this order:
 
-1. a trajectory set that is stored (``sipe_bayes.datasets.trajectory_sets``), where it was made with these parameters and seed and is as
-   large as asked for;
-2. a simulation of the agent, whose file is looked for in ``sipe_bayes/datasets/agents``, at these parameters; type "random"
-   needs none;
+1. a trajectory set that is stored (``sipe_bayes.datasets.trajectory_sets``), where it was made with these parameters
+   and seed and is as large as asked for;
+2. a simulation of the agent, whose file is looked for in ``sipe_bayes/datasets/agents``, at these parameters; type
+   "random" needs none;
 3. where there is no such agent, an excitation policy stands in, and a UserWarning says so.
 
 How each of them acts is described in ``sipe_bayes.datasets.acting``.
@@ -18,12 +18,13 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Protocol, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.core.validation import one_of, whole
 from sipe_bayes.datasets import acting, trajectory_sets
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Behaviour, Split
 from sipe_bayes.datasets.trajectory_sets import COUNT, SHIPPED, SetName, TrajectorySetError
@@ -31,19 +32,28 @@ from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import VARIANTS, Task, Variant
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
 
-_FOLDER = Path(__file__).parent / "agents"
+class Wrapped(Protocol):
+    """A Gymnasium environment of ``sipe.make``, vectorised or not."""
+
+    @property
+    def unwrapped(self) -> object:
+        """The environment within all wrappers."""
+
+
+Environment = str | Task | Simulator | Wrapped
+"""A task's name, the task, its simulator, or a Gymnasium environment of this library."""
+
+AGENT_FILES = Path(__file__).parent / "agents"
 _ROBOTS = {  # tasks that share the agent of another: what is unknown differs, the robot does not
     "HalfCheetahJoints": "HalfCheetahLinks",
     "HalfCheetahAllJoints": "HalfCheetahLinks",
     "HumanoidJoints": "HumanoidLinks",
 }
-_LONGEST = 250  # control steps where none are asked for, of an episode that is longer
 
 
 def demonstrations(
-    env: Any,
+    env: Environment,
     type: Agent = "expert",
     split: Split = "reference",
     variant: Variant | None = None,
@@ -55,35 +65,43 @@ def demonstrations(
     noise_seed: int = 0,
     folder: str | Path | None = None,
 ) -> Trajectories:
-    """``count`` trajectories of ``steps`` control steps, default an episode or its first 250, with states and rewards.
+    """Trajectories of an agent, with states and rewards; the same arguments give the same ones, fewer begin alike.
 
-    env: a task's name, a Task, a Simulator of one, or a Gymnasium environment of ``sipe.make``. variant: the parameters, by
-    default the published model's; a Gymnasium environment has its own, and then a variant that differs from them is refused.
-    type: expert, suboptimal or random. split: reference, validation or test; they differ in starting states and actions. The same
-    arguments give the same trajectories, fewer begin alike.
-    noise: white noise on the observations, its sd as a share of each channel's spread over these trajectories, or (O,) in each
-    channel's unit; noise_seed: its own. Noisy trajectories hold neither states nor rewards, which would give the truth away.
-    folder: read what `sipe data generate --out` wrote there, and nothing else.
+    Args:
+        env: a task's name, a Task, a Simulator of one, or a Gymnasium environment of ``sipe.make``.
+        type: expert, suboptimal or random.
+        split: reference, validation or test; they differ in starting states and actions.
+        variant: the parameters, by default the published model's; a Gymnasium environment has its own, and then a
+            variant that differs from them is refused.
+        count: how many.
+        seed: of starting states and actions.
+        steps: control steps, default an episode or its first 250.
+        noise: white noise on the observations, its sd as a share of each channel's spread over these trajectories, or
+            (O,) in each channel's unit. Noisy trajectories hold neither states nor rewards, which would give the truth
+            away.
+        noise_seed: its own.
+        folder: read what `sipe data generate --out` wrote there, and nothing else.
 
-    Raises ValueError for what has no starting states or is not in ``folder``, TrajectorySetError for a damaged file, and
-    RuntimeError where a simulation diverges.
+    Raises:
+        ValueError: for what has no starting states or is not in ``folder``.
+        TrajectorySetError: for a damaged file.
+        RuntimeError: where a simulation diverges.
     """
-    for name, value, known in (("type", type, AGENTS), ("split", split, SPLITS)):
-        if value not in known:
-            raise ValueError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
+    one_of("type", type, AGENTS)
+    one_of("split", split, SPLITS)
     simulator, theta = _placed(env, variant)
     task = simulator.environment
     assert isinstance(task, Task)
-    horizon = default_steps(task) if steps is None else steps
-    if count < 1 or horizon < 1:
-        raise ValueError(f"count and steps: expected at least 1 of each, got {count} and {horizon}")
-    found = _stored(simulator, theta, split, type, count, seed, horizon, SHIPPED if folder is None else Path(folder))
-    if found is None and folder is not None:
+    horizon = default_steps(task) if steps is None else whole("steps", steps)
+    whole("count", count)
+    where = SHIPPED if folder is None else Path(folder)
+    recorded = _stored(simulator, theta, split, type, count, seed, horizon, where)
+    if recorded is None and folder is not None:
         raise TrajectorySetError(
-            f"folder {folder}: holds no {type} {split} set of {task.name} with these parameters, seed {seed}, and at least "
-            f"{count} trajectories of {horizon} steps; make it with `sipe data generate`, or leave folder out"
+            f"folder {folder}: holds no {type} {split} set of {task.name} with these parameters, seed {seed}, and at "
+            f"least {count} trajectories of {horizon} steps; make it with `sipe data generate`, or leave folder out"
         )
-    if found is None:
+    if recorded is None:
         behaviour = behaviour_of(task, type)
         if behaviour is None:
             warnings.warn(
@@ -92,17 +110,33 @@ def demonstrations(
                 stacklevel=_caller(),
             )
             behaviour = acting.excitation(task, simulator.dt)
-        found, _ = acting.simulate(simulator, theta, behaviour, split, count, seed, horizon)
-    return _noisy(found, noise, noise_seed)
+        recorded, _ = acting.simulate(simulator, theta, behaviour, split, count, seed, horizon)
+    return _noisy(recorded, noise, noise_seed)
 
 
-def default_steps(task: Task) -> int:
-    """Control steps of a trajectory where none are asked for."""
-    return min(task.episode_steps, _LONGEST)
+def default_steps(task: Task, longest: int = 250) -> int:
+    """Control steps of a trajectory where none are asked for.
+
+    Args:
+        task: which.
+        longest: of a task whose episodes are longer.
+    """
+    return min(task.episode_steps, longest)
 
 
 def behaviour_of(task: Task, type: Agent) -> Behaviour | None:
-    """How the agent acts, or None where it is not installed; raises ValueError for a file that is no such policy."""
+    """How an agent acts.
+
+    Args:
+        task: which.
+        type: of the agent.
+
+    Returns:
+        None where it is not installed.
+
+    Raises:
+        PolicyError: for a file that is no such policy.
+    """
     if type == "random":
         return acting.random(task)
     file = agent_file(task.name, type)
@@ -114,19 +148,24 @@ def behaviour_of(task: Task, type: Agent) -> Behaviour | None:
     sizes, expected = (policy.observation_size, policy.action_size), (len(task.channels), task.num_actions)
     if sizes != expected:
         raise PolicyError(
-            f"{file}: expected {expected[0]} observations and {expected[1]} actions for {task.name}, got {sizes[0]} and "
-            f"{sizes[1]}; train it anew with `sipe train`"
+            f"{file}: expected {expected[0]} observations and {expected[1]} actions for {task.name}, got {sizes[0]} "
+            f"and {sizes[1]}; train it anew with `sipe train`"
         )
     return acting.agent(task, policy, type)
 
 
 def agent_file(task: str, type: str) -> Path | None:
-    """The file of a task's agent, or None where it is not installed."""
-    path = _FOLDER / f"{_ROBOTS.get(task, task)}-{type}.safetensors"
+    """The file of a task's agent, or None where it is not installed.
+
+    Args:
+        task: its name.
+        type: of the agent.
+    """
+    path = AGENT_FILES / f"{_ROBOTS.get(task, task)}-{type}.safetensors"
     return path if path.is_file() else None
 
 
-def _placed(env: Any, variant: Variant | None) -> tuple[Simulator, FloatArray]:
+def _placed(env: Environment, variant: Variant | None) -> tuple[Simulator, FloatArray]:
     """The simulator of ``env`` and the parameters (N,) asked for."""
     simulator, theta = simulator_of(env)
     task = simulator.environment
@@ -140,7 +179,8 @@ def _placed(env: Any, variant: Variant | None) -> tuple[Simulator, FloatArray]:
     wanted = task.theta(variant or "default")
     if own and not np.array_equal(theta, wanted):
         raise ValueError(
-            f"variant: env has parameters other than those of {variant!r}; leave variant out, or give the name {task.name!r}"
+            f"variant: env has parameters other than those of {variant!r}; leave variant out, or give the name "
+            f"{task.name!r}"
         )
     return simulator, wanted
 
@@ -162,22 +202,22 @@ def _stored(
         name = SetName(task.name, variant, split, type)
         if np.array_equal(theta, task.theta(variant)):
             entry = trajectory_sets.entry_of(folder, name, simulator)
-            if entry is not None and entry["seed"] == seed and count <= entry["count"] and steps <= entry["steps"]:
+            if entry is not None and entry.seed == seed and count <= entry.count and steps <= entry.steps:
                 return trajectory_sets.read(folder, name, simulator, count, steps)
     return None
 
 
-def _noisy(found: Trajectories, noise: float | FloatArray, seed: int) -> Trajectories:
+def _noisy(recorded: Trajectories, noise: float | FloatArray, seed: int) -> Trajectories:
     """With white noise on the observations, from a generator for each trajectory."""
-    level, size = np.asarray(noise, float), found.observations.shape[-1]
+    level, size = np.asarray(noise, float), recorded.observations.shape[-1]
     if level.shape not in ((), (size,)) or not (np.isfinite(level) & (level >= 0)).all():
         raise ValueError(f"noise: expected one number or ({size},), none below zero, got {noise!r}")
     if not level.any():
-        return found
-    sd = level * found.observations.std((0, 1)) if level.ndim == 0 else level
-    shape = found.observations.shape[1:]
-    drawn = [np.random.default_rng([seed, i]).standard_normal(shape) for i in range(len(found))]
-    return replace(found, observations=found.observations + sd * np.stack(drawn), states=None, rewards=None)
+        return recorded
+    sd = level * recorded.observations.std((0, 1)) if level.ndim == 0 else level
+    shape = recorded.observations.shape[1:]
+    drawn = [np.random.default_rng([seed, i]).standard_normal(shape) for i in range(len(recorded))]
+    return replace(recorded, observations=recorded.observations + sd * np.stack(drawn), states=None, rewards=None)
 
 
 def _caller() -> int:
@@ -188,9 +228,16 @@ def _caller() -> int:
     return level
 
 
-def simulator_of(env: Any) -> tuple[Simulator, FloatArray]:
-    """The simulator of a task's name, a Task, a Simulator or a Gymnasium environment of this library, and the theta (N,) that
-    it stands for; raises TypeError for anything else."""
+def simulator_of(env: Environment) -> tuple[Simulator, FloatArray]:
+    """The simulator of an environment, and the theta (N,) that it stands for.
+
+    Args:
+        env: see ``Environment``.
+
+    Raises:
+        TypeError: for anything else.
+        ValueError: for a vectorised environment whose parameters differ.
+    """
     if isinstance(env, str):
         env = make_task(env)
     if isinstance(env, Task):
@@ -209,22 +256,32 @@ def simulator_of(env: Any) -> tuple[Simulator, FloatArray]:
     return simulator, rows[0]
 
 
-def is_environment(given: Any) -> bool:
+def is_environment(given: object) -> TypeGuard[Environment]:
     """Whether ``given`` is what ``simulator_of`` takes, and not trajectories."""
     return isinstance(given, str | Task | Simulator) or hasattr(given, "unwrapped")
 
 
 class Given:
-    """Trajectories as an estimator is given them, time after time: the same objects give the same Trajectories, and an
-    environment stands for its reference demonstrations, recorded once for each theta."""
+    """Trajectories as an estimator is given them, time after time.
+
+    The same objects give the same Trajectories, and an environment stands for its reference demonstrations, recorded
+    once for each theta.
+    """
 
     def __init__(self) -> None:
-        self._key: tuple[Any, ...] = ()
+        self._key: tuple[object, ...] = ()
         self._batch: Trajectories | None = None
 
-    def stack(self, given: Any, anew: bool = False) -> Trajectories:
-        """The trajectories of ``given``: one, several, or an environment. anew: read recorded ones again, as their arrays may
-        have changed."""
+    def stack(self, given: object, anew: bool = False) -> Trajectories:
+        """Trajectories as a batch.
+
+        Args:
+            given: one, several, or an environment.
+            anew: read recorded ones again, as their arrays may have changed.
+
+        Raises:
+            ValueError: for anything else.
+        """
         if isinstance(given, Trajectories):
             return given
         if is_environment(given):
@@ -238,19 +295,19 @@ class Given:
         self._key = () if anew else self._key
         return self._kept(items, lambda: Trajectories.stack(items))
 
-    def _kept(self, key: tuple[Any, ...], make: Callable[[], Trajectories]) -> Trajectories:
+    def _kept(self, key: tuple[object, ...], make: Callable[[], Trajectories]) -> Trajectories:
         same = len(key) == len(self._key) and all(_same(a, b) for a, b in zip(key, self._key, strict=True))
         if self._batch is None or not same:
             self._batch, self._key = make(), key
         return self._batch
 
 
-def _identity(env: Any) -> tuple[Any, ...]:
+def _identity(env: Environment) -> tuple[object, ...]:
     """What tells an environment from others; the parameters of a Gymnasium environment may change."""
     if isinstance(env, str | Task | Simulator):
         return (env,)
     return (env.unwrapped, np.asarray(getattr(env.unwrapped, "theta", 0.0), float).tobytes())
 
 
-def _same(a: Any, b: Any) -> bool:
+def _same(a: object, b: object) -> bool:
     return a is b or (isinstance(a, str | bytes) and type(a) is type(b) and bool(a == b))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sipe_bayes.datasets import acting, trajectory_sets
 from sipe_bayes.datasets.demonstrations import agent_file, behaviour_of, default_steps
-from sipe_bayes.datasets.trajectory_sets import SetName
+from sipe_bayes.datasets.trajectory_sets import Origin, SetName
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
@@ -35,8 +35,19 @@ def generate(
     command: str = "",
     num_threads: int | None = None,
 ) -> Iterator[Made]:
-    """Make sets one after the other, each written when it is done. A set without an agent, or that diverges, is passed over,
-    and says so."""
+    """Make sets one after the other, each written when it is done.
+
+    A set without an agent, or that diverges, is passed over, and says so.
+
+    Args:
+        names: which.
+        folder: to write to.
+        count: trajectories of each.
+        steps: control steps; default of the task.
+        seed: of the trajectories.
+        command: that asked for them.
+        num_threads: of the simulation.
+    """
     simulator: Simulator | None = None
     for name in names:
         began = time.monotonic()
@@ -59,11 +70,7 @@ def _generate(
     if behaviour is None:
         raise LookupError(f"no {name.type} agent of {name.task} is installed")
     horizon = default_steps(task) if steps is None else steps
-    found, goals = acting.simulate(simulator, task.theta(name.variant), behaviour, name.split, count, seed, horizon)
+    made, goals = acting.simulate(simulator, task.theta(name.variant), behaviour, name.split, count, seed, horizon)
     file = agent_file(name.task, name.type)
-    about = {
-        "seed": seed,
-        "agent_sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file else "",
-        "command": command,
-    }
-    return int(trajectory_sets.write(folder, name, simulator, found, goals, about)["bytes"])
+    agent = hashlib.sha256(file.read_bytes()).hexdigest() if file else ""
+    return trajectory_sets.write(folder, name, simulator, made, goals, Origin(seed, agent, command)).bytes

@@ -4,9 +4,9 @@
 ``sipe data export --minari NAME`` writes one. It is looked for, and written, where Minari has them: in the folder of
 ``MINARI_DATASETS_PATH``, default ~/.minari/datasets. Nothing is downloaded, and no code that a data set names is run.
 
-An observation that is a dictionary or a tuple becomes one row: its parts in the space's order, but the achieved and the desired
-goal of a goal-based environment last, as in this library's Fetch tasks. Minari has no place for the physics states: those
-exported here are in each episode's ``infos["state"]``, and come back.
+An observation that is a dictionary or a tuple becomes one row: its parts in the space's order, but the achieved and the
+desired goal of a goal-based environment last, as in this library's Fetch tasks. Minari has no place for the physics
+states: those exported here are in each episode's ``infos["state"]``, and come back.
 """
 
 from __future__ import annotations
@@ -17,36 +17,52 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.registry import TASKS
-
-FloatArray = NDArray[np.float64]
 
 _GOALS = ("achieved_goal", "desired_goal")
 _STATE = "state"
 
 
 def from_minari(dataset: str | Path, dt: float | None = None) -> Trajectories:
-    """The episodes of a Minari data set: its id, or the folder that it lies in.
+    """The episodes of a Minari data set; rewards are kept, and states where this library wrote them.
 
-    dt: seconds of a control step; by default that of the data set's environment where Gymnasium knows it by itself, and must be
-    given otherwise. Rewards are kept, and states where this library wrote them. Raises ValueError for what cannot be read and
-    ModuleNotFoundError without Minari.
+    Args:
+        dataset: its id, or the folder that it lies in.
+        dt: of a control step, s; by default that of the data set's environment where Gymnasium knows it by itself, and
+            must be given otherwise.
+
+    Raises:
+        ValueError: for what cannot be read.
+        ModuleNotFoundError: without Minari.
     """
-    found = _open(dataset)
+    opened = _open(dataset)
     if dt is None:
-        dt = _dt(found.spec.env_spec, dataset)
-    episodes = [_trajectory(episode, dt, str(dataset)) for episode in found.iterate_episodes()]
+        dt = _dt(opened.spec.env_spec, dataset)
+    episodes = [_trajectory(episode, dt, str(dataset)) for episode in opened.iterate_episodes()]
     if not episodes:
         raise ValueError(f"dataset: {dataset} holds no episodes; take another")
     return Trajectories.stack(episodes)
 
 
 def to_minari(trajectories: Trajectories, dataset: str, task: str, description: str = "", command: str = "") -> Path:
-    """Write trajectories of ``task`` with rewards as a new Minari data set, actions in float32; returns its folder. Raises
-    ValueError for a name that is none, or is taken."""
+    """Write trajectories as a new Minari data set, actions in float32.
+
+    Args:
+        trajectories: with rewards.
+        dataset: its id.
+        task: of the trajectories.
+        description: of the data set.
+        command: that made it.
+
+    Returns:
+        Its folder.
+
+    Raises:
+        ValueError: for a name that is none, or is taken.
+    """
     minari = _minari()
     if trajectories.rewards is None:
         raise ValueError("trajectories: they hold no rewards, which Minari needs; export them without noise")
@@ -92,17 +108,14 @@ def _buffers(trajectories: Trajectories) -> list[Any]:
     """An EpisodeBuffer of each trajectory, cut off at its end."""
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
-    found = []
+    buffers = []
     for i, episode in enumerate(trajectories):
         ends = np.arange(len(episode)) == len(episode) - 1
         infos = None if episode.states is None else {_STATE: episode.states}
         actions = episode.actions.astype(np.float32)
-        found.append(
-            EpisodeBuffer(
-                i, None, None, episode.observations, actions, episode.rewards, np.zeros_like(ends), ends, infos
-            )
-        )
-    return found
+        motion = (episode.observations, actions, episode.rewards)
+        buffers.append(EpisodeBuffer(i, None, None, *motion, np.zeros_like(ends), ends, infos))
+    return buffers
 
 
 def _minari() -> Any:

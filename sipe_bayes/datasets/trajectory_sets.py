@@ -1,17 +1,18 @@
-"""Trajectory sets: the benchmark's trajectories, simulated once, stored compactly, and read without being simulated again.
+"""Trajectory sets: the benchmark's trajectories, simulated once, stored compactly, and read without a simulation.
 
-A set is one file, ``TASK/VARIANT-SPLIT-TYPE.npz``: five trajectories of one agent in one variant of an environment. What is
-stored is what counts: a long contact-rich motion that is replayed on another processor drifts apart. So a file holds the
-motion itself: starting states and goals in float64, all later states, the actions and the rewards in float32.
-The time is not stored (it is k dt), nor are the observations: they follow from the states. Where an environment reads more
-than the state (the humanoid's forces, the hand's palm), sample k+1 has what one control step from the stored state k under
-the stored action k gives: no error outlives a step. Measured on the random agent's sets against the observations at the
-simulation, root mean square in each channel's sd: 1e-7 at the median and, in the worst channel, 3e-7 (hand), 4e-6 (humanoid, a
-contact's torque), 9e-6 (Fetch, an object that hardly moves). That is float32's rounding.
+A set is one file, ``TASK/VARIANT-SPLIT-TYPE.npz``: five trajectories of one agent in one variant of an environment.
+What is stored is what counts: a long contact-rich motion that is replayed on another processor drifts apart. So a file
+holds the motion itself: starting states and goals in float64, all later states, the actions and the rewards in float32.
+The time is not stored (it is k dt), nor are the observations: they follow from the states. Where an environment reads
+more than the state (the humanoid's forces, the hand's palm), sample k+1 has what one control step from the stored state
+k under the stored action k gives: no error outlives a step. Measured on the random agent's sets against the
+observations at the simulation, root mean square in each channel's sd: 1e-7 at the median and, in the worst channel,
+3e-7 (hand), 4e-6 (humanoid, a contact's torque), 9e-6 (Fetch, an object that hardly moves). That is float32's rounding.
 
-float32 numbers are kept as their four bytes apart, the time as the last axis: neighbours share exponents, so that deflate
-saves another eighth. Files hold no time stamp and no pickle: the same command on the same versions and kind of processor gives the
-same bytes. ``manifest.json`` is the one list of them: size, SHA-256, count, steps, seed, parameter values, versions, command.
+float32 numbers are kept as their four bytes apart, the time as the last axis: neighbours share exponents, so that
+deflate saves another eighth. Files hold no time stamp and no pickle: the same command on the same versions and kind of
+processor gives the same bytes. ``manifest.json`` is the one list of them: size, SHA-256, count, steps, seed, parameter
+values, versions, command.
 
 The half-cheetah's default variant is one model whatever is unknown about it, so HalfCheetahLinks' files serve for the
 others. HumanoidJoints has springs of 0.001 N m/rad where HumanoidLinks has none: each has its own.
@@ -29,21 +30,21 @@ import platform
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import to_json, write_bytes, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
 from sipe_bayes.envs.task import VARIANTS, Task, Variant
 from sipe_bayes.simulation.simulator import Simulator
-
-FloatArray = NDArray[np.float64]
 
 SHIPPED = Path(__file__).parent / "trajectories"
 FORMAT = "sipe_bayes.trajectories/1"
@@ -53,6 +54,7 @@ TASKS = (  # the benchmark's
     *("HalfCheetahLinks", "HalfCheetahJoints", "HumanoidLinks", "HumanoidJoints"),
 )
 COUNT = 5
+"""Trajectories of a set."""
 _SHARED = {
     "HalfCheetahJoints": "HalfCheetahLinks",
     "HalfCheetahAllJoints": "HalfCheetahLinks",
@@ -79,7 +81,44 @@ class SetName:
 
     @property
     def file(self) -> str:
+        """Its path in a folder of sets."""
         return f"{self.task}/{self.variant}-{self.split}-{self.type}.npz"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a set was made with besides its name: seed, SHA-256 of the agent's file (empty for none), command."""
+
+    seed: int
+    agent_sha256: str = ""
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the manifest says of a file.
+
+    Args:
+        sha256: of the file.
+        bytes: its size.
+        count: trajectories.
+        steps: control steps.
+        values: of the variant's parameters.
+        seed: of the trajectories.
+        agent_sha256: of the agent's file, empty for none.
+        command: that made it.
+        versions: what the bits depend on.
+    """
+
+    sha256: str
+    bytes: int
+    count: int = 0
+    steps: int = 0
+    values: tuple[float, ...] = ()
+    seed: int = 0
+    agent_sha256: str = ""
+    command: str = ""
+    versions: dict[str, str] | None = None
 
 
 def names(
@@ -88,20 +127,31 @@ def names(
     splits: Sequence[Split] = SPLITS,
     types: Sequence[Agent] = AGENTS,
 ) -> Iterator[SetName]:
-    """All sets of these, each file once."""
+    """All sets of these, each file once.
+
+    Args:
+        tasks: which.
+        variants: of each.
+        splits: of each.
+        types: of agents.
+    """
     every = (SetName(task, v, s, t) for task in tasks for v in variants for s in splits for t in types)
     return iter(dict.fromkeys(every))
 
 
-def manifest(folder: Path) -> dict[str, dict[str, Any]]:
-    """What a folder's manifest says of each file; nothing where there is none. Raises TrajectorySetError."""
+def manifest(folder: Path) -> dict[str, Entry]:
+    """What a folder's manifest says of each file; nothing where there is none.
+
+    Raises:
+        TrajectorySetError: for one that cannot be read.
+    """
     path = folder / MANIFEST
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        sets: dict[str, dict[str, Any]] = found["sets"]
-        good = found["format"] == FORMAT and all({"sha256", "bytes"} <= entry.keys() for entry in sets.values())
+        plain = json.loads(path.read_text(encoding="utf-8"))
+        sets = TypeAdapter(dict[str, Entry]).validate_python(plain["sets"])
+        good = plain["format"] == FORMAT
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         good = False
     if not good:
@@ -109,17 +159,32 @@ def manifest(folder: Path) -> dict[str, dict[str, Any]]:
     return sets
 
 
-def entry_of(folder: Path, name: SetName, simulator: Simulator) -> dict[str, Any] | None:
-    """The manifest's entry of a set that was made with this task's parameter values, or None."""
+def entry_of(folder: Path, name: SetName, simulator: Simulator) -> Entry | None:
+    """The manifest's entry of a set that was made with a task's parameter values.
+
+    Args:
+        folder: of sets.
+        name: of the set.
+        simulator: of the task.
+
+    Returns:
+        None where there is no such set.
+    """
     entry, task = manifest(folder).get(name.file), simulator.environment
     assert isinstance(task, Task)
     shared = name.task != task.name  # the values are another task's
     return entry if entry is not None and (shared or fits(entry, simulator, name.variant)) else None
 
 
-def fits(entry: dict[str, Any], simulator: Simulator, variant: Variant) -> bool:
-    """Whether a set was made with the values that the variant has today."""
-    return bool(entry.get("values") == _values(simulator, variant))
+def fits(entry: Entry, simulator: Simulator, variant: Variant) -> bool:
+    """Whether a set was made with the values that a variant has today.
+
+    Args:
+        entry: of the set.
+        simulator: of the task.
+        variant: of the task.
+    """
+    return list(entry.values) == _values(simulator, variant)
 
 
 def _values(simulator: Simulator, variant: Variant) -> list[float]:
@@ -135,39 +200,49 @@ def write(
     folder: Path,
     name: SetName,
     simulator: Simulator,
-    found: Trajectories,
+    trajectories: Trajectories,
     goals: FloatArray | None,
-    about: dict[str, Any],
-) -> dict[str, Any]:
-    """Store trajectories of equal length with states and rewards, and enter them in the manifest with what there is to say
-    ``about`` them; returns the entry."""
-    assert found.states is not None
-    assert found.rewards is not None
-    arrays: dict[str, Any] = {
-        "start": found.states[:, 0],
-        "states": _planes(found.states[:, 1:, 1:]),  # the time is left out
-        "actions": _planes(found.actions),
-        "rewards": found.rewards.astype(np.float32),
-        "dt": np.float64(found.dt[0]),
+    origin: Origin,
+) -> Entry:
+    """Store trajectories and enter them in the manifest.
+
+    Args:
+        folder: of sets.
+        name: of the set.
+        simulator: of its task.
+        trajectories: of equal length, with states and rewards.
+        goals: (B, G), where there are any.
+        origin: what else there is to say of them.
+
+    Returns:
+        The manifest's entry.
+    """
+    assert trajectories.states is not None
+    assert trajectories.rewards is not None
+    arrays: dict[str, NDArray[Any]] = {
+        "start": trajectories.states[:, 0],
+        "states": _planes(trajectories.states[:, 1:, 1:]),  # the time is left out
+        "actions": _planes(trajectories.actions),
+        "rewards": trajectories.rewards.astype(np.float32),
+        "dt": np.asarray(trajectories.dt[0], np.float64),
     }
     if goals is not None:
         arrays["goals"] = goals
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     content = buffer.getvalue()
-    path = folder / name.file
-    write_bytes(path, content)
-    entry = {
-        "sha256": hashlib.sha256(content).hexdigest(),
-        "bytes": len(content),
-        "count": len(found),
-        "steps": found.actions.shape[1],
-        "values": _values(simulator, name.variant),
-        **about,
-        "versions": versions(),
-    }
-    sets = {**manifest(folder), name.file: entry}
-    write_text(folder / MANIFEST, to_json({"format": FORMAT, "sets": dict(sorted(sets.items()))}, indent=1))
+    write_bytes(folder / name.file, content)
+    entry = Entry(
+        sha256=hashlib.sha256(content).hexdigest(),
+        bytes=len(content),
+        count=len(trajectories),
+        steps=trajectories.actions.shape[1],
+        values=tuple(_values(simulator, name.variant)),
+        **asdict(origin),
+        versions=versions(),
+    )
+    sets = {file: asdict(kept) for file, kept in sorted({**manifest(folder), name.file: entry}.items())}
+    write_text(folder / MANIFEST, to_json({"format": FORMAT, "sets": sets}, indent=1))
     return entry
 
 
@@ -207,8 +282,18 @@ def _joined(planes: NDArray[np.uint8]) -> FloatArray:
 
 
 def read(folder: Path, name: SetName, simulator: Simulator, count: int, steps: int) -> Trajectories:
-    """The first ``count`` trajectories of a set and their first ``steps`` steps, with states and rewards, as of the
-    variant's parameters. Raises TrajectorySetError, which names the file, for one that is not as the manifest says."""
+    """The first trajectories of a set, with states and rewards, as of the variant's parameters.
+
+    Args:
+        folder: of sets.
+        name: of the set.
+        simulator: of its task.
+        count: trajectories.
+        steps: control steps of each.
+
+    Raises:
+        TrajectorySetError: for a file that is not as the manifest says; it names the file.
+    """
     arrays = _arrays(folder, name.file)
     start, goals = arrays["start"][:count], arrays["goals"][:count] if "goals" in arrays else None
     actions = np.ascontiguousarray(_joined(arrays["actions"])[:count, :steps])
@@ -220,8 +305,8 @@ def read(folder: Path, name: SetName, simulator: Simulator, count: int, steps: i
     assert isinstance(task, Task)
     if states.shape[-1] != simulator.state_size or actions.shape[-1] != task.num_actions:
         raise TrajectorySetError(
-            f"{folder / name.file}: expected {simulator.state_size} numbers of state and {task.num_actions} of action for "
-            f"{task.name}, got {states.shape[-1]} and {actions.shape[-1]}; {_REMEDY}"
+            f"{folder / name.file}: expected {simulator.state_size} numbers of state and {task.num_actions} of action "
+            f"for {task.name}, got {states.shape[-1]} and {actions.shape[-1]}; {_REMEDY}"
         )
     observations = _observations(simulator, task.theta(name.variant), states, actions, goals)
     return Trajectories(
@@ -237,18 +322,18 @@ def read(folder: Path, name: SetName, simulator: Simulator, count: int, steps: i
     )
 
 
-def _arrays(folder: Path, file: str) -> dict[str, Any]:
+def _arrays(folder: Path, file: str) -> dict[str, NDArray[Any]]:
     """What a file holds, checked against the manifest before it is opened."""
     path, entry = folder / file, manifest(folder)[file]
     try:
         content = path.read_bytes()
     except OSError as error:
         raise TrajectorySetError(f"{path}: cannot be read ({error.strerror}); {_REMEDY}") from None
-    if len(content) != entry["bytes"]:
+    if len(content) != entry.bytes:
         raise TrajectorySetError(
-            f"{path}: expected {entry['bytes']} bytes, got {len(content)}: cut short or another file; {_REMEDY}"
+            f"{path}: expected {entry.bytes} bytes, got {len(content)}: cut short or another file; {_REMEDY}"
         )
-    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
+    if hashlib.sha256(content).hexdigest() != entry.sha256:
         raise TrajectorySetError(f"{path}: its SHA-256 is not the manifest's: corrupted or altered; {_REMEDY}")
     stream = io.BytesIO(content)
     try:

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
 import numpy as np
 
 from sipe_bayes.core.files import write_bytes
@@ -27,6 +26,7 @@ from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report.drawing import png, unit_text
+from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.verdicts import improvement, parameter_verdict, verdicts
 from sipe_bayes.report.words import error_text, number, significant, times
 
@@ -216,14 +216,8 @@ def render(calibration: Calibration, images: Sequence[Picture]) -> str:
         calibration: what is reported.
         images: its figures.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sipe_bayes.report", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html.j2").render(**_context(calibration, images))
+    template = html_templates("sipe_bayes.report").get_template("report.html.j2")
+    return template.render(**_context(calibration, images))
 
 
 def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:

@@ -2,26 +2,49 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.report.drawing import DEFAULT, POSTERIOR, PRIOR, _short, _ticks, unit_text
+from sipe_bayes.report.drawing import (
+    DEFAULT,
+    MEASURED,
+    POSTERIOR,
+    PRIOR,
+    STYLE,
+    legend_above,
+    new_figure,
+    shortened,
+    ticks,
+    unit_text,
+)
 
 if TYPE_CHECKING:
     from sipe_bayes.posterior import Posterior
 
-FloatArray = NDArray[np.float64]
+Place = float | None
+"""Of the model as given or the truth, in theta; None where there is none."""
 
-DRAWS = 8000
+_POINT = 1e-6  # spread of draws in theta below which rounding is all that is left of it: a point
 
 
-def draws(posterior: Posterior, n: int = DRAWS) -> FloatArray:
-    """Fixed-seed draws theta (n, N)."""
+def draws(posterior: Posterior, n: int = STYLE.points) -> FloatArray:
+    """Draws of a posterior with a fixed seed.
+
+    Args:
+        posterior: over N parameters.
+        n: how many.
+
+    Returns:
+        theta (n, N), within [0, 1].
+    """
     import torch
 
     values = posterior.values(n, generator=torch.Generator().manual_seed(0))
@@ -29,8 +52,17 @@ def draws(posterior: Posterior, n: int = DRAWS) -> FloatArray:
 
 
 def density(theta: FloatArray, grid: FloatArray) -> FloatArray:
-    """Density (G,) at ``grid`` (G,) of draws theta (M,) in [0, 1]: Gaussian kernels, reflected at both
-    bounds, so that nothing leaks past them and an edge is not rounded off."""
+    """Density of draws in [0, 1] by Gaussian kernels.
+
+    They are reflected at both bounds, so that nothing leaks past them and an edge is not rounded off.
+
+    Args:
+        theta: draws (M,).
+        grid: where the density is wanted (G,).
+
+    Returns:
+        The density (G,), 0 outside [0, 1].
+    """
     q25, q75 = np.quantile(theta, (0.25, 0.75))
     sd = float(theta.std())
     width = 0.9 * (min(sd, (q75 - q25) / 1.349) or sd) * len(np.unique(theta)) ** -0.2
@@ -48,8 +80,13 @@ def correlation(theta: FloatArray) -> FloatArray:
     return np.asarray(scaled.T @ scaled / len(theta))
 
 
-def _view(theta: FloatArray, default: float | None = None) -> tuple[float, float]:
-    """The part of [0, 1] to show: where the draws are, and the default if it is not far."""
+def view(theta: FloatArray, default: Place = None) -> tuple[float, float]:
+    """The part of [0, 1] to show: where the draws are, and the default if it is not far.
+
+    Args:
+        theta: draws (M,).
+        default: the model as given.
+    """
     low, high = (float(q) for q in np.quantile(theta, (0.002, 0.998)))
     span = max(high - low, 1e-6)
     view_low, view_high = low - 0.3 * span, high + 0.3 * span
@@ -60,68 +97,202 @@ def _view(theta: FloatArray, default: float | None = None) -> tuple[float, float
     return max(view_low, 0.0), min(view_high, 1.0)
 
 
-def _scale(parameter: Parameter, view: tuple[float, float]) -> str:
-    wide = parameter.scale == "log" and parameter.value(view[1]) > 5 * parameter.value(view[0])
+def view_with(shown: tuple[float, float], truth: Place) -> tuple[float, float]:
+    """``shown`` with the truth inside and a little room beside it."""
+    if truth is None:
+        return shown
+    room = 0.05 * (max(shown[1], truth) - min(shown[0], truth))
+    return min(shown[0], truth - room), max(shown[1], truth + room)
+
+
+def scale(parameter: Parameter, shown: tuple[float, float]) -> str:
+    """The scale of an axis: "log" where the parameter has one and several octaves are shown.
+
+    Args:
+        parameter: on the axis.
+        shown: from where to where, in theta.
+    """
+    wide = parameter.scale == "log" and parameter.value(shown[1]) > 5 * parameter.value(shown[0])
     return "log" if wide else "linear"
 
 
+def marginal(
+    ax: Axes,
+    parameter: Parameter,
+    theta: FloatArray,
+    prior: Posterior,
+    interval: FloatArray,
+    default: Place,
+    truth: Place = None,
+) -> None:
+    """One parameter in its unit: density and interval, the prior, the model as given, the truth; the range above.
+
+    Densities are per unit of theta, in which a uniform prior is flat, on log scales too.
+
+    Args:
+        ax: the panel.
+        parameter: what it shows.
+        theta: draws of the posterior (M,).
+        prior: its marginal is drawn too.
+        interval: the two ends of the 90 % interval, in theta.
+        default: the model as given.
+        truth: if it is known; may lie outside [0, 1].
+    """
+    point = bool(np.ptp(theta) < _POINT)
+    low, high = view_with((0.0, 1.0) if point else view(theta, default), truth)
+    ax.set_xscale(scale(parameter, (low, high)))
+    grid = np.linspace(low, high, STYLE.grid)
+    x = parameter.value(grid)
+    inside = ((grid >= 0) & (grid <= 1)).astype(float)
+    before = _prior_density(prior, parameter.name, np.clip(grid, 0, 1)) * inside
+    ax.fill_between(x, before, color=PRIOR, alpha=STYLE.prior, lw=0)
+    if point:
+        ax.axvline(parameter.value(theta[0]), color=POSTERIOR, lw=STYLE.truth)
+        ax.set_ylim(bottom=0)
+    else:
+        height = density(theta, grid)
+        within = (grid >= interval[0]) & (grid <= interval[1])
+        ax.fill_between(x, height, where=within.tolist(), color=POSTERIOR, alpha=STYLE.interval, lw=0)
+        ax.plot(x, height, color=POSTERIOR, lw=STYLE.curve)
+        ax.set_ylim(0, 1.08 * height.max())
+    if default is not None and low <= default <= high:
+        ax.axvline(parameter.value(default), color=DEFAULT, ls="--", lw=STYLE.reference)
+    if truth is not None:
+        ax.axvline(parameter.value(truth), color=MEASURED, ls=":", lw=STYLE.truth)
+    ax.set_xlim(x[0], x[-1])
+    ticks(ax.xaxis, 5)
+    ax.set_yticks([])
+    ax.spines["left"].set_visible(False)
+    ax.set_xlabel(unit_text(parameter.unit) or "no unit", labelpad=1)
+    ax.set_title(shortened(parameter.name, 40), pad=15, fontweight="bold")
+    _prior_strip(ax, interval, default, truth)
+
+
 def _prior_density(prior: Posterior, name: str, grid: FloatArray) -> FloatArray:
-    marginal = prior.marginal([name])
-    if marginal.has_density:
-        return np.exp(marginal.log_prob(grid[:, None]).numpy())
-    return density(draws(marginal)[:, 0], grid)
+    one = prior.marginal([name])
+    if one.has_density:
+        return np.exp(one.log_prob(grid[:, None]).numpy())
+    return density(draws(one)[:, 0], grid)
 
 
-def _prior_strip(ax: Axes, interval: FloatArray, default: float | None) -> None:
+def _prior_strip(ax: Axes, interval: FloatArray, default: Place, truth: Place) -> None:
     """The whole prior range as a bar above the panel; ends are the bounds."""
-    bar: dict[str, Any] = {"transform": ax.transAxes, "clip_on": False, "lw": 0}
-    ax.add_patch(Rectangle((0, 1.05), 1, 0.055, color=PRIOR, alpha=0.35, **bar))
-    width = max(interval[1] - interval[0], 0.006)
-    ax.add_patch(Rectangle((min(interval[0], 1 - width), 1.05), width, 0.055, color=POSTERIOR, **bar))
-    if default is not None:
-        ax.plot([default] * 2, [1.03, 1.125], color=DEFAULT, transform=ax.transAxes, clip_on=False, lw=1.6)
+    across, width = ax.transAxes, max(interval[1] - interval[0], 0.006)
+    whole = Rectangle((0, 1.05), 1, 0.055, color=PRIOR, alpha=STYLE.prior, lw=0, transform=across, clip_on=False)
+    start = (min(interval[0], 1 - width), 1.05)
+    part = Rectangle(start, width, 0.055, color=POSTERIOR, lw=0, transform=across, clip_on=False)
+    ax.add_patch(whole)
+    ax.add_patch(part)
+    for place, colour in ((default, DEFAULT), (truth, MEASURED)):
+        if place is not None and (colour == DEFAULT or 0 <= place <= 1):
+            ax.plot([place] * 2, [1.03, 1.125], color=colour, transform=across, clip_on=False, lw=STYLE.truth)
 
 
-def _axis_range(parameter: Parameter, theta: FloatArray) -> tuple[str, tuple[float, float]]:
-    """Scale and limits of an axis that shows the draws."""
-    view = _view(theta)
-    return _scale(parameter, view), (float(parameter.value(view[0])), float(parameter.value(view[1])))
+def pair_grid(
+    parameters: Sequence[Parameter],
+    theta: FloatArray,
+    before: FloatArray,
+    defaults: Sequence[Place],
+    truth: Sequence[Place],
+    handles: Sequence[Artist] = (),
+) -> Figure:
+    """Draws of every pair of parameters: close up below the diagonal, within the whole prior range above it.
+
+    Above it stand the pairs' correlations, too.
+
+    Args:
+        parameters: K of them.
+        theta: draws of the posterior (M, K).
+        before: draws of the prior (M', K).
+        defaults: of the model as given, in the parameters' units (K,).
+        truth: in theta (K,).
+        handles: of a legend, if there is to be one.
+    """
+    size = len(parameters)
+    width, height = (min(STYLE.width, least + step * size) for least, step in ((1.6, 1.75), (1.3, 1.55)))
+    figure = new_figure(0.96 * height + 0.5 * bool(handles), width)
+    axes = figure.subplots(size, size, squeeze=False)
+    strength = correlation(theta)
+    for i in range(size):
+        for j in range(size):
+            ax, two, columns = axes[i, j], (parameters[j], parameters[i]), [j, i]
+            known = (truth[j], truth[i])
+            if i < j:
+                _pair_in_prior(ax, theta[:, columns], before[:, columns], known, float(strength[i, j]))
+            elif i == j:
+                _diagonal(ax, two[0], theta[:, i], truth[i])
+            else:
+                _pair(ax, two, theta[:, columns], (defaults[j], defaults[i]), known)
+            _pair_frame(ax, two, i, j, size)
+    if handles:
+        legend_above(figure, handles, 4)
+    figure.align_labels()
+    return figure
 
 
-def _pair(ax: Axes, parameters: tuple[Parameter, Parameter], theta: FloatArray, default: list[float | None]) -> None:
-    x, y = (p.value(theta[:2000, k]) for k, p in enumerate(parameters))
+def _axis_range(parameter: Parameter, theta: FloatArray, truth: Place) -> tuple[str, tuple[float, float]]:
+    """Scale and limits of an axis that shows the draws and the truth."""
+    close = view(theta)
+    low, high = view_with(close, truth)
+    return scale(parameter, close), (float(parameter.value(low)), float(parameter.value(high)))
+
+
+def _pair(
+    ax: Axes,
+    two: tuple[Parameter, Parameter],
+    theta: FloatArray,
+    default: tuple[Place, Place],
+    truth: tuple[Place, Place],
+) -> None:
+    """Draws of two parameters in their units. default: in units; truth: in theta."""
+    x, y = (p.value(theta[:2000, k]) for k, p in enumerate(two))
     ax.scatter(x, y, s=3, color=POSTERIOR, alpha=0.2, lw=0)
-    (x_scale, x_limits), (y_scale, y_limits) = (_axis_range(p, theta[:, k]) for k, p in enumerate(parameters))
+    known = None not in truth
+    (x_scale, x_limits), (y_scale, y_limits) = (
+        _axis_range(p, theta[:, k], truth[k] if known else None) for k, p in enumerate(two)
+    )
     ax.set(xscale=x_scale, yscale=y_scale, xlim=x_limits, ylim=y_limits)
     if default[0] is not None and default[1] is not None:
         ax.plot(default[0], default[1], "+", color=DEFAULT, ms=9, mew=1.8)
+    if truth[0] is not None and truth[1] is not None:
+        _cross(ax, two[0].value(truth[0]), two[1].value(truth[1]))
 
 
-def _diagonal(ax: Axes, parameter: Parameter, theta: FloatArray) -> None:
-    grid = np.linspace(*_view(theta), 200)
-    if np.ptp(theta) < 1e-9:
+def _cross(ax: Axes, x: float, y: float) -> None:
+    ax.plot(x, y, "x", color=MEASURED, ms=8, mew=1.8, ls="none")
+
+
+def _diagonal(ax: Axes, parameter: Parameter, theta: FloatArray, truth: Place) -> None:
+    if np.ptp(theta) < _POINT:
         ax.axvline(parameter.value(theta[0]), color=POSTERIOR)
     else:
+        grid = np.linspace(*view(theta), STYLE.grid)
         height = density(theta, grid)
-        ax.fill_between(parameter.value(grid), height, color=POSTERIOR, alpha=0.3, lw=0)
-        ax.plot(parameter.value(grid), height, color=POSTERIOR, lw=1.2)
+        ax.fill_between(parameter.value(grid), height, color=POSTERIOR, alpha=STYLE.interval, lw=0)
+        ax.plot(parameter.value(grid), height, color=POSTERIOR, lw=STYLE.reference)
         ax.set_ylim(0, 1.08 * height.max())
-    scale, limits = _axis_range(parameter, theta)
-    ax.set(xscale=scale, xlim=limits)
+    if truth is not None:
+        ax.axvline(parameter.value(truth), color=MEASURED, ls=":", lw=STYLE.truth)
+    how, limits = _axis_range(parameter, theta, truth)
+    ax.set(xscale=how, xlim=limits)
 
 
-def _pair_in_prior(ax: Axes, theta: FloatArray, before: FloatArray, strength: float) -> None:
-    ax.scatter(before[:, 0], before[:, 1], s=4, color=PRIOR, alpha=0.35, lw=0)
-    ax.scatter(theta[:1000, 0], theta[:1000, 1], s=3, color=POSTERIOR, alpha=0.3, lw=0)
+def _pair_in_prior(
+    ax: Axes, theta: FloatArray, before: FloatArray, truth: tuple[Place, Place], strength: float
+) -> None:
+    ax.scatter(before[:, 0], before[:, 1], s=4, color=PRIOR, alpha=STYLE.prior, lw=0)
+    ax.scatter(theta[:1000, 0], theta[:1000, 1], s=3, color=POSTERIOR, alpha=STYLE.interval, lw=0)
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1)
     box = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
     weight = "bold" if abs(strength) >= 0.8 else "normal"
     number = f"{strength:+.2f}" if abs(strength) >= 0.005 else "0.00"
     ax.text(0.96, 0.95, number, transform=ax.transAxes, ha="right", va="top", bbox=box, fontweight=weight)
+    if truth[0] is not None and truth[1] is not None:
+        _cross(ax, float(np.clip(truth[0], 0, 1)), float(np.clip(truth[1], 0, 1)))
 
 
-def _pair_frame(ax: Axes, parameters: tuple[Parameter, Parameter], i: int, j: int, size: int) -> None:
+def _pair_frame(ax: Axes, two: tuple[Parameter, Parameter], i: int, j: int, size: int) -> None:
     """Labels on the outer panels only; frames in the upper half, whose axes are the prior's bounds."""
     if i < j:
         ax.set_xticks([])
@@ -130,18 +301,18 @@ def _pair_frame(ax: Axes, parameters: tuple[Parameter, Parameter], i: int, j: in
         ax.spines[:].set_color(PRIOR)
         return
     length, font = (26, 9.0) if size < 6 else (15, 8.0) if size < 8 else (14, 7.5)
-    _ticks(ax.xaxis, 3)
+    ticks(ax.xaxis, 3)
     if i > j:
-        _ticks(ax.yaxis, 3)
+        ticks(ax.yaxis, 3)
     else:
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
     ax.tick_params(axis="x", rotation=90 if size > 4 else 0, labelbottom=i == size - 1)
     ax.tick_params(axis="y", labelleft=j == 0 and i > j)
     if i == size - 1:
-        ax.set_xlabel(_axis_name(parameters[0], length), fontsize=font)
+        ax.set_xlabel(_axis_name(two[0], length), fontsize=font)
     if j == 0 and i > 0:
-        ax.set_ylabel(_axis_name(parameters[1], length), fontsize=font)
+        ax.set_ylabel(_axis_name(two[1], length), fontsize=font)
 
 
 def _axis_name(parameter: Parameter, length: int) -> str:
@@ -157,4 +328,4 @@ def _wrapped(name: str, length: int) -> str:
     if len(name) <= length:
         return name
     cut = name.rfind("_", length // 3, length) + 1 or length
-    return f"{name[:cut]}\n{_short(name[cut:], length)}"
+    return f"{name[:cut]}\n{shortened(name[cut:], length)}"

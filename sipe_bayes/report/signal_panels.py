@@ -6,12 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import Signal
-from sipe_bayes.report.drawing import DEFAULT, MEASURED, POSTERIOR, PRIOR, _ticks
-
-FloatArray = NDArray[np.float64]
+from sipe_bayes.report.drawing import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE, ticks
 
 
 def _restarted(signal: Signal, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -21,22 +19,29 @@ def _restarted(signal: Signal, values: FloatArray) -> tuple[FloatArray, FloatArr
     return np.insert(signal.time, starts, signal.time[starts]), np.insert(values, starts, np.nan)
 
 
-def _window_ticks(ax: Axes, signal: Signal, height: float) -> None:
+def _window_marks(ax: Axes, signal: Signal, height: float) -> None:
     ax.vlines(signal.window_starts, 0, height, transform=ax.get_xaxis_transform(), color=PRIOR, lw=0.9, clip_on=True)
 
 
-def _signal(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+def signal_panel(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+    """Measured against simulated, with the posterior's band and the model as given.
+
+    Args:
+        ax: the panel.
+        signal: one channel of one log.
+        span: from when to when its limits are taken, s.
+    """
     time, low = _restarted(signal, signal.low)
-    ax.fill_between(time, low, _restarted(signal, signal.high)[1], color=POSTERIOR, alpha=0.3, lw=0)
+    ax.fill_between(time, low, _restarted(signal, signal.high)[1], color=POSTERIOR, alpha=STYLE.interval, lw=0)
     ax.plot(*_restarted(signal, signal.default), color=DEFAULT, ls="--", lw=1)
     if len(signal.time) > 400 or not np.isfinite(signal.measured).any():
         ax.plot(signal.time, signal.measured, color=MEASURED, lw=0.9)
     else:
         ax.plot(signal.time, signal.measured, ".", color=MEASURED, ms=3)
-    ax.plot(*_restarted(signal, signal.mode), color=POSTERIOR, lw=1.3)
-    _window_ticks(ax, signal, 0.05)
+    ax.plot(*_restarted(signal, signal.mode), color=POSTERIOR, lw=STYLE.curve)
+    _window_marks(ax, signal, 0.05)
     _keep_in_view(ax, signal, span)
-    _ticks(ax.yaxis, 4)
+    ticks(ax.yaxis, 4)
 
 
 def _keep_in_view(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
@@ -56,24 +61,39 @@ def _keep_in_view(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
     ax.set_ylim(low - 1.3 * pad, high + pad)
 
 
-def _error(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+def error_panel(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+    """What is measured less the posterior's mode, within the posterior's band.
+
+    Args:
+        ax: the panel.
+        signal: one channel of one log.
+        span: from when to when its limits are taken, s.
+    """
     time, low = _restarted(signal, signal.low - signal.mode)
-    ax.fill_between(time, low, _restarted(signal, signal.high - signal.mode)[1], color=POSTERIOR, alpha=0.3, lw=0)
+    ax.fill_between(
+        time, low, _restarted(signal, signal.high - signal.mode)[1], color=POSTERIOR, alpha=STYLE.interval, lw=0
+    )
     ax.axhline(0, color="#555555", lw=0.7)
     error = signal.measured - signal.mode
     ax.plot(*_restarted(signal, error), color=MEASURED, lw=0.8)
-    _window_ticks(ax, signal, 0.1)
+    _window_marks(ax, signal, 0.1)
     shown = np.abs(error[(signal.time >= span[0]) & (signal.time <= span[1]) & np.isfinite(error)])
     if len(shown) and shown.max() > 0:
         band = np.nanmax(np.abs([signal.low - signal.mode, signal.high - signal.mode]), initial=0.0)
         reach = 1.2 * max(shown.max(), min(band, 3 * shown.max()))
         ax.set_ylim(-reach, reach)
-    _ticks(ax.yaxis, 2)
+    ticks(ax.yaxis, 2)
 
 
-def _worst_stretch(rows: Sequence[Signal]) -> tuple[float, float]:
-    """About a tenth of the log, four windows at least, where the squared error, relative to each channel's,
-    is largest."""
+def worst_stretch(rows: Sequence[Signal]) -> tuple[float, float]:
+    """The part of a log with the largest squared error, relative to each channel's.
+
+    Args:
+        rows: the log's channels.
+
+    Returns:
+        Its two ends, s: about a tenth of the log, four windows at least.
+    """
     time = rows[0].time
     starts = rows[0].window_starts
     window = float(np.median(np.diff(starts))) if len(starts) > 1 else 0.0

@@ -9,17 +9,27 @@ https://arxiv.org/abs/1802.09477 ("our DDPG"). Of a batch of transitions (s, a, 
 the actor then climbs the mean of Q(s, pi(s)), and the targets Q' and pi' follow their networks by tau. An episode that
 runs out of time is not terminated, so its last value is asked for as any other's.
 
-Deviations from the 2018 paper's DDPG: hidden layers of 256 and 256, Adam at 3e-4 and batches of 256, as its authors later
-had them in their repository; before: 400 and 300, 1e-3, 100. Random actions at the start: 25,000 steps on every task.
-Options (``sipe_bayes.rl.settings``), each off unless asked for and each a deviation: ``normalise`` (observations), ``layer_norm``
-(critic's hidden layers; Ba, Kiros, Hinton, "Layer Normalization", 2016, https://arxiv.org/abs/1607.06450), ``n_step``
-(returns), ``demonstration_share`` (of each batch, from trajectories given beforehand), ``cloning`` (the actor's loss also has the
-squared distance, in half ranges, from what the batch's demonstrations do, their mean: Nair et al., "Overcoming Exploration in
-Reinforcement Learning with Demonstrations", 2018, https://arxiv.org/abs/1709.10089, without their filter and in units of the
-mean |Q|, as Fujimoto, Gu, "A Minimalist Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860),
-``end_hopeless`` (episodes of the training end where the humanoid has fallen, as the published class's), ``lanes`` (environments
-stepped together before the updates), ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share`` (those of
-hindsight experience replay: Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
+Deviations from the 2018 paper's DDPG:
+
+- hidden layers of 256 and 256, Adam at 3e-4 and batches of 256, as its authors later had them in their repository;
+  before: 400 and 300, 1e-3, 100;
+- random actions at the start: 25,000 steps on every task.
+
+Options (``sipe_bayes.rl.settings``), each off unless asked for and each a deviation:
+
+- ``normalise`` (observations);
+- ``layer_norm`` (critic's hidden layers; Ba, Kiros, Hinton, "Layer Normalization", 2016,
+  https://arxiv.org/abs/1607.06450);
+- ``n_step`` (returns);
+- ``demonstration_share`` (of each batch, from trajectories given beforehand);
+- ``cloning``: the actor's loss also has the squared distance, in half ranges, from what the batch's demonstrations do,
+  their mean: Nair et al., "Overcoming Exploration in Reinforcement Learning with Demonstrations", 2018,
+  https://arxiv.org/abs/1709.10089, without their filter and in units of the mean |Q|, as Fujimoto, Gu, "A Minimalist
+  Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860;
+- ``end_hopeless``: episodes of the training end where the humanoid has fallen, as the published class's;
+- ``lanes``: environments stepped together before the updates;
+- ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share``: those of hindsight experience replay
+  (Andrychowicz et al., 2017, https://arxiv.org/abs/1707.01495).
 
 The two networks are small and of one kind, so gradients are written out by hand on flat vectors of parameters: the
 actor's step needs no gradient of the critic's weights, and Adam and the targets take a call each.
@@ -27,26 +37,55 @@ actor's step needs no gradient of the critic's weights, and Adam and the targets
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.models.policy import Policy
 from sipe_bayes.models.training import check_device
-from sipe_bayes.rl.normaliser import Normaliser
+from sipe_bayes.rl.normaliser import Moments, Normaliser
 from sipe_bayes.rl.replay import Batch
 from sipe_bayes.rl.settings import Settings
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
+_OBSERVATION_CLIP = 5.0  # of normalised observations, in spreads
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What ``Network.backward`` needs of a layer.
+
+    Args:
+        inputs: (B, in).
+        outputs: after ReLU (B, out); None of the last layer.
+        statistics: of the normalisation: before it (B, out), mean and inverse spread (B, 1); empty without one.
+    """
+
+    inputs: Tensor
+    outputs: Tensor | None = None
+    statistics: tuple[Tensor, ...] = ()
+
+
+@dataclass(frozen=True)
+class AgentState:
+    """An agent between two updates: parameters and moments by name, the normaliser's, and the number of updates."""
+
+    tensors: dict[str, Float32Array]
+    normaliser: Moments | None
+    updates: int
 
 
 class Network:
-    """An MLP with ReLU, perhaps normalised hidden layers, in one flat vector (P,); forward and backward by hand."""
+    """An MLP with ReLU, perhaps normalised hidden layers, in one flat vector (P,); forward and backward by hand.
+
+    Args:
+        sizes: of inputs, hidden layers and outputs.
+        layer_norm: normalise hidden layers.
+        device: where the vector lies.
+    """
 
     def __init__(self, sizes: tuple[int, ...], layer_norm: bool = False, device: str = "cpu") -> None:
         self.sizes, self.layer_norm = sizes, layer_norm
@@ -68,42 +107,57 @@ class Network:
             if norm:
                 norm[0].fill_(1.0)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, list[Any]]:
+    def forward(self, x: Tensor) -> tuple[Tensor, list[Layer]]:
         """Outputs (B, out) of x (B, in), and what ``backward`` needs."""
-        tape: list[Any] = []
+        tape: list[Layer] = []
         for weight, bias, *norm in self.layers[:-1]:
             z = torch.addmm(bias, x, weight.t())
             if norm:
                 normal, *statistics = torch.native_layer_norm(z, z.shape[1:], norm[0], norm[1], 1e-5)
-                tape.append((x, normal.relu_(), (z, *statistics)))
+                outputs, kept = normal.relu_(), (z, *statistics)
             else:
-                tape.append((x, z.relu_(), ()))
-            x = tape[-1][1]
+                outputs, kept = z.relu_(), ()
+            tape.append(Layer(x, outputs, kept))
+            x = outputs
         weight, bias = self.layers[-1]
-        tape.append((x, None, ()))
+        tape.append(Layer(x))
         return torch.addmm(bias, x, weight.t()), tape
 
-    def backward(self, tape: list[Any], slope: Tensor, weights: bool = True, inputs: bool = False) -> Tensor | None:
-        """Fill ``gradients`` from slope (B, out) if ``weights``; returns the inputs' (B, in) if ``inputs``."""
+    def backward(self, tape: list[Layer], slope: Tensor, weights: bool = True, inputs: bool = False) -> Tensor | None:
+        """The gradients of a scalar.
+
+        Args:
+            tape: of ``forward``.
+            slope: the scalar's gradient in the outputs (B, out).
+            weights: whether to fill ``gradients``.
+            inputs: whether to return the gradient in the inputs.
+
+        Returns:
+            (B, in), or None.
+        """
         for i in range(len(self.layers) - 1, -1, -1):
-            (x, y, statistics), (weight, _, *norm), out = tape[i], self.layers[i], self._slopes[i]
-            if y is not None:
-                slope = torch.ops.aten.threshold_backward(slope, y, 0)
+            layer, (weight, _, *norm), out = tape[i], self.layers[i], self._slopes[i]
+            # back through ReLU
+            if layer.outputs is not None:
+                slope = torch.ops.aten.threshold_backward(slope, layer.outputs, 0)
+            # back through the normalisation
             if norm:
+                before, *statistics = layer.statistics
                 slope, gain, shift = torch.ops.aten.native_layer_norm_backward(
-                    slope, statistics[0], statistics[0].shape[1:], *statistics[1:], *norm, [True, weights, weights]
+                    slope, before, before.shape[1:], *statistics, *norm, [True, weights, weights]
                 )
                 if weights:
                     out[2].copy_(gain)
                     out[3].copy_(shift)
+            # back through the linear map
             if weights:
-                torch.mm(slope.t(), x, out=out[0])
+                torch.mm(slope.t(), layer.inputs, out=out[0])
                 torch.sum(slope, 0, out=out[1])
             if i or inputs:
                 slope = torch.mm(slope, weight)
         return slope if inputs else None
 
-    def twin(self) -> Network:
+    def copy(self) -> Network:
         """Another network with the same parameters."""
         other = Network(self.sizes, self.layer_norm, str(self.parameters.device))
         other.parameters.copy_(self.parameters)
@@ -119,8 +173,17 @@ class Network:
 
 
 class Agent:
-    """Actor, critic, their targets and optimisers, for observations (B, O) and actions (B, A) between two bounds. device: where they
-    learn; what goes in and comes out are numpy's arrays."""
+    """Actor, critic, their targets and optimisers; what goes in and comes out are numpy's arrays.
+
+    Args:
+        observation_size: O.
+        action_size: A.
+        action_low: bound of every action.
+        action_high: bound of every action.
+        settings: how it learns.
+        rng: of the first weights.
+        device: where it learns.
+    """
 
     def __init__(
         self,
@@ -139,14 +202,14 @@ class Agent:
         self.critic = Network((observation_size + action_size, *settings.hidden, 1), settings.layer_norm, device)
         self.actor.initialise(rng)
         self.critic.initialise(rng)
-        self.target_actor, self.target_critic = self.actor.twin(), self.critic.twin()
+        self.target_actor, self.target_critic = self.actor.copy(), self.critic.copy()
         self._actor_optimiser, self._critic_optimiser = _Adam(self.actor, settings), _Adam(self.critic, settings)
-        self.normaliser = Normaliser(observation_size, 5.0) if settings.normalise else None
+        self.normaliser = Normaliser(observation_size, _OBSERVATION_CLIP) if settings.normalise else None
         self.updates = 0
 
     def act(self, observations: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, O), without noise."""
-        x = self._on_device(self._seen(observations.astype(np.float32)))
+        x = self._on_device(self._normalised(observations.astype(np.float32)))
         return np.asarray(self._bounded(self.actor.forward(x)[0].tanh_()).cpu().numpy(), float)
 
     def update(self, batch: Batch) -> None:
@@ -154,22 +217,29 @@ class Agent:
         observations, following, actions, returns, discounts = (
             self._on_device(x)
             for x in (
-                *(self._seen(x) for x in (batch.observations, batch.next_observations)),
+                *(self._normalised(x) for x in (batch.observations, batch.next_observations)),
                 *(batch.actions, batch.returns, batch.discounts),
             )
         )
+        # the critic follows its target
         targets = self._targets(following, returns, discounts)
         pairs = torch.cat([observations, actions], 1)
         values, tape = self.critic.forward(pairs)
         self.critic.backward(tape, (values - targets).mul_(2 / len(values)))
         self._critic_optimiser.step()
+        # the actor climbs the critic, and the targets follow
         self._climb(observations, actions)
         for network, target in ((self.actor, self.target_actor), (self.critic, self.target_critic)):
             target.parameters.lerp_(network.parameters, self.settings.tau)
         self.updates += 1
 
     def policy(self, task: str, goal_size: int = 0) -> Policy:
-        """What has been learnt so far."""
+        """What has been learnt so far.
+
+        Args:
+            task: its name.
+            goal_size: of the desired goal at the end of an observation.
+        """
         layers = tuple((w.cpu().numpy().copy(), b.cpu().numpy().copy()) for w, b in self.actor.layers)
         low, high = self.action_low, self.action_high
         if self.normaliser is None:
@@ -177,28 +247,27 @@ class Agent:
         seen = self.normaliser
         return Policy(task, layers, low, high, seen.mean.copy(), seen.scale.copy(), seen.clip, goal_size)
 
-    def state(self) -> dict[str, Any]:
-        """Arrays and numbers from which ``restore`` goes on bit for bit."""
-        found: dict[str, Any] = {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
-        if self.normaliser is not None:
-            found |= {f"normaliser.{k}": v for k, v in self.normaliser.state().items()}
-        return {**found, "updates": self.updates}
+    def state(self) -> AgentState:
+        """From which ``restore`` goes on bit for bit."""
+        tensors = {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
+        return AgentState(tensors, None if self.normaliser is None else self.normaliser.state(), self.updates)
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: AgentState) -> None:
+        """Go on from what ``state`` gave."""
         for name, tensor in self._tensors().items():
-            tensor.copy_(torch.from_numpy(state[name]).reshape(tensor.shape))  # a file's scalar is (1,)
-        if self.normaliser is not None:
-            self.normaliser.restore({k: state[f"normaliser.{k}"] for k in self.normaliser.state()})
-        self.updates = int(state["updates"])
+            tensor.copy_(torch.from_numpy(state.tensors[name]).reshape(tensor.shape))  # a file's scalar is (1,)
+        if self.normaliser is not None and state.normaliser is not None:
+            self.normaliser.restore(state.normaliser)
+        self.updates = state.updates
 
     def _tensors(self) -> dict[str, Tensor]:
         networks = ("actor", "critic", "target_actor", "target_critic")
-        found = {name: getattr(self, name).parameters for name in networks}
+        tensors = {name: getattr(self, name).parameters for name in networks}
         for name, optimiser in (("actor", self._actor_optimiser), ("critic", self._critic_optimiser)):
-            found |= {f"{name}.{k}": v for k, v in optimiser.moments().items()}
-        return found
+            tensors |= {f"{name}.{k}": v for k, v in optimiser.moments().items()}
+        return tensors
 
-    def _seen(self, observations: Float32Array) -> Float32Array:
+    def _normalised(self, observations: Float32Array) -> Float32Array:
         return observations if self.normaliser is None else self.normaliser.apply(observations)
 
     def _on_device(self, array: Float32Array) -> Tensor:
@@ -211,8 +280,8 @@ class Agent:
         """y (B, 1)."""
         actions = self._bounded(self.target_actor.forward(following)[0].tanh_())
         values = self.target_critic.forward(torch.cat([following, actions], 1))[0]
-        found = torch.addcmul(returns[:, None], discounts[:, None], values)
-        return found.clamp_(-1 / (1 - self.settings.discount), 0.0) if self.settings.clip_targets else found
+        targets = torch.addcmul(returns[:, None], discounts[:, None], values)
+        return targets.clamp_(-1 / (1 - self.settings.discount), 0.0) if self.settings.clip_targets else targets
 
     def _climb(self, observations: Tensor, actions: Tensor) -> None:
         """The actor's step: along the critic's slope in the action, times what squashes it."""

@@ -6,11 +6,10 @@ import hashlib
 import json
 from collections import deque
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import whole
@@ -20,23 +19,62 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.search.base import Search
 from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.rl.evaluation import evaluate
+from sipe_bayes.rl.evaluation import STARTS, evaluate
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import Report, checksum
 from sipe_bayes.rl.trainer import Trainer
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
-Row = dict[str, Any]
-"""Of the history; ``train_in_the_loop`` says what is in it."""
+_REPORTED = 100  # control steps between two reports
 
-_EVALUATION_SEED = 3_000_000  # of the history's starts: other ones than a card's or a curve's
+
+@dataclass(frozen=True)
+class Update:
+    """A row of the history, N parameters.
+
+    Args:
+        update: its number, from 1.
+        step: of the training.
+        rollouts: of the estimator so far.
+        reference_rollouts: trajectories taken from the reference so far.
+        accuracy: 1 - |mean - truth|, mean over parameters: reported, never used.
+        least_accuracy: of the worst parameter.
+        simulation_return: of the policy, in simulators drawn from the estimate.
+        simulation_success: None where only the return counts.
+        reference_return: of the policy, in the reference.
+        reference_success: None where only the return counts.
+        redrawn: theta so far that no model can have.
+        diverged: simulations so far.
+        failure: why the update gave no estimate, in which case the one before stays.
+        mean: of the estimate (N,).
+        sd: of the estimate (N,).
+    """
+
+    update: int
+    step: int
+    rollouts: int
+    reference_rollouts: int
+    accuracy: float
+    least_accuracy: float
+    simulation_return: float
+    simulation_success: float | None
+    reference_return: float
+    reference_success: float | None
+    redrawn: int
+    diverged: int
+    failure: str | None
+    mean: tuple[float, ...]
+    sd: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a run goes; see ``train_in_the_loop``. Raises ValueError for numbers out of range."""
+    """How a run goes; see ``train_in_the_loop``.
+
+    Raises:
+        ValueError: for numbers out of range.
+    """
 
     steps: int
     updates: int
@@ -50,7 +88,7 @@ class Plan:
             whole(name, getattr(self, name))
 
     def horizon(self, task: Task) -> int:
-        """Control steps of a trajectory; raises ValueError where an update has no room for an episode that begins in it."""
+        """Control steps of a trajectory; raises ValueError where no episode can begin in an update."""
         steps = (
             default_steps(task) if self.trajectory_steps is None else whole("trajectory_steps", self.trajectory_steps)
         )
@@ -59,21 +97,28 @@ class Plan:
         least = (task.episode_steps + steps + 1) * self.settings.lanes
         if self.steps // self.updates < least:
             raise ValueError(
-                f"steps: {self.steps} in {self.updates} updates are too few for an episode to begin in each, expected {least} for "
-                "each; raise steps, or take fewer updates"
+                f"steps: {self.steps} in {self.updates} updates are too few for an episode to begin in each, expected "
+                f"{least} for each; raise steps, or take fewer updates"
             )
         return steps
 
 
 @dataclass(frozen=True)
 class LoopResult:
-    """What a run came to. history: a row for each update (see ``train_in_the_loop``). converged: whether the last policy solves
-    simulators drawn from the last estimate; solved_reference: whether it solves the reference. warnings: the last estimate's,
-    and what failed on the way."""
+    """What a run came to.
+
+    Args:
+        policy: the last one.
+        posterior: the last estimate.
+        history: a row for each update.
+        converged: whether the last policy solves simulators drawn from the last estimate.
+        solved_reference: whether it solves the reference.
+        warnings: the last estimate's, and what failed on the way.
+    """
 
     policy: Policy
     posterior: Posterior
-    history: tuple[Row, ...]
+    history: tuple[Update, ...]
     converged: bool
     solved_reference: bool
     warnings: tuple[str, ...]
@@ -89,7 +134,7 @@ class _Begun:
 
 
 class _Recorder:
-    """Advances a trainer and keeps the first ``steps`` actions of its ``count`` latest episodes that came so far or ended."""
+    """Advances a trainer and keeps the first actions of its latest episodes that came so far or ended."""
 
     def __init__(self, trainer: Trainer, count: int, steps: int) -> None:
         self._trainer, self._steps = trainer, steps
@@ -110,7 +155,18 @@ class _Recorder:
 
 
 class LoopRun:
-    """The state of a run: the trainer, the estimator, what theta are drawn from, and the history."""
+    """The state of a run: the trainer, the estimator, what theta are drawn from, and the history.
+
+    Args:
+        estimator: a fresh one on a simulator of a task.
+        reference: a variant's name, or theta (N,).
+        plan: how it goes.
+        threads: of the simulation.
+        demonstrations: that the agent learns from besides.
+
+    Raises:
+        ValueError: for an estimator that is not fresh, another reference, and a plan that does not fit the task.
+    """
 
     def __init__(
         self,
@@ -136,7 +192,7 @@ class LoopRun:
         self.posterior: Posterior = estimator.prior
         self.spent = self.reference_rollouts = 0
         self.idle = False  # a search that is over
-        self.history: list[Row] = []
+        self.history: list[Update] = []
         drawn = Randomization(self.posterior)
         self.trainer = Trainer(task, plan.settings, estimator.seed, drawn, demonstrations, threads)
         assert self.trainer.draws is not None
@@ -144,13 +200,15 @@ class LoopRun:
 
     def iterate(self, report: Report | None) -> None:
         """Train, estimate, and add a row to the history."""
+        # the agent acts and learns
         recorder = _Recorder(self.trainer, self.plan.trajectories, self.horizon)
         until = self.plan.steps * (len(self.history) + 1) // self.plan.updates
         while self.trainer.steps < until:
             before = self.trainer.steps
             recorder.advance()
-            if report is not None and self.trainer.steps // 100 > before // 100:
+            if report is not None and self.trainer.steps // _REPORTED > before // _REPORTED:
                 report(f"{self.task.name}: update {len(self.history)}", self.trainer.steps, self.plan.steps)
+        # the estimator spends its share of the budget
         allowed = self.budget * (len(self.history) + 1) // self.plan.updates - self.spent
         failure = None
         if allowed > 0 and not self.idle:
@@ -158,14 +216,15 @@ class LoopRun:
         self.history.append(self._row(failure))
 
     def result(self) -> LoopResult:
+        """What the run came to after its last update."""
         last = self.history[-1]
-        failures = [f"update {row['update']}: {row['failure']}" for row in self.history if row["failure"]]
+        failures = [f"update {row.update}: {row.failure}" for row in self.history if row.failure]
         return LoopResult(
             policy=self.trainer.policy(),
             posterior=self.posterior,
             history=tuple(self.history),
-            converged=solves(self.task, last["simulation_return"], last["simulation_success"]),
-            solved_reference=solves(self.task, last["reference_return"], last["reference_success"]),
+            converged=solves(self.task, last.simulation_return, last.simulation_success),
+            solved_reference=solves(self.task, last.reference_return, last.reference_success),
             warnings=(*dict.fromkeys(self.estimator.warnings), *failures),
         )
 
@@ -211,44 +270,50 @@ class LoopRun:
 
     def _replayed(self, episodes: list[_Begun]) -> list[Trajectory]:
         """What the reference does from the episodes' starting states with their actions, as far as it is valid."""
-        found = []
+        replayed = []
         for begun in episodes:
             actions = np.stack(begun.actions)[None]
             made = self.simulator.rollout(self.truth, actions, begun.state, allow_outside=True, goals=begun.goal)
             valid = int(made.valid[0].sum()) - 1
             if valid > 0:
-                found.append(made[0].slice(0, valid))
+                replayed.append(made[0].slice(0, valid))
         self.reference_rollouts += len(episodes)
-        return found
+        return replayed
 
-    def _row(self, failure: str | None) -> Row:
+    def _row(self, failure: str | None) -> Update:
         policy, count = self.trainer.policy(), self.plan.evaluation_episodes
         rng = np.random.default_rng([self.estimator.seed, 1 + len(self.history)])
-        inside = evaluate(policy, self.simulator, count, _EVALUATION_SEED, theta=self.draw(rng, count))
-        outside = evaluate(policy, self.simulator, count, _EVALUATION_SEED, theta=self.truth)
+        inside = evaluate(policy, self.simulator, count, STARTS.loop, theta=self.draw(rng, count))
+        outside = evaluate(policy, self.simulator, count, STARTS.loop, theta=self.truth)
         mean, sd = self.posterior.mean.numpy(), self.posterior.stddev.numpy()
         accuracy = 1 - np.abs(mean - self.truth)
-        return {
-            "update": len(self.history) + 1,
-            "step": self.trainer.steps,
-            "rollouts": self.spent,
-            "reference_rollouts": self.reference_rollouts,
-            "accuracy": float(accuracy.mean()),
-            "least_accuracy": float(accuracy.min()),
-            "simulation_return": inside["mean"],
-            "simulation_success": inside["success_rate"],
-            "reference_return": outside["mean"],
-            "reference_success": outside["success_rate"],
-            "redrawn": self.draw.redrawn,
-            "diverged": self.trainer.simulator.diverged,
-            "failure": failure,
-            "mean": mean.tolist(),
-            "sd": sd.tolist(),
-        }
+        return Update(
+            update=len(self.history) + 1,
+            step=self.trainer.steps,
+            rollouts=self.spent,
+            reference_rollouts=self.reference_rollouts,
+            accuracy=float(accuracy.mean()),
+            least_accuracy=float(accuracy.min()),
+            simulation_return=inside.mean,
+            simulation_success=inside.success_rate,
+            reference_return=outside.mean,
+            reference_success=outside.success_rate,
+            redrawn=self.draw.redrawn,
+            diverged=self.trainer.simulator.diverged,
+            failure=failure,
+            mean=tuple(mean.tolist()),
+            sd=tuple(sd.tolist()),
+        )
 
 
 def solves(task: Task, mean_return: float, success_rate: float | None) -> bool:
-    """Whether a policy of this mean return and share of successes (None where only the return counts) solves the task."""
+    """Whether a policy solves a task.
+
+    Args:
+        task: which.
+        mean_return: that it earns.
+        success_rate: None where only the return counts.
+    """
     measured = mean_return if task.solved.measure == "return" else success_rate
     return measured is not None and measured >= task.solved.threshold
 
@@ -267,7 +332,7 @@ def _task(estimator: Estimator) -> Task:
     return task
 
 
-def _theta(task: Task, reference: Any) -> FloatArray:
+def _theta(task: Task, reference: FloatArray) -> FloatArray:
     theta = task.space.check_shape(reference)
     if theta.ndim != 1 or not np.isfinite(theta).all():
         raise ValueError(f"reference: expected a variant's name or {len(task.space)} finite numbers, got {reference!r}")

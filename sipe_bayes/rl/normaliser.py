@@ -1,19 +1,36 @@
-"""Running mean and spread of observations, merged batch by batch (Chan, Golub, LeVeque, "Updating Formulae and a Pairwise
-Algorithm for Computing Sample Variances", 1979, http://i.stanford.edu/pub/cstr/reports/cs/tr/79/773/CS-TR-79-773.pdf)."""
+"""Running mean and spread of observations, merged batch by batch.
+
+Chan, Golub, LeVeque, "Updating Formulae and a Pairwise Algorithm for Computing Sample Variances", 1979,
+http://i.stanford.edu/pub/cstr/reports/cs/tr/79/773/CS-TR-79-773.pdf.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
+import numpy as np
+
+from sipe_bayes.core.arrays import Float32Array, FloatArray
 
 _LEAST = 1e-2  # spread below which a channel counts as constant and is not blown up
 
 
+@dataclass(frozen=True)
+class Moments:
+    """Of observations seen so far: their number (1,), mean (O,) and sum of squared deviations (O,)."""
+
+    count: FloatArray
+    mean: FloatArray
+    squares: FloatArray
+
+
 class Normaliser:
-    """Of observations (B, O). clip: bound of what ``apply`` returns. ``mean`` and ``scale`` (O,) in float32."""
+    """Of observations (B, O), by ``mean`` and ``scale`` (O,) in float32.
+
+    Args:
+        size: O.
+        clip: bound of what ``apply`` returns.
+    """
 
     def __init__(self, size: int, clip: float) -> None:
         self.clip = clip
@@ -35,13 +52,14 @@ class Normaliser:
         """Observations (B, O), shifted, scaled and clipped."""
         return np.clip((observations - self.mean) / self.scale, -self.clip, self.clip)
 
-    def state(self) -> dict[str, NDArray[np.generic]]:
-        """Arrays from which ``restore`` goes on."""
-        return {"count": np.array([self._count]), "mean": self._mean.copy(), "squares": self._squares.copy()}
+    def state(self) -> Moments:
+        """From which ``restore`` goes on."""
+        return Moments(np.array([self._count]), self._mean.copy(), self._squares.copy())
 
-    def restore(self, state: dict[str, NDArray[np.generic]]) -> None:
-        self._count = float(np.asarray(state["count"], float)[0])
-        self._mean, self._squares = np.array(state["mean"], float), np.array(state["squares"], float)
+    def restore(self, moments: Moments) -> None:
+        """Go on from what ``state`` gave."""
+        self._count = float(moments.count[0])
+        self._mean, self._squares = moments.mean.copy(), moments.squares.copy()
         self._refresh()
 
     def _refresh(self) -> None:

@@ -1,15 +1,18 @@
 """Open-loop plans for the Adroit hand by the cross-entropy method, from which demonstrations are made.
 
 Rubinstein, "The Cross-Entropy Method for Combinatorial and Continuous Optimization", 1999,
-https://doi.org/10.1023/A:1010091220143: draw candidates from N(mean, diag(sd^2)), keep the best, move mean and sd to theirs,
-again and again. A candidate holds a few knots of a few synergies: commands linear between knots for the arm, the wrist, the
-thumb's joints, and two curls that bend four fingers at once, each in the actions' unit. All candidates of an iteration are one
-batch of the engine.
+https://doi.org/10.1023/A:1010091220143: draw candidates from N(mean, diag(sd^2)), keep the best, move mean and sd to
+theirs, again and again. A candidate holds a few knots of a few synergies: commands linear between knots for the arm,
+the wrist, the thumb's joints, and two curls that bend four fingers at once, each in the actions' unit. All candidates
+of an iteration are one batch of the engine.
 
-Deviations: mean and sd move by a share of the way, and sd has a floor (both keep it from stopping too soon); the best
-candidates of an iteration take part in the next; actions carry noise, so that what is found bears it. A task says where
-it starts (``Outline``: what a hand that reaches, closes and pulls would do, roughly) and what is added to its own reward, which
-says nothing of the way to the handle or the ball.
+Deviations:
+
+- mean and sd move by a share of the way, and sd has a floor: both keep it from stopping too soon;
+- the best candidates of an iteration take part in the next;
+- actions carry noise, so that what is found bears it;
+- a task says where it starts (``Outline``: what a hand that reaches, closes and pulls would do, roughly) and what is
+  added to its own reward, which says nothing of the way to the handle or the ball.
 """
 
 from __future__ import annotations
@@ -17,19 +20,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State, load_state, save_state
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.envs.tasks.adroit import Adroit
 from sipe_bayes.rl.scripted import Demonstrator
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
 Report = Callable[[str, int, int], None]
 
 _CURLS = {"knuckles": ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), "tips": tuple(f"{f}FJ{i}" for f in "FMRL" for i in (1, 0))}
@@ -38,25 +40,39 @@ _THUMB = ("THJ4", "THJ3", "THJ1", "THJ0")
 
 
 @dataclass(frozen=True)
-class Search:
-    """Settings of the search. sd, floor: of candidates, in actions. share: how far mean and sd go in an iteration. noise: sd
-    on actions. repeats: rollouts of each finalist."""
+class Search(Options):
+    """Settings of the search."""
 
-    population: int = 40
-    elites: int = 6
-    iterations: int = 60
-    sd: float = 0.15
-    floor: float = 0.02
-    share: float = 0.7
-    noise: float = 0.05
-    repeats: int = 8
+    population: int = option(40, "candidates of an iteration", least=2)
+    elites: int = option(6, "best ones that mean and sd move to", least=1)
+    iterations: int = option(60, "of the search", least=0)
+    sd: float = option(0.15, "of candidates at first", "actions", above=0)
+    floor: float = option(0.02, "least sd of candidates", "actions", least=0)
+    share: float = option(0.7, "how far mean and sd go in an iteration", above=0, most=1)
+    noise: float = option(0.05, "sd of the noise on actions", "actions", least=0)
+    repeats: int = option(8, "rollouts of each finalist", least=1)
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """After an iteration: mean and sd of candidates (K, D), and the elites (E, K, D)."""
+
+    iteration: int
+    mean: FloatArray
+    sd: FloatArray
+    elites: FloatArray
 
 
 @dataclass(frozen=True)
 class Outline:
-    """knots: the actuators' commands by the share of the episode at which they are given; what is not named is at zero. (The
-    arm's joints settle at 2.5 times the command, less what gravity takes.) progress: (...,) of observations (..., O), added to
-    the reward of each step. search: what suits the task: a grasp is fragile, so Relocate's looks close by, with less noise."""
+    """Where a task's search starts.
+
+    Args:
+        knots: the actuators' commands by the share of the episode at which they are given; what is not named is at
+            zero. (The arm's joints settle at 2.5 times the command, less what gravity takes.)
+        progress: (...,) of observations (..., O), added to the reward of each step.
+        search: what suits the task: a grasp is fragile, so Relocate's looks close by, with less noise.
+    """
 
     knots: dict[float, dict[str, float]]
     progress: Callable[[FloatArray], FloatArray]
@@ -120,7 +136,12 @@ class Plan:
 
 @dataclass
 class Synergies:
-    """How knots (..., K, D) become actions (..., T, A)."""
+    """How knots (..., K, D) become actions (..., T, A).
+
+    Args:
+        task: whose actuators.
+        steps: T.
+    """
 
     task: Adroit
     steps: int
@@ -148,6 +169,7 @@ class Synergies:
         return knots
 
     def actions(self, knots: FloatArray) -> FloatArray:
+        """Actions (..., T, A) of knots (..., K, D)."""
         return np.clip(self._rest + self._weights @ (knots @ self._members), -1, 1)
 
 
@@ -158,45 +180,66 @@ def plan(
     checkpoint: Path | None = None,
     report: Report | None = None,
 ) -> Plan:
-    """Search a plan for a task of ``OUTLINES``. checkpoint: a file to go on from and to write after each iteration."""
+    """Search a plan for a task of ``OUTLINES``.
+
+    Args:
+        simulator: of the task.
+        seed: of candidates and noise.
+        search: its settings; default what suits the task.
+        checkpoint: a file to go on from and to write after each iteration.
+        report: is told how far it is.
+
+    Raises:
+        CheckpointError: for a checkpoint of another search.
+    """
     task = simulator.environment
     assert isinstance(task, Adroit)
     search = search or OUTLINES[task.name].search
     synergies = Synergies(task, task.episode_steps)
     start, _ = task.initial_states(np.random.default_rng(0), 1)
-    described = [task.name, seed, {**asdict(search), "iterations": 0, "repeats": 0}, synergies.outline().tolist()]
+    outline = synergies.outline()
+    described = [task.name, seed, {**asdict(search), "iterations": 0, "repeats": 0}, outline.tolist()]
     fingerprint = hashlib.sha256(json.dumps([described, simulator.checksum()]).encode()).hexdigest()
-    mean = synergies.outline()
-    sd, elites = np.full_like(mean, search.sd), mean[None]
-    first = 0
+    state = SearchState(0, outline, np.full_like(outline, search.sd), outline[None])
     if checkpoint is not None and checkpoint.is_file():
-        state = load_state(checkpoint, State, fingerprint)
-        mean, sd, elites = (state[name] for name in ("mean", "sd", "elites"))
-        first = int(state["iteration"])
-    for iteration in range(first, search.iterations):
-        rng = np.random.default_rng([seed, iteration])
-        drawn = mean + sd * rng.standard_normal((search.population - len(elites), *mean.shape))
-        knots = np.concatenate([elites, drawn])
-        found = _score(simulator, synergies, knots, start, search.noise, rng)
-        best = np.argsort(-found, kind="stable")[: search.elites]
+        state = load_state(checkpoint, SearchState, fingerprint)
+    while state.iteration < search.iterations:
+        rng = np.random.default_rng([seed, state.iteration])
+        # candidates: the best so far, and others about the mean
+        count = search.population - len(state.elites)
+        drawn = state.mean + state.sd * rng.standard_normal((count, *state.mean.shape))
+        knots = np.concatenate([state.elites, drawn])
+        # the best of them, to which mean and sd move
+        scores = _score(simulator, synergies, knots, start, search.noise, rng)
+        best = np.argsort(-scores, kind="stable")[: search.elites]
         elites = knots[best]
-        mean = mean + search.share * (elites.mean(0) - mean)
-        sd = np.maximum(sd + search.share * (elites.std(0) - sd), search.floor)
+        state = replace(
+            state,
+            iteration=state.iteration + 1,
+            mean=state.mean + search.share * (elites.mean(0) - state.mean),
+            sd=np.maximum(state.sd + search.share * (elites.std(0) - state.sd), search.floor),
+            elites=elites,
+        )
         if checkpoint is not None:
-            state = {"mean": mean, "sd": sd, "elites": elites, "iteration": iteration + 1}
             save_state(checkpoint, state, fingerprint)
         if report is not None:
-            report(f"{task.name}: best {found[best[0]]:.0f}", iteration + 1, search.iterations)
-    finalists = np.concatenate([mean[None], elites])
+            report(f"{task.name}: best {scores[best[0]]:.0f}", state.iteration, search.iterations)
+    # of the finalists the best under noise
+    finalists = np.concatenate([state.mean[None], state.elites])
     rng = np.random.default_rng([seed, search.iterations, 1])
     repeated = _score(simulator, synergies, np.repeat(finalists, search.repeats, axis=0), start, search.noise, rng)
     scores = repeated.reshape(len(finalists), -1).mean(1)
     return Plan(finalists[scores.argmax()], float(scores.max()), search.iterations)
 
 
-def demonstrator(task: Adroit, found: Plan) -> Demonstrator:
-    """The plan with noise."""
-    actions, noise = Synergies(task, task.episode_steps).actions(found.knots), OUTLINES[task.name].search.noise
+def demonstrator(task: Adroit, plan: Plan) -> Demonstrator:
+    """The plan with noise.
+
+    Args:
+        task: that it is for.
+        plan: of its actions.
+    """
+    actions, noise = Synergies(task, task.episode_steps).actions(plan.knots), OUTLINES[task.name].search.noise
 
     def act(observations: FloatArray, step: int, rngs: Sequence[np.random.Generator]) -> FloatArray:
         return actions[step] + noise * np.stack([rng.standard_normal(task.num_actions) for rng in rngs])
@@ -213,7 +256,7 @@ def _score(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Return and progress (B,) of knots (B, K, D) under noise; minus infinity where a simulation diverges."""
-    actions: Any = synergies.actions(knots)
+    actions = synergies.actions(knots)
     actions = np.clip(actions + noise * rng.standard_normal(actions.shape), -1, 1)
     moved = simulator.rollout(simulator.space.default_theta, actions, start)
     assert moved.rewards is not None

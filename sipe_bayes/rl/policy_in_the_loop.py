@@ -1,49 +1,54 @@
-"""Policy in the loop: an agent is trained in the simulators that an estimator believes in, and its actions teach the estimator.
+"""Policy in the loop: an agent is trained in the simulators that an estimator believes in, and teaches the estimator.
 
 B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", sections 3.2 and 3.3
 (https://arxiv.org/abs/2011.08985). A run of ``steps`` control steps has ``updates`` iterations; in each
 
-1. the agent (``sipe_bayes.rl.ddpg``) acts and learns for ``steps / updates`` control steps. Every episode has a theta of its own,
-   drawn from the prior at first, then from the estimator's ``proposal`` where it has one (simopt's Gaussian), else from its
-   posterior. The transitions fill the replay buffer;
-2. the actions of the ``trajectories`` latest of these episodes, the noise of exploration included, are replayed from the same
-   starting states in the reference environment, whose theta is hidden from the estimator;
+1. the agent (``sipe_bayes.rl.ddpg``) acts and learns for ``steps / updates`` control steps. Every episode has a theta
+   of its own, drawn from the prior at first, then from the estimator's ``proposal`` where it has one (simopt's
+   Gaussian), else from its posterior. The transitions fill the replay buffer;
+2. the actions of the ``trajectories`` latest of these episodes, the noise of exploration included, are replayed from
+   the same starting states in the reference environment, whose theta is hidden from the estimator;
 3. the estimator gets the reference's trajectories, and spends its budget up to the share of the training that is done.
 
 What a method does with other trajectories each time follows from what its state holds:
 
-- The searches (simopt, adr, cem, also with learned rewards) keep a distribution over theta and begin a new pool of simulations:
-  they take as many steps as their share of the budget wants.
-- Everything else conditions on simulations of the actions in hand (npe, bayessim, abc, regression, maml, bayesopt) or on their
-  residuals (laplace, mcmc). Such a state says nothing of another experiment, so these are fitted anew to the present
-  trajectories with what is left of the budget so far. No trajectory counts twice, and an estimate knows the latest ones only. The
-  trajectories hold the reference's states, noise-free: ``Segments(dt, noise="white", starts="recorded")`` spares laplace and mcmc
-  the search for windows' starts.
+- The searches (simopt, adr, cem, also with learned rewards) keep a distribution over theta and begin a new pool of
+  simulations: they take as many steps as their share of the budget wants.
+- Everything else conditions on simulations of the actions in hand (npe, bayessim, abc, regression, maml, bayesopt) or
+  on their residuals (laplace, mcmc). Such a state says nothing of another experiment, so these are fitted anew to the
+  present trajectories with what is left of the budget so far. No trajectory counts twice, and an estimate knows the
+  latest ones only. The trajectories hold the reference's states, noise-free: ``Segments(dt, noise="white",
+  starts="recorded")`` spares laplace and mcmc the search for windows' starts.
 
-Two budgets: the estimator's counts its simulations as always; ``reference_rollouts`` counts the trajectories taken from the
-reference. Training, and the evaluations of the history, which nothing is chosen by, belong to neither.
+Two budgets: the estimator's counts its simulations as always; ``reference_rollouts`` counts the trajectories taken from
+the reference. Training, and the evaluations of the history, which nothing is chosen by, belong to neither.
 
-Convergence, the paper's: a seed counts only if its policy solves the environment (``Task.solved``). The paper does not say which of
-them. Here it is the one that the policy was trained in, simulators drawn from the last estimate: to ask for the reference would count
-a seed because its estimate is good, and with it its accuracy. What the last policy does in the reference stands beside it.
+Convergence, the paper's: a seed counts only if its policy solves the environment (``Task.solved``). The paper does not
+say which of them. Here it is the one that the policy was trained in, simulators drawn from the last estimate: to ask
+for the reference would count a seed because its estimate is good, and with it its accuracy. What the last policy does
+in the reference stands beside it.
 
-A theta that is outside the cube or unphysical is drawn anew and counted (``redrawn``). One whose simulation diverges ends its episode,
-the next has another theta, and that is counted too (``diverged``).
+A theta that is outside the cube or unphysical is drawn anew and counted (``redrawn``). One whose simulation diverges
+ends its episode, the next has another theta, and that is counted too (``diverged``).
 
-Deviations. The reference replays the simulated episode's actions, where the paper lets the policy choose its own there ("control for
-starting states" alone): the methods that compare states need equal actions. Of an episode its first ``trajectory_steps`` are used,
-not the whole. How often the estimator is updated, and the pace of its budget, are not in the paper.
+Deviations:
+
+- The reference replays the simulated episode's actions, where the paper lets the policy choose its own there ("control
+  for starting states" alone): the methods that compare states need equal actions.
+- Of an episode its first ``trajectory_steps`` are used, not the whole.
+- How often the estimator is updated, and the pace of its budget, are not in the paper.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import SearchState, load_state, save_state
 from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.core.findings import Finding, Findings
@@ -51,12 +56,13 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import Estimator, Snapshot
 from sipe_bayes.inference.search.base import Search
 from sipe_bayes.posterior import load_posterior
-from sipe_bayes.rl.loop_run import FloatArray, LoopResult, LoopRun, Plan, Row
+from sipe_bayes.rl.loop_run import LoopResult, LoopRun, Plan, Update
 from sipe_bayes.rl.settings import Settings
+from sipe_bayes.rl.train import CHECKPOINT as CHECKPOINT
 from sipe_bayes.rl.train import Report
+from sipe_bayes.rl.trainer import TrainerState
 
 S = TypeVar("S", bound=SearchState)
-CHECKPOINT = "checkpoint/state.safetensors"
 
 
 def train_in_the_loop(
@@ -75,22 +81,29 @@ def train_in_the_loop(
     threads: int = 1,
     report: Report | None = None,
 ) -> LoopResult:
-    """Train a policy for ``steps`` control steps while ``estimator`` runs; see the module.
+    """Train a policy while an estimator runs; see the module.
 
-    estimator: a fresh one on a simulator of a task, such as ``sipe.get_estimator("Pendulum", "simopt", budget=1000)``; it brings
-    prior, budget and seed, and is the run's own from then on. reference: a variant's name or theta (N,), which may lie outside
-    [0, 1]. updates: iterations. trajectories: taken from the reference for each; trajectory_steps: of each, default an
-    episode or its first 250. demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is
-    taken; given with a share alone. evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
-    folder: where ``history.csv``, ``result.json``, ``policy.safetensors``, ``posterior`` and a checkpoint, written at each update, are
-    kept; resume: go on from there, to the result of an undisturbed run.
+    Args:
+        estimator: a fresh one on a simulator of a task, such as ``sipe.get_estimator("Pendulum", "simopt",
+            budget=1000)``; it brings prior, budget and seed, and is the run's own from then on.
+        reference: a variant's name or theta (N,), which may lie outside [0, 1].
+        steps: control steps.
+        updates: iterations.
+        trajectories: taken from the reference for each.
+        trajectory_steps: of each, default an episode or its first 250.
+        settings: how the agent learns.
+        demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is taken;
+            given with a share alone.
+        evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
+        folder: where ``history.csv``, ``result.json``, ``policy.safetensors``, ``posterior`` and a checkpoint, written
+            at each update, are kept.
+        resume: go on from there, to the result of an undisturbed run.
+        threads: of the simulation.
+        report: is told how far it is.
 
-    A row of the history: update, step, rollouts (of the estimator so far), reference_rollouts, mean and sd (N,) of the estimate,
-    accuracy and least_accuracy (1 - |mean - truth|, mean and minimum over parameters: reported, never used), return and success
-    in simulation and reference (success None where only the return counts), redrawn, diverged, and failure: why an update gave
-    no estimate, in which case the one before stays. A first update that fails raises its ValueError.
-
-    Raises ValueError for arguments out of range, a folder that holds another run or, without ``resume``, any.
+    Raises:
+        ValueError: for arguments out of range, a folder that holds another run or, without ``resume``, any; and where
+            the first update gives no estimate.
     """
     plan = Plan(steps, updates, trajectories, trajectory_steps, evaluation_episodes, settings or Settings())
     run = LoopRun(estimator, reference, plan, threads, demonstrations)
@@ -99,38 +112,51 @@ def train_in_the_loop(
         run.iterate(report)
         if kept is not None:
             kept.save(run)
-    found = run.result()
+    result = run.result()
     if kept is not None:
-        kept.finish(run, found)
-    return found
+        kept.finish(run, result)
+    return result
 
 
 @dataclass(frozen=True)
 class LoopState(Generic[S]):
-    """A run between two iterations: trainer and search as they were, counts, the history as JSON."""
+    """A run between two iterations.
 
-    trainer: dict[str, Any]
+    Args:
+        trainer: as it was.
+        search: as it was; None of a method that is fitted anew.
+        history: so far.
+        findings: of the last estimate.
+        spent: rollouts of the estimator.
+        reference_rollouts: trajectories taken from the reference.
+        idle: whether the search is over.
+    """
+
+    trainer: TrainerState
     search: Snapshot[S] | None
-    counts: dict[str, int]
-    history: str
+    history: tuple[Update, ...]
     findings: tuple[Finding, ...]
+    spent: int
+    reference_rollouts: int
+    idle: bool
 
 
 class _Folder:
-    """What a run keeps on disk. The checkpoint names its replay buffer and posteriors, which are written before it, and those of the
-    one before go after it: an interruption leaves a whole set."""
+    """What a run keeps on disk.
 
-    _COUNTS = ("spent", "reference_rollouts", "idle")
+    The checkpoint's replay buffer and posteriors are written before it, and those of the one before go after it: an
+    interruption leaves a whole set.
+    """
 
     def __init__(self, folder: Path, run: LoopRun, resume: bool) -> None:
         self._folder, self._kept = folder, (folder / CHECKPOINT).parent
-        there = (folder / CHECKPOINT).is_file()
-        if there and not resume:
+        begun = (folder / CHECKPOINT).is_file()
+        if begun and not resume:
             raise ValueError(
                 f"folder {folder}: holds a run already; pass resume=True to go on, or choose another folder"
             )
         self._kept.mkdir(parents=True, exist_ok=True)
-        if there:
+        if begun:
             self._load(run)
 
     def save(self, run: LoopRun) -> None:
@@ -138,54 +164,60 @@ class _Folder:
         run.trainer.replay.save(self._kept / f"replay-{number}.npz")
         run.posterior.save(self._kept / f"posterior-{number}")
         run.draw.source.save(self._kept / f"proposal-{number}")
-        searched = run.estimator.snapshot if isinstance(run.estimator, Search) else None
-        counts = {name: getattr(run, name) for name in self._COUNTS}
-        state = LoopState(run.trainer.state(), searched, counts, json.dumps(run.history), tuple(run.estimator.findings))
+        state = LoopState(
+            trainer=run.trainer.state(),
+            search=run.estimator.snapshot if isinstance(run.estimator, Search) else None,
+            history=tuple(run.history),
+            findings=tuple(run.estimator.findings),
+            spent=run.spent,
+            reference_rollouts=run.reference_rollouts,
+            idle=run.idle,
+        )
         save_state(self._folder / CHECKPOINT, state, run.fingerprint)
         for path in self._kept.iterdir():  # also what an interruption left
-            if path.name != "state.safetensors" and not path.stem.endswith(f"-{number}"):
+            if path.name != Path(CHECKPOINT).name and not path.stem.endswith(f"-{number}"):
                 path.unlink()
         write_text(self._folder / "history.csv", _table(run.history, run.task.space.names))
 
-    def finish(self, run: LoopRun, found: LoopResult) -> None:
-        found.policy.save(self._folder / "policy.safetensors")
-        found.posterior.save(self._folder / "posterior")
-        said = {
+    def finish(self, run: LoopRun, result: LoopResult) -> None:
+        result.policy.save(self._folder / "policy.safetensors")
+        result.posterior.save(self._folder / "posterior")
+        plain = {
             "task": run.task.name,
             "estimator": run.estimator.name,
             "seed": run.estimator.seed,
             "budget": run.budget,
             "reference": run.truth.tolist(),
-            "converged": found.converged,
-            "solved_reference": found.solved_reference,
+            "converged": result.converged,
+            "solved_reference": result.solved_reference,
             "solved_at": {"measure": run.task.solved.measure, "threshold": run.task.solved.threshold},
-            "warnings": list(found.warnings),
-            "history": list(found.history),
+            "warnings": list(result.warnings),
+            "history": [asdict(update) for update in result.history],
         }
-        write_text(self._folder / "result.json", to_json(said, indent=1))
+        write_text(self._folder / "result.json", to_json(plain, indent=1))
 
     def _load(self, run: LoopRun) -> None:
         kind = LoopState[run.estimator.state_type]  # type: ignore[name-defined]
         state = load_state(self._folder / CHECKPOINT, kind, run.fingerprint)
-        run.history = json.loads(state.history)
-        number = len(run.history)
+        number = len(state.history)
+        run.history = list(state.history)
         run.trainer.replay.load(self._kept / f"replay-{number}.npz")
         run.trainer.restore(state.trainer)
         run.posterior = load_posterior(self._kept / f"posterior-{number}")
         run.draw.source = load_posterior(self._kept / f"proposal-{number}")
-        for name in self._COUNTS:
-            setattr(run, name, state.counts[name])
+        run.spent, run.reference_rollouts, run.idle = state.spent, state.reference_rollouts, state.idle
         if isinstance(run.estimator, Search) and state.search is not None:
             run.estimator.go_on_from(state.search)
             run.estimator.rollouts = run.spent
         run.estimator.findings = Findings(state.findings)
 
 
-def _table(history: list[Row], names: tuple[str, ...]) -> str:
+def _table(history: Sequence[Update], names: Sequence[str]) -> str:
     """The history as CSV, with a column for each parameter's mean and sd."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    plain = [key for key in history[0] if key not in ("mean", "sd")]
+    rows = [asdict(update) for update in history]
+    plain = [key for key in rows[0] if key not in ("mean", "sd")]
     writer.writerow([*plain, *(f"{kind}_{name}" for kind in ("mean", "sd") for name in names)])
-    writer.writerows([*(row[key] for key in plain), *row["mean"], *row["sd"]] for row in history)
+    writer.writerows([*(row[key] for key in plain), *row["mean"], *row["sd"]] for row in rows)
     return text.getvalue()

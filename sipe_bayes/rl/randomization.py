@@ -1,16 +1,20 @@
 """Domain randomisation: every episode of an agent's training runs under parameters of its own, drawn from a posterior.
 
-Uniform domain randomisation draws from the prior (J. Tobin et al. 2017, "Domain Randomization for Transferring Deep Neural Networks from
-Simulation to the Real World", https://arxiv.org/abs/1703.06907; dynamics: X. B. Peng et al. 2018, "Sim-to-Real Transfer of Robotic Control
-with Dynamics Randomization", https://arxiv.org/abs/1710.06537); B. Mehta, A. Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating
-Robotics Simulators", Section 3.4 (https://arxiv.org/abs/2011.08985) draw from what an estimator found. Here both are a ``Posterior``: a
-Dirac trains in one environment, of particles each is drawn by its weight, everything else is sampled.
+Uniform domain randomisation draws from the prior (J. Tobin et al. 2017, "Domain Randomization for Transferring Deep
+Neural Networks from Simulation to the Real World", https://arxiv.org/abs/1703.06907; dynamics: X. B. Peng et al. 2018,
+"Sim-to-Real Transfer of Robotic Control with Dynamics Randomization", https://arxiv.org/abs/1710.06537); B. Mehta, A.
+Handa, D. Fox, F. Ramos 2020, "A User's Guide to Calibrating Robotics Simulators", Section 3.4
+(https://arxiv.org/abs/2011.08985) draw from what an estimator found. Here both are a ``Posterior``: a Dirac trains in
+one environment, of particles each is drawn by its weight, everything else is sampled.
 
-A theta outside the cube of the environment's parameters, or one that no model can have, is drawn anew and counted. Whether a simulation
-diverges shows in its course alone: it ends its episode, the next one draws again, and the engine counts it.
+A theta outside the cube of the environment's parameters, or one that no model can have, is drawn anew and counted.
+Whether a simulation diverges shows in its course alone: it ends its episode, the next one draws again, and the engine
+counts it.
 
-Two further randomisations, of what a calibration does not say (Peng et al. have both): each episode draws a noise on its observations
-and a delay of its actions. Deviation: Peng's noise has one sd and his delay changes within an episode.
+Two further randomisations, of what a calibration does not say (Peng et al. have both): each episode draws a noise on
+its observations and a delay of its actions.
+
+Deviation: Peng's noise has one sd and his delay changes within an episode.
 """
 
 from __future__ import annotations
@@ -24,27 +28,31 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.core.validation import whole
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
-_DRAWS = 100  # times that theta are drawn anew
 _ROUNDING = 1e-9  # in theta, from one space's bounds to another's
 _POINT = 1e-12  # variance in theta of a normal that is a point
 
 
 @dataclass(frozen=True, eq=False)
 class Randomization:
-    """What an episode draws. posterior: of its parameters. observation_noise: each episode's white noise has an sd uniform between 0 and
-    this, one number or (O,) in the channels' units; one number leaves the desired goal alone. action_delay: control steps; each
-    episode's delay is one of 0 to this many, all equally probable; until the first action arrives nothing is done.
+    """What an episode draws.
+
+    Args:
+        posterior: of its parameters.
+        observation_noise: each episode's white noise has an sd uniform between 0 and this, one number or (O,) in the
+            channels' units; one number leaves the desired goal alone.
+        action_delay: control steps; each episode's delay is one of 0 to this many, all equally probable; until the
+            first action arrives nothing is done.
+
+    Raises:
+        ValueError: for anything else.
     """
 
     posterior: Posterior
@@ -54,13 +62,15 @@ class Randomization:
     def __post_init__(self) -> None:
         if not isinstance(self.posterior, Posterior):
             raise ValueError(
-                f"posterior: expected a Posterior, got a {type(self.posterior).__name__}; a point is sipe.Dirac(theta, space)"
+                f"posterior: expected a Posterior, got a {type(self.posterior).__name__}; a point is "
+                "sipe.Dirac(theta, space)"
             )
         whole("action_delay", self.action_delay, 0)
         noise = np.asarray(self.observation_noise, float)
         if noise.ndim > 1 or not np.isfinite(noise).all() or (noise < 0).any():
             raise ValueError(
-                f"observation_noise: expected an sd of at least 0, or one for each channel, got {self.observation_noise!r}"
+                f"observation_noise: expected an sd of at least 0, or one for each channel, got "
+                f"{self.observation_noise!r}"
             )
 
     @property
@@ -72,10 +82,10 @@ class Randomization:
             *(type(self.posterior).__name__, self.posterior.space.to_dict(), settings),
             *(noise.tolist(), int(self.action_delay)),
         ]
-        found = hashlib.sha256(json.dumps(plain, sort_keys=True, default=float).encode())
+        digest = hashlib.sha256(json.dumps(plain, sort_keys=True, default=float).encode())
         for name in sorted(tensors):
-            found.update(name.encode() + tensors[name].contiguous().numpy().tobytes())
-        return found.hexdigest()
+            digest.update(name.encode() + tensors[name].contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
     @property
     def disturbs(self) -> bool:
@@ -85,8 +95,18 @@ class Randomization:
     def disturbances(
         self, lanes: int, channels: int, goal_size: int, middle: FloatArray, generator: np.random.Generator
     ) -> Disturbances:
-        """Of ``lanes`` lanes; channels: O, of which the last ``goal_size`` are the desired goal; middle (A,): the idle action.
-        Raises ValueError for noise of another length."""
+        """Noise and delay of episodes side by side.
+
+        Args:
+            lanes: how many.
+            channels: O.
+            goal_size: of the desired goal, the last channels.
+            middle: the idle action (A,).
+            generator: of what is drawn.
+
+        Raises:
+            ValueError: for noise of another length.
+        """
         noise = np.asarray(self.observation_noise, float)
         if noise.ndim == 0:
             noise = np.where(np.arange(channels) < channels - goal_size, noise, 0.0)
@@ -105,40 +125,56 @@ def randomization(given: Posterior | Randomization) -> Randomization:
 def load_randomization(path: str | os.PathLike[str]) -> Randomization:
     """Read the ``domain_randomization.json`` of `sipe calibrate`.
 
-    Its ``posterior`` names the saved posterior in the same folder, which is read. A file without that entry stands for its normal: ``mean``
-    and ``covariance`` in the parameters' units, cut off at ``low`` and ``high``. ``observation_noise`` and ``action_delay`` may be
-    added to the file. Raises FileNotFoundError, or ValueError for a file that says something else.
+    Its ``posterior`` names the saved posterior in the same folder, which is read. A file without that entry stands for
+    its normal: ``mean`` and ``covariance`` in the parameters' units, cut off at ``low`` and ``high``.
+    ``observation_noise`` and ``action_delay`` may be added to the file.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FileNotFoundError: where there is none.
+        ValueError: for a file that says something else.
     """
     file = Path(path)
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        more = {name: found[name] for name in ("observation_noise", "action_delay") if name in found}
-        posterior = load_posterior(file.parent / str(found["posterior"])) if "posterior" in found else _normal(found)
+        plain = json.loads(file.read_text(encoding="utf-8"))
+        more = {name: plain[name] for name in ("observation_noise", "action_delay") if name in plain}
+        posterior = load_posterior(file.parent / str(plain["posterior"])) if "posterior" in plain else _normal(plain)
         return Randomization(posterior, **more)
     except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as error:
         raise ValueError(f"{file}: not a domain randomisation ({error!r}); export it with `sipe calibrate`") from None
 
 
-def _normal(found: dict[str, Any]) -> GaussianMixture:
+def _normal(plain: dict[str, Any]) -> GaussianMixture:
     """The truncated normal of a file's parameters, in theta between its bounds."""
-    rows = found["parameters"]
+    rows = plain["parameters"]
     space = ParameterSpace(
         Parameter(row["name"], row["low"], row["high"], unit=row["unit"], targets=tuple(row["targets"])) for row in rows
     )
     width = np.array([p.high - p.low for p in space])
     mean = space.normalise(np.array([row["mean"] for row in rows], float))
-    covariance = np.array(found["covariance"], float) / width / width[:, None] + _POINT * np.eye(len(space))
+    covariance = np.array(plain["covariance"], float) / width / width[:, None] + _POINT * np.eye(len(space))
     return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
 
 
 def check_names(posterior: Posterior, space: ParameterSpace, whose: str) -> None:
-    """Raises ValueError, which names them, where a posterior is over other parameters than ``space``, or in other units."""
+    """See that a posterior is over the parameters of a space, in their units.
+
+    Args:
+        posterior: that episodes are to be drawn from.
+        space: of the environment.
+        whose: what the environment is called.
+
+    Raises:
+        ValueError: which names what differs.
+    """
     mine, theirs = posterior.space.names, space.names
-    lacking, unknown = [n for n in theirs if n not in mine], [n for n in mine if n not in theirs]
-    if lacking or unknown:
-        said = [f"it lacks {', '.join(lacking)}"] * bool(lacking) + [f"it has {', '.join(unknown)}"] * bool(unknown)
+    missing, unknown = [n for n in theirs if n not in mine], [n for n in mine if n not in theirs]
+    if missing or unknown:
+        what = [f"it lacks {', '.join(missing)}"] * bool(missing) + [f"it has {', '.join(unknown)}"] * bool(unknown)
         raise ValueError(
-            f"posterior: is over other parameters than {whose}: {' and '.join(said)}; fit one to the environment's "
+            f"posterior: is over other parameters than {whose}: {' and '.join(what)}; fit one to the environment's "
             f"{', '.join(theirs)}"
         )
     for p in space:
@@ -148,25 +184,30 @@ def check_names(posterior: Posterior, space: ParameterSpace, whose: str) -> None
 
 
 class Draws:
-    """theta of episodes that begin in a simulator. source: what is drawn from, which may be exchanged for another one over the same
-    parameters; redrawn: how many theta no model can have."""
+    """Theta of episodes that begin in a simulator; ``redrawn`` counts those that no model can have.
 
-    def __init__(self, simulator: Simulator, source: Posterior) -> None:
+    Args:
+        simulator: in which they begin.
+        source: what is drawn from; it may be exchanged for another one over the same parameters.
+        tries: times that theta are drawn anew.
+    """
+
+    def __init__(self, simulator: Simulator, source: Posterior, tries: int = 100) -> None:
         whose = getattr(simulator.environment, "name", type(simulator.environment).__name__)
         check_names(source, simulator.space, whose)
-        self.source, self.redrawn, self._simulator = source, 0, simulator
+        self.source, self.redrawn, self._simulator, self._tries = source, 0, simulator, tries
 
     def __call__(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """theta (count, N) that a model can have; raises ValueError where the source hardly has any."""
-        found = np.empty((0, len(self._simulator.space)))
-        for _ in range(_DRAWS):
-            theta = sample(self.source, rng, count - len(found), self._simulator.space)
+        """Draw theta (count, N) that a model can have; raises ValueError where the source hardly has any."""
+        drawn = np.empty((0, len(self._simulator.space)))
+        for _ in range(self._tries):
+            theta = sample(self.source, rng, count - len(drawn), self._simulator.space)
             possible = np.array([self._possible(row) for row in theta])
             self.redrawn += int((~possible).sum())
-            found = np.concatenate([found, theta[possible]])
-            if len(found) == count:
-                return found
-        raise ValueError(f"theta: {_DRAWS} draws of {self.source!r} gave no model; narrow the parameters' bounds")
+            drawn = np.concatenate([drawn, theta[possible]])
+            if len(drawn) == count:
+                return drawn
+        raise ValueError(f"theta: {self._tries} draws of {self.source!r} gave no model; narrow the parameters' bounds")
 
     def _possible(self, theta: FloatArray) -> bool:
         try:
@@ -177,7 +218,17 @@ class Draws:
 
 
 def sample(source: Posterior, rng: np.random.Generator, count: int, space: ParameterSpace) -> FloatArray:
-    """Draws (count, N) of a posterior as theta of ``space``, by name and value where the two spaces' order or bounds differ."""
+    """Draws of a posterior as theta of another space, by name and value where their order or bounds differ.
+
+    Args:
+        source: the posterior.
+        rng: of the draws.
+        count: how many.
+        space: the other one.
+
+    Returns:
+        (count, N).
+    """
     generator = torch_generator_from(rng)
     theta = np.asarray(source.sample((count,), generator=generator).numpy())
     if _scales(source.space) == _scales(space):
@@ -192,10 +243,38 @@ def _scales(space: ParameterSpace) -> list[tuple[str, float, float, str]]:
     return [(p.name, p.low, p.high, p.scale) for p in space]
 
 
+@dataclass(frozen=True)
+class DisturbancesState:
+    """Between two steps.
+
+    Args:
+        observations: what was seen (L, O).
+        share: of the greatest noise (L,).
+        delays: control steps (L,).
+        queue: actions on their way (L, D+1, A).
+        generator: as JSON.
+    """
+
+    observations: FloatArray
+    share: FloatArray
+    delays: IntArray
+    queue: FloatArray
+    generator: str
+
+
 @dataclass(eq=False)
 class Disturbances:
-    """The noise and the delay of L lanes. noise (O,): greatest sd; delay: greatest, in control steps; middle (A,): the idle action.
-    Call ``begin`` for lanes whose episode begins, ``noisy`` on every observation and ``delayed`` on every action."""
+    """The noise and the delay of L episodes side by side.
+
+    Call ``begin`` for those that begin, ``noisy`` on every observation and ``delayed`` on every action.
+
+    Args:
+        noise: greatest sd (O,).
+        delay: greatest, in control steps.
+        lanes: L.
+        middle: the idle action (A,).
+        generator: of what is drawn.
+    """
 
     noise: FloatArray
     delay: int
@@ -223,17 +302,24 @@ class Disturbances:
         return self.observations.copy()
 
     def delayed(self, actions: FloatArray, ignored: BoolArray) -> FloatArray:
-        """What arrives when actions (L, A) are sent; those of ``ignored`` lanes (L,) are none."""
+        """What arrives when actions are sent.
+
+        Args:
+            actions: (L, A).
+            ignored: lanes (L,) whose actions are none.
+        """
         self._queue = np.roll(self._queue, 1, axis=1)
         self._queue[:, 0] = np.where(ignored[:, None], self.middle, actions)
         return self._queue[np.arange(self.lanes), self._delays]
 
-    def state(self) -> dict[str, Any]:
-        """Arrays and text from which ``restore`` goes on bit for bit."""
-        arrays = {"observations": self.observations, "share": self._share, "delays": self._delays, "queue": self._queue}
-        return {**{k: v.copy() for k, v in arrays.items()}, "generator": json.dumps(self.generator.bit_generator.state)}
+    def state(self) -> DisturbancesState:
+        """From which ``restore`` goes on bit for bit."""
+        generator = json.dumps(self.generator.bit_generator.state)
+        seen, share = self.observations.copy(), self._share.copy()
+        return DisturbancesState(seen, share, self._delays.copy(), self._queue.copy(), generator)
 
-    def restore(self, state: dict[str, Any]) -> None:
-        self.observations, self._share = np.array(state["observations"]), np.array(state["share"])
-        self._delays, self._queue = np.array(state["delays"]), np.array(state["queue"])
-        self.generator.bit_generator.state = json.loads(state["generator"])
+    def restore(self, state: DisturbancesState) -> None:
+        """Go on from what ``state`` gave."""
+        self.observations, self._share = state.observations.copy(), state.share.copy()
+        self._delays, self._queue = state.delays.copy(), state.queue.copy()
+        self.generator.bit_generator.state = json.loads(state.generator)

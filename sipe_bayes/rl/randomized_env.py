@@ -1,52 +1,58 @@
-"""A Gymnasium wrapper that gives every episode parameters drawn from a posterior: domain randomisation for anyone's own training code.
+"""A Gymnasium wrapper that gives every episode parameters drawn from a posterior: domain randomisation.
 
-Code that takes Gymnasium's environments takes it (tested: Stable-Baselines3, and Gymnasium's vector environments, as CleanRL uses them; RLlib's
-``register_env(name, lambda config: ...)`` is not tried). ``sipe_bayes.rl.randomization`` says what is drawn, and what happens to draws
-that no model can have.
+Code that takes Gymnasium's environments takes it (tested: Stable-Baselines3, and Gymnasium's vector environments, as
+CleanRL uses them; RLlib's ``register_env(name, lambda config: ...)`` is not tried). ``sipe_bayes.rl.randomization``
+says what is drawn, and what happens to draws that no model can have.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.rl.randomization import Draws, Randomization, randomization
+from sipe_bayes.rl.randomization import Disturbances, Draws, Randomization, randomization
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
-Write = Callable[[gymnasium.Env[Any, Any], dict[str, float]], None]
+Environment = gymnasium.Env[FloatArray, FloatArray]
+Write = Callable[[Environment, dict[str, float]], None]
 """Gives an environment the parameters' values, by name, in their units."""
 
 
 class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatArray], RecordConstructorArgs):
-    """``env`` under a posterior of its parameters, or a ``Randomization`` with noise and delay as well.
+    """An environment under a posterior of its parameters, or a ``Randomization`` with noise and delay as well.
 
-    env: of ``sipe.make`` or ``gymnasium.make("sipe/...")``, wrapped or not; any other one needs ``write(env, values)``, which gives it the
-    values by name before each reset. ``reset(seed=...)`` seeds environment and draws, and the first reset without a seed takes a random
-    one. ``info["theta"]`` (N,) is the episode's; ``redrawn`` counts draws that no model can have, ``diverged`` the simulations that did.
-    ``reset(options={"theta": ...})`` overrules the draw of one episode. Noise makes the observation space unbounded; it needs a flat
-    Box there, a delay flat and bounded actions.
+    ``reset(seed=...)`` seeds environment and draws, and the first reset without a seed takes a random one.
+    ``info["theta"]`` (N,) is the episode's; ``redrawn`` counts draws that no model can have, ``diverged`` the
+    simulations that did. ``reset(options={"theta": ...})`` overrules the draw of one episode. Noise makes the
+    observation space unbounded; it needs a flat Box there, a delay flat and bounded actions.
 
-    Raises ValueError, which names them, for a posterior over other parameters than the environment's."""
+    Args:
+        env: of ``sipe.make`` or ``gymnasium.make("sipe/...")``, wrapped or not; any other one needs ``write``.
+        posterior: what is drawn from.
+        write: called with the environment and the values by name before each reset.
 
-    def __init__(
-        self, env: gymnasium.Env[Any, Any], posterior: Posterior | Randomization, write: Write | None = None
-    ) -> None:
+    Raises:
+        ValueError: for a posterior over other parameters than the environment's; it names them.
+    """
+
+    def __init__(self, env: Environment, posterior: Posterior | Randomization, write: Write | None = None) -> None:
         RecordConstructorArgs.__init__(self, posterior=posterior, write=write)
         gymnasium.Wrapper.__init__(self, env)
         self.randomization, self.diverged = randomization(posterior), 0
         simulator = getattr(env.unwrapped, "simulator", None)
         if not isinstance(simulator, Simulator) and write is None:
             raise ValueError(
-                f"env: {type(env.unwrapped).__name__} is not of sipe.make; pass write(env, values), which gives it the parameters"
+                f"env: {type(env.unwrapped).__name__} is not of sipe.make; pass write(env, values), which gives it the "
+                "parameters"
             )
         if write is not None and not callable(write):
             raise ValueError(
@@ -58,15 +64,28 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
             self._draws = Draws(simulator, self.randomization.posterior)
         self._generator = np.random.default_rng()
         self._noisy = bool(np.any(np.asarray(self.randomization.observation_noise, float)))
-        self._disturbances: Any = self._disturbed() if self.randomization.disturbs else None
+        self._disturbances = self._disturbed() if self.randomization.disturbs else None
 
     @property
     def redrawn(self) -> int:
+        """Draws so far that no model can have."""
         return 0 if self._draws is None else self._draws.redrawn
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[FloatArray, dict[str, object]]:
+        """Begin an episode.
+
+        Args:
+            seed: of environment and draws; None goes on.
+            options: "theta" overrules the draw; with "allow_outside" it may lie outside [0, 1].
+
+        Returns:
+            The first observation and what there is to say.
+
+        Raises:
+            ValueError: for another theta.
+        """
         if seed is not None:
             self._generator = np.random.default_rng([seed, 1])
             if self._disturbances is not None:
@@ -74,14 +93,15 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
         options = dict(options or {})
         given = options.get("theta")
         space = self.randomization.posterior.space
-        theta = self._drawn() if given is None else np.array(space.check_shape(given))
+        theta = self._drawn() if given is None else np.array(space.check_shape(cast(ArrayLike, given)))
         if self._write is None:
             options["theta"] = theta
         else:
             options.pop("theta", None)
             if not ((theta >= 0) & (theta <= 1)).all() and not options.pop("allow_outside", False):
                 raise ValueError(
-                    f'theta: expected numbers in [0, 1], got {theta.tolist()}; options={{"allow_outside": True}} takes others'
+                    f'theta: expected numbers in [0, 1], got {theta.tolist()}; options={{"allow_outside": True}} takes '
+                    "others"
                 )
             self._write(self.env, dict(zip(space.names, space.values(theta).tolist(), strict=True)))
         observation, info = self.env.reset(seed=seed, options=options or None)
@@ -90,8 +110,9 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
             self._disturbances.begin(np.ones(1, bool))
         return self._seen(observation), {**info, "theta": theta.copy()}
 
-    def step(self, action: FloatArray) -> tuple[FloatArray, Any, bool, bool, dict[str, Any]]:
-        if self.randomization.action_delay:
+    def step(self, action: FloatArray) -> tuple[FloatArray, SupportsFloat, bool, bool, dict[str, object]]:
+        """One control step, as Gymnasium has it."""
+        if self.randomization.action_delay and self._disturbances is not None:
             action = self._disturbances.delayed(np.asarray(action, float)[None], np.zeros(1, bool))[0]
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.diverged += info.get("valid", True) is False
@@ -105,19 +126,19 @@ class RandomizedEnv(gymnasium.Wrapper[FloatArray, FloatArray, FloatArray, FloatA
         return np.asarray(self.randomization.posterior.sample(generator=generator).numpy())
 
     def _seen(self, observation: FloatArray) -> FloatArray:
-        if not self._noisy:
+        if not self._noisy or self._disturbances is None:
             return observation
         noisy = self._disturbances.noisy(np.asarray(observation, float)[None])[0]
         return np.asarray(noisy, self.observation_space.dtype)
 
-    def _disturbed(self) -> Any:
+    def _disturbed(self) -> Disturbances:
         observations, actions = self.env.observation_space, self.env.action_space
         channels, goal_size, middle = 0, 0, np.zeros(0)
         if self._noisy:
             channels = _flat(observations, "noise needs a flat Box as its observation_space").shape[0]
             goal_size = int(getattr(getattr(self.env.unwrapped, "task", None), "goal_size", 0))
-            unbounded: Any = gymnasium.spaces.Box(-np.inf, np.inf, (channels,), observations.dtype)  # type: ignore[arg-type]
-            self.observation_space = unbounded
+            unbounded = gymnasium.spaces.Box(-np.inf, np.inf, (channels,), observations.dtype)  # type: ignore[arg-type]
+            self.observation_space = unbounded  # type: ignore[assignment]
         if self.randomization.action_delay:
             box = _flat(actions, "a delay needs a flat Box as its action_space")
             low, high = np.asarray(box.low, float), np.asarray(box.high, float)

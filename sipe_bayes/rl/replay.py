@@ -20,21 +20,19 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.simulation.episodes import Step
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
-GoalReward = Callable[[NDArray[Any], NDArray[Any]], FloatArray]
+GoalReward = Callable[[FloatArray, FloatArray], FloatArray]
+"""Rewards (...,) of achieved and desired goals (..., G)."""
 
+_DRAWS = 100  # times that places are drawn anew before a buffer counts as empty
 _STORED = ("observations", "actions", "rewards", "terminated", "transition", "ends", "achieved")
 
 
@@ -44,8 +42,15 @@ class ReplayError(ValueError):
 
 @dataclass(frozen=True)
 class Batch:
-    """observations and next_observations (B, O), actions (B, A), returns (B,) of the steps between them, and discounts
-    (B,) of the value of the next observation: 0 where the episode terminated."""
+    """Transitions to learn from.
+
+    Args:
+        observations: (B, O).
+        actions: (B, A).
+        returns: of the steps up to the next observations (B,).
+        discounts: of the value of the next observation (B,): 0 where the episode terminated.
+        next_observations: (B, O).
+    """
 
     observations: Float32Array
     actions: Float32Array
@@ -55,10 +60,21 @@ class Batch:
 
 
 class Replay:
-    """Holds the last ``capacity`` steps, of all lanes together, in float32.
+    """The last steps, in float32.
 
-    hindsight: k, 0 for none. goal_reward: rewards (...,) of achieved and desired goals (..., G); the desired goal is
-    the observation's last ``goal_size`` numbers. n_step: steps that a return sums.
+    Args:
+        observation_size: O.
+        action_size: A.
+        capacity: steps, of all lanes together.
+        lanes: L.
+        discount: of a reward one step later.
+        n_step: steps that a return sums.
+        goal_size: G; the desired goal is the observation's last numbers.
+        hindsight: k, 0 for none.
+        goal_reward: what the task gives for a goal.
+
+    Raises:
+        ValueError: for a capacity without room, or hindsight without goals.
     """
 
     def __init__(
@@ -100,7 +116,12 @@ class Replay:
         self._observe(step.observations, step.achieved_goals)
 
     def add(self, actions: FloatArray, step: Step) -> None:
-        """What actions (L, A) led to. Lanes whose episode was over have begun a new one instead."""
+        """What actions led to; lanes whose episode was over have begun a new one instead.
+
+        Args:
+            actions: (L, A).
+            step: what followed.
+        """
         row = self.head % self.rows
         self.actions[row], self.rewards[row] = actions, step.rewards
         self.terminated[row], self.transition[row] = step.terminated, step.valid & ~self._over
@@ -113,8 +134,15 @@ class Replay:
         self._observe(step.observations, step.achieved_goals)
 
     def add_trajectories(self, trajectories: Trajectories, achieved: FloatArray | None = None) -> None:
-        """Fill an empty buffer, one lane for each of B trajectories with rewards; achieved: (B, T+1, G) where there are
-        goals. A trajectory that is not valid to its end counts as far as it is."""
+        """Fill an empty buffer, one lane for each trajectory; one that is not valid to its end counts as far as it is.
+
+        Args:
+            trajectories: B of them, with rewards.
+            achieved: (B, T+1, G) where there are goals.
+
+        Raises:
+            ValueError: for trajectories without rewards, or for which there is no room.
+        """
         batch, horizon = trajectories.actions.shape[:2]
         if batch != self.lanes or horizon >= self.rows:
             raise ValueError(
@@ -136,7 +164,16 @@ class Replay:
         self.head = horizon
 
     def sample(self, rng: np.random.Generator, count: int) -> Batch:
-        """``count`` transitions, uniformly and with replacement; raises ValueError where there are none."""
+        """Transitions, drawn uniformly and with replacement.
+
+        Args:
+            rng: of the draws.
+            count: how many.
+
+        Raises:
+            ValueError: where there are none.
+        """
+        # which transitions, and where their episodes end
         steps, lanes = self._draw(rng, count)
         rows = steps % self.rows
         ends = self.ends[rows, lanes]
@@ -146,14 +183,18 @@ class Replay:
         goals = None
         if self.hindsight:
             goals = self._relabel(rng, steps, lanes, ends, observations, following)
+        # sum the rewards up to there, those of other goals where hindsight has exchanged them
         returns, factor = np.zeros(count), np.ones(count)
         for ahead in range(self.n_step):
             at = steps + ahead
             inside = at < ends
             here = at % self.rows
-            rewards: NDArray[Any] = self.rewards[here, lanes]
+            rewards: FloatArray | Float32Array = self.rewards[here, lanes]
             if goals is not None and self._goal_reward is not None:
-                rewards = self._goal_reward(self.achieved[(at + 1) % self.rows, lanes], goals)
+                reached = self.achieved[(at + 1) % self.rows, lanes]
+                rewards = self._goal_reward(
+                    cast(FloatArray, reached), cast(FloatArray, goals)
+                )  # single precision will do
             returns += np.where(inside, factor * rewards, 0.0)
             factor = np.where(inside, factor * self.discount, factor)
         factor *= ~self.terminated[(last - 1) % self.rows, lanes]
@@ -163,7 +204,7 @@ class Replay:
     def save(self, path: Path) -> None:
         """Write an npz file of what is filled, atomically."""
         used = min(self.head + 1, self.rows)
-        arrays: dict[str, Any] = {name: getattr(self, name)[:used] for name in _STORED}
+        arrays = {name: getattr(self, name)[:used] for name in _STORED}
         arrays |= {"head": np.array(self.head), "starts": self._starts, "over": self._over, "rows": np.array(self.rows)}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -203,14 +244,14 @@ class Replay:
         """Steps and lanes (count,) of transitions: places are drawn anew until enough of them hold one."""
         oldest = max(0, self.head - self.rows + 1)
         held = (self.head - oldest) * self.lanes
-        found = np.empty(0, int)
-        for _ in range(100):
-            places = rng.integers(held, size=count) if held else found
+        drawn = np.empty(0, int)
+        for _ in range(_DRAWS):
+            places = rng.integers(held, size=count) if held else drawn
             rows, lanes = (oldest + places // self.lanes) % self.rows, places % self.lanes
-            found = np.concatenate([found, places[self.transition[rows, lanes]]])
-            if len(found) >= count:
-                found = found[:count]
-                return oldest + found // self.lanes, found % self.lanes
+            drawn = np.concatenate([drawn, places[self.transition[rows, lanes]]])
+            if len(drawn) >= count:
+                drawn = drawn[:count]
+                return oldest + drawn // self.lanes, drawn % self.lanes
         raise ValueError("replay: holds no transitions to sample; add some first")
 
     def _relabel(

@@ -1,7 +1,7 @@
 """Closed-loop controllers that solve the Fetch tasks by hand, for demonstrations.
 
-A share of demonstrated transitions in each batch is what makes sparse rewards learnable for a plain DDPG: Vecerik et al.,
-"Leveraging Demonstrations for Deep Reinforcement Learning on Robotics Problems with Sparse Rewards", 2017,
+A share of demonstrated transitions in each batch is what makes sparse rewards learnable for a plain DDPG: Vecerik et
+al., "Leveraging Demonstrations for Deep Reinforcement Learning on Robotics Problems with Sparse Rewards", 2017,
 https://arxiv.org/abs/1707.08817; Nair et al., "Overcoming Exploration in Reinforcement Learning with Demonstrations",
 2018, https://arxiv.org/abs/1709.10089. Their demonstrations come from people, these from geometry: lengths in metres,
 an action of 1 asks for 5 cm, of which a control step makes less.
@@ -12,21 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.envs.task import Task
-
-FloatArray = NDArray[np.float64]
 
 Demonstrator = Callable[[FloatArray, int, Sequence[np.random.Generator]], FloatArray]
 """Actions (B, A) of observations (B, O), the control step and the lanes' B generators."""
 
 _GAIN = 10.0  # action per metre that the gripper is off
-_BRAKING = 2 * 0.1 * 9.81 * 0.04**2  # a puck goes v^2 / (2 friction gravity); v in metres a control step of 0.04 s
+_BRAKING = 2 * 0.1 * 9.81 * 0.04**2  # a puck goes v^2 / (2 friction gravity); v in metres a step of 0.04 s
 
 
 def push(observations: FloatArray) -> FloatArray:
-    """Actions (B, 4) of observations (B, O): over the block, down behind it as seen from the goal, then straight on."""
+    """Over the block, down behind it as seen from the goal, then straight on: actions (B, 4) of observations (B, O)."""
     grip, block, goal = (observations[:, i : i + 3] for i in (0, 3, 28))
     ahead, left, heading = _towards(block, goal)
     behind, from_block = block - 0.06 * heading, grip - block
@@ -39,8 +37,11 @@ def push(observations: FloatArray) -> FloatArray:
 
 
 def slide(observations: FloatArray) -> FloatArray:
-    """Actions (B, 4) of observations (B, O): over the puck, down behind it, one hit as hard as the goal is far, and a stop as
-    soon as the puck would slide there by itself. Hits that are not central miss: about two fifths reach the goal."""
+    """Over the puck, down behind it, and one hit as hard as the goal is far: actions (B, 4) of observations (B, O).
+
+    It stops as soon as the puck would slide there by itself. Hits that are not central miss: about two fifths reach the
+    goal.
+    """
     grip, puck, goal = (observations[:, i : i + 3] for i in (0, 3, 28))
     _, left, heading = _towards(puck, goal)
     speed = ((observations[:, 14:17] + observations[:, 20:23]) * heading).sum(1, keepdims=True)
@@ -92,8 +93,10 @@ TASKS = (*CONTROLLERS, "FetchPickAndPlace")
 
 
 def demonstrator(task: Task) -> Demonstrator:
-    """How a task of ``TASKS`` is done, with noise. FetchPickAndPlace has its excitation, which grasps the block and brings it to
-    the goal."""
+    """How a task of ``TASKS`` is done, with noise.
+
+    FetchPickAndPlace has its excitation, which grasps the block and brings it to the goal.
+    """
     if task.name not in CONTROLLERS:
         return lambda observations, step, rngs: np.concatenate(
             [np.asarray(task.excitation(seen[None], rng)) for seen, rng in zip(observations, rngs, strict=True)]

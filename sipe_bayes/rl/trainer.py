@@ -1,37 +1,83 @@
 """An agent at work: lanes of a task that act, remember and learn, in small steps that can be stopped and gone on with.
 
-The lanes are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta, noise and delay
-(``sipe_bayes.rl.randomization``).
+The lanes are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta,
+noise and delay (``sipe_bayes.rl.randomization``).
 """
 
 from __future__ import annotations
 
+import copy
 import json
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sipe_bayes.core.checkpoint import State
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.task import Task
 from sipe_bayes.models.policy import Policy
-from sipe_bayes.rl.ddpg import Agent
-from sipe_bayes.rl.randomization import Draws, Randomization
+from sipe_bayes.rl.ddpg import Agent, AgentState
+from sipe_bayes.rl.randomization import DisturbancesState, Draws, Randomization
 from sipe_bayes.rl.replay import Batch, Replay
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.simulation.episodes import Episodes, Step
 from sipe_bayes.simulation.simulator import Simulator
 
-FloatArray = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class Lanes:
+    """Where L lanes are: the arrays of ``Episodes``, None for what the task does not have."""
+
+    theta: FloatArray
+    states: FloatArray
+    goals: FloatArray | None
+    observations: FloatArray
+    elapsed: IntArray
+    derived: FloatArray | None
+    over: BoolArray
+
+
+@dataclass(frozen=True)
+class TrainerState:
+    """Everything but the replay buffer.
+
+    Args:
+        agent: networks and optimisers.
+        lanes: where they are.
+        over: lanes whose episode has ended (L,).
+        steps: control steps taken.
+        owed: updates that are due.
+        diverged: simulations so far.
+        redrawn: theta so far.
+        generators: as JSON.
+        disturbances: None where there are none.
+    """
+
+    agent: AgentState
+    lanes: Lanes
+    over: BoolArray
+    steps: int
+    owed: float
+    diverged: int
+    redrawn: int
+    generators: tuple[str, ...]
+    disturbances: DisturbancesState | None
 
 
 class Trainer:
     """An agent, its replay buffer and the lanes that it acts in. ``steps`` counts control steps, of all lanes together.
 
-    randomization: what each episode draws; without one it runs in the published model. demonstrations: trajectories with rewards, from which
-    ``settings.demonstration_share`` of each batch is taken. device: of the networks.
+    Args:
+        task: what it learns.
+        settings: how.
+        seed: of weights, starts, actions and batches.
+        randomization: what each episode draws; without one it runs in the published model.
+        demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is taken.
+        threads: of the simulation.
+        device: of the networks.
+
+    Raises:
+        ValueError: for settings that do not fit the task, or demonstrations without a share of them.
     """
 
     def __init__(
@@ -70,7 +116,7 @@ class Trainer:
             every = np.ones(settings.lanes, bool)
             self._redraw(every)
             self.episodes.begin(every)
-        self.replay.begin(self._seen(self.episodes.first()))
+        self.replay.begin(self._observed(self.episodes.first()))
         self._over = np.zeros(settings.lanes, bool)
         self.steps, self._owed = 0, 0.0
 
@@ -80,7 +126,7 @@ class Trainer:
         actions = self._actions()
         self._redraw(fresh)
         sent = actions if self._disturbances is None else self._disturbances.delayed(actions, fresh)
-        step = self._seen(self.episodes.step(sent))
+        step = self._observed(self.episodes.step(sent))
         self.replay.add(actions, step)
         if self.agent.normaliser is not None:
             self.agent.normaliser.update(step.observations)
@@ -97,46 +143,43 @@ class Trainer:
         """What has been learnt so far."""
         return self.agent.policy(self.task.name, self.task.goal_size)
 
-    def state(self) -> State:
+    def state(self) -> TrainerState:
         """Everything but the replay buffer, from which ``restore`` goes on bit for bit."""
-        generators = [self._noise, self._picks, self._draws, *self.episodes.generators]
-        arrays = {name: value.copy() for name, value in self._lanes().items()}
-        states = json.dumps([g.bit_generator.state for g in generators])
-        counts = {"steps": self.steps, "owed": self._owed, "diverged": self.simulator.diverged}
-        if self.draws is not None:
-            counts["redrawn"] = self.draws.redrawn
-        disturbed = {} if self._disturbances is None else self._disturbances.state()
-        more = {f"disturbances.{name}": value for name, value in disturbed.items()}
-        return {**self.agent.state(), **arrays, **counts, **more, "generators": states, "over": self._over}
+        return TrainerState(
+            agent=self.agent.state(),
+            lanes=copy.deepcopy(self._lanes()),
+            over=self._over.copy(),
+            steps=self.steps,
+            owed=self._owed,
+            diverged=self.simulator.diverged,
+            redrawn=0 if self.draws is None else self.draws.redrawn,
+            generators=tuple(json.dumps(g.bit_generator.state) for g in self._generators()),
+            disturbances=None if self._disturbances is None else self._disturbances.state(),
+        )
 
-    def restore(self, state: State) -> None:
-        self.agent.restore(state)
-        self.episodes.set_theta(np.arange(self.settings.lanes), state["lanes.theta"])
-        for name, value in self._lanes().items():
-            value[...] = state[name]
-        generators = [self._noise, self._picks, self._draws, *self.episodes.generators]
-        for generator, found in zip(generators, json.loads(state["generators"]), strict=True):
-            generator.bit_generator.state = found
-        self.steps, self._owed, self._over = int(state["steps"]), float(state["owed"]), np.array(state["over"])
-        self.simulator.diverged = int(state.get("diverged", 0))  # earlier versions did not count
+    def restore(self, state: TrainerState) -> None:
+        """Go on from what ``state`` gave."""
+        self.agent.restore(state.agent)
+        self.episodes.set_theta(np.arange(self.settings.lanes), state.lanes.theta)
+        for name, array in vars(self._lanes()).items():
+            if array is not None:
+                array[...] = getattr(state.lanes, name)
+        for generator, kept in zip(self._generators(), state.generators, strict=True):
+            generator.bit_generator.state = json.loads(kept)
+        self.steps, self._owed, self._over = state.steps, state.owed, state.over.copy()
+        self.simulator.diverged = state.diverged
         if self.draws is not None:
-            self.draws.redrawn = int(state.get("redrawn", 0))
-        if self._disturbances is not None:
-            self._disturbances.restore({name: state[f"disturbances.{name}"] for name in self._disturbances.state()})
+            self.draws.redrawn = state.redrawn
+        if self._disturbances is not None and state.disturbances is not None:
+            self._disturbances.restore(state.disturbances)
 
-    def _lanes(self) -> dict[str, NDArray[Any]]:
-        """The arrays that say where the lanes are."""
-        lanes = self.episodes
-        found = {
-            "theta": lanes.theta,
-            "states": lanes.states,
-            "goals": lanes.goals,
-            "observations": lanes.observations,
-            "elapsed": lanes.elapsed,
-            "derived": lanes.derived,
-            "over": lanes.over,
-        }
-        return {f"lanes.{name}": value for name, value in found.items() if value is not None}
+    def _generators(self) -> list[np.random.Generator]:
+        return [self._noise, self._picks, self._draws, *self.episodes.generators]
+
+    def _lanes(self) -> Lanes:
+        """The arrays themselves."""
+        at = self.episodes
+        return Lanes(at.theta, at.states, at.goals, at.observations, at.elapsed, at.derived, at.over)
 
     def _actions(self) -> FloatArray:
         """(L, A): random ones at first, then the actor's with noise."""
@@ -152,14 +195,14 @@ class Trainer:
             actions[chosen] = self._noise.uniform(task.action_low, task.action_high, (int(chosen.sum()), size[1]))
         return np.clip(actions, task.action_low, task.action_high)
 
-    def _redraw(self, lanes: NDArray[np.bool_]) -> None:
+    def _redraw(self, lanes: BoolArray) -> None:
         chosen = np.flatnonzero(lanes)
         if self.draws is not None and len(chosen):
             self.episodes.set_theta(chosen, self.draws(self._draws, len(chosen)))
             if self._disturbances is not None:
                 self._disturbances.begin(lanes)
 
-    def _seen(self, step: Step) -> Step:
+    def _observed(self, step: Step) -> Step:
         """A step as the agent observes it."""
         if self._disturbances is None:
             return step
@@ -177,8 +220,8 @@ class Trainer:
         task, settings = self.task, self.settings
         if capacity // lanes <= task.episode_steps:
             raise ValueError(
-                f"capacity: expected room for more than an episode of {task.episode_steps} steps in each of {lanes} lanes, "
-                f"got {capacity}"
+                f"capacity: expected room for more than an episode of {task.episode_steps} steps in each of {lanes} "
+                f"lanes, got {capacity}"
             )
         goals, reward = task.goal_size, task.goal_reward if task.goal_size else None
         k = settings.hindsight if goals else 0

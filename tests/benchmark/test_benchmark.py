@@ -18,14 +18,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from sipe_bayes.benchmark import bank, cells, frame, measure, records, run, spent
+from sipe_bayes.benchmark import bank, cells, measure, measurement, records, run, run_log
 from sipe_bayes.benchmark.bank import Bank
 from sipe_bayes.benchmark.cells import NINE, SUITES, Cell, matches, select, suite
 from sipe_bayes.benchmark.executors.pool import Inline
 from sipe_bayes.benchmark.log import recorded
-from sipe_bayes.benchmark.records import Record, load_all, posterior_path, record_path
+from sipe_bayes.benchmark.measure import ESTIMATES
+from sipe_bayes.benchmark.records import Look, Record, posterior_path, record_path
 from sipe_bayes.benchmark.report_contents import contents
-from sipe_bayes.benchmark.status import lines, summary
+from sipe_bayes.benchmark.status import summary
 from sipe_bayes.cli.app import app
 from sipe_bayes.core import files
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
@@ -102,7 +103,7 @@ def test_suites_are_those_of_the_paper() -> None:
     ]
 
 
-@pytest.mark.parametrize("estimator", [name for name in ESTIMATORS if name in cells._GRIDS])
+@pytest.mark.parametrize("estimator", [name for name in ESTIMATORS if name in cells.GRIDS])
 def test_sweep_holds_the_defaults(estimator: str) -> None:
     import inspect
 
@@ -146,26 +147,26 @@ def test_select_keeps_the_order_and_each_cell_once() -> None:
 
 
 def test_records_round_trip_and_name_what_is_wrong(undisturbed: Path, tmp_path: Path) -> None:
-    found = load_all(undisturbed)
+    found = Record.all_in(undisturbed)
     assert len(found) == 6
     for record in found:
         assert Record.read(record.write(tmp_path)) == record
         assert record.done
         assert len(record.mean) == len(record.names) == len(record.determined or ())
-        assert record.history[-1]["mean_accuracy"] == record.scores["mean_accuracy"]
+        assert record.history[-1].mean_accuracy == record.scored.mean_accuracy
         assert record.versions["mujoco"]
         assert set(record.checksums) == {"model", "log", "source"}
     (tmp_path / "records" / "bad.json").write_text('{"id": "x", "budgets": 3}')
     with pytest.raises(records.RecordError, match=r"bad\.json: cannot be read as a record \(unknown entry 'budgets'\)"):
-        load_all(tmp_path)
+        Record.all_in(tmp_path)
     with pytest.raises(records.RecordError, match="holds no records"):
-        load_all(tmp_path / "nowhere")
+        Record.all_in(tmp_path / "nowhere")
 
 
 def test_searches_have_a_history(tmp_path: Path) -> None:
     """Looks at a tenth, a quarter and half of the budget, which change nothing; then the result."""
     cell = replace(Cell("Pendulum", "adr"), budget=60, steps=20)
-    looked_at, alone = measure.run(cell, tmp_path, ""), _without_looks(cell, tmp_path)
+    looked_at, alone = ESTIMATES.run(cell, tmp_path, ""), _without_looks(cell, tmp_path)
     history, plain = (json.loads(done.files[1][1])["history"] for done in (looked_at, alone))
     assert [row["rollouts"] for row in history] == [10, 20, 30, 60]
     assert plain == history[-1:]
@@ -174,8 +175,8 @@ def test_searches_have_a_history(tmp_path: Path) -> None:
 
 def _without_looks(cell: Cell, folder: Path) -> Any:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(measure, "_ALONG", ())
-        return measure.run(cell, folder, "")
+        patched.setattr(measure, "SHARES", measure.Shares(looks=()))
+        return ESTIMATES.run(cell, folder, "")
 
 
 def test_estimate_is_that_of_fit(undisturbed: Path) -> None:
@@ -185,7 +186,7 @@ def test_estimate_is_that_of_fit(undisturbed: Path) -> None:
     simulator = sipe_package.Simulator(sipe_package.make_task("Pendulum"), num_threads=1)
     for name in ("simopt", "regression"):
         posterior = sipe_package.get_estimator(simulator, name, budget=60, seed=0).fit(log.trajectories)
-        (record,) = [r for r in load_all(undisturbed) if r.estimator == name and r.seed == 0]
+        (record,) = [r for r in Record.all_in(undisturbed) if r.estimator == name and r.seed == 0]
         assert record.mean == posterior.mean.tolist()
 
 
@@ -198,44 +199,39 @@ def test_finished_cells_never_run_again(undisturbed: Path) -> None:
 
 def test_status(undisturbed: Path) -> None:
     found = summary(undisturbed)
-    assert (found["cells"], found["done"], found["failed"], found["missing"]) == (6, 6, {}, [])
-    (took,) = found["runs"]
-    assert took["cpu_use"] == took["cpu_seconds"] / took["seconds"] > 0
-    assert took["units"] == 7
-    assert "6 cells, 6 done, 0 failed, 0 missing" in lines(found)[0]
-    (cpu,) = [line for line in lines(found) if line.startswith("CPU time of these cells")]
-    seconds = sum(record.cpu_seconds or 0 for record in load_all(undisturbed))
-    assert f"{spent.duration(seconds)} for the methods (direct {spent.duration(seconds)})" in cpu
-    twice = {
-        **found,
-        "runs": [
-            {**took, "seconds": 1800.0, "cpu_seconds": 3600.0},
-            {**took, "seconds": 5400.0, "cpu_seconds": 900.0},
-        ],
-    }
-    assert lines({**twice, "suites": {}, "all": spent.together(twice["runs"])})[-1].startswith(
-        "all runs: 2.0 h, 1.2 h of CPU"
-    )
-    many = [{**took, "command": f"run {k}"} for k in range(5)]
-    shown = lines({**found, "runs": many, "suites": {}, "all": spent.together(many)})
+    assert (found.cells, found.done, found.failed, found.missing) == (6, 6, {}, [])
+    (took,) = found.runs
+    assert run_log.Usage.of([took]).cpu_use == took.cpu_seconds / took.seconds > 0
+    assert took.units == 7
+    assert "6 cells, 6 done, 0 failed, 0 missing" in found.lines()[0]
+    (cpu,) = [line for line in found.lines() if line.startswith("CPU time of these cells")]
+    seconds = sum(record.cpu_seconds or 0 for record in Record.all_in(undisturbed))
+    assert f"{run_log.duration(seconds)} for the methods (direct {run_log.duration(seconds)})" in cpu
+    two = [replace(took, seconds=1800.0, cpu_seconds=3600.0), replace(took, seconds=5400.0, cpu_seconds=900.0)]
+    twice = replace(found, runs=two, suites={}, all=run_log.Usage.of(two))
+    assert twice.lines()[-1].startswith("all runs: 2.0 h, 1.2 h of CPU")
+    many = [replace(took, command=f"run {k}") for k in range(5)]
+    shown = replace(found, runs=many, suites={}, all=run_log.Usage.of(many)).lines()
     assert [line.rsplit(": ", 1)[1] for line in shown if "CPU use" in line and "run" in line][:3] == [
         "run 2",
         "run 3",
         "run 4",
     ]
     assert "and 2 runs before; --json has them all" in shown
-    assert json.loads(sipe("benchmark", "status", str(undisturbed), "--json").output)["done"] == 6
+    plain = json.loads(sipe("benchmark", "status", str(undisturbed), "--json").output)
+    assert plain["done"] == 6
+    assert plain["runs"][0]["cpu_use"] == took.cpu_seconds / took.seconds
 
 
 def test_status_finds_cells_that_do_not_compare(undisturbed: Path, tmp_path: Path) -> None:
     """An agent that is trained anew gives other logs."""
-    found = load_all(undisturbed)
+    found = Record.all_in(undisturbed)
     for record in found:
         changed = {**record.checksums, "log": "other"} if record.estimator == "prior" else record.checksums
         replace(record, checksums=changed).write(tmp_path)
     records.plan(tmp_path, [record.id for record in found])
-    assert summary(undisturbed)["mixed"] == []
-    assert summary(tmp_path)["mixed"] == ["Pendulum/in_distribution/seed0"]
+    assert summary(undisturbed).mixed == []
+    assert summary(tmp_path).mixed == ["Pendulum/in_distribution/seed0"]
 
 
 def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
@@ -266,7 +262,7 @@ def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) 
     assert all(path.stat().st_mtime_ns == written for path, written in seen.items())
     assert records.planned(out) == records.planned(undisturbed)
     assert bank.verify(PENDULUM_BANK, 60, out) == []
-    assert 2 <= len(spent.runs(out)) <= 4  # of those that wrote something
+    assert 2 <= len(run_log.read_runs(out)) <= 4  # of those that wrote something
 
 
 MIDDLE = '''"""A toy: the answer is the middle, whatever was recorded."""
@@ -315,13 +311,13 @@ def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) 
     assert found.exit_code == 1
     assert "1 cell failed" in found.stderr
     assert "seed1 failed: ArithmeticError: no middle" in found.stdout
-    status = {r.seed: r.status for r in load_all(tmp_path)}
+    status = {r.seed: r.status for r in Record.all_in(tmp_path)}
     assert status == {0: "done", 1: "failed", 2: "done"}
     failed = Record.read(record_path(tmp_path, "Pendulum/middle/direct/in_distribution/seed1"))
     assert "in step" in (failed.traceback or "")
     assert not posterior_path(tmp_path, failed.id).exists()
-    assert "failed: Pendulum/middle/direct/in_distribution/seed1: ArithmeticError: no middle" in lines(
-        summary(tmp_path)
+    assert (
+        "failed: Pendulum/middle/direct/in_distribution/seed1: ArithmeticError: no middle" in summary(tmp_path).lines()
     )
     before = measured(tmp_path, *chosen)
     assert (before.exit_code, before.stdout) == (1, "3 cells, 3 of them there already, 1 failed\n")
@@ -344,14 +340,12 @@ def test_policy_cell(tmp_path: Path) -> None:
     """Its checkpoint goes when the record is there; the policy stays."""
     found = measured(tmp_path, "--select", "pendulum/simopt/policy/*/seed0", "--training", "9000")
     assert found.exit_code == 0, found.output
-    (record,) = load_all(tmp_path)
+    (record,) = Record.all_in(tmp_path)
     assert record.converged in (True, False)
     assert record.log == "policy"
-    assert record.history[-1] == {
-        "rollouts": record.rollouts, "mean_accuracy": record.scores["mean_accuracy"], "mean_crps": record.scores["mean_crps"]
-    }  # fmt: skip
+    assert record.history[-1] == Look(record.rollouts, record.scored.mean_accuracy, record.scored.mean_crps)
     assert 0 < record.rollouts <= 60
-    (folder,) = (tmp_path / measure.POLICIES).iterdir()
+    (folder,) = (tmp_path / measurement.POLICIES).iterdir()
     assert (folder / "policy.safetensors").exists()
     assert not (folder / "checkpoint").exists()
     refused(
@@ -363,9 +357,9 @@ def test_policy_cell(tmp_path: Path) -> None:
 
 def test_out_of_distribution(tmp_path: Path) -> None:
     assert measured(tmp_path, "--select", "pendulum/prior/direct/out_of_distribution/seed0").exit_code == 0
-    (record,) = load_all(tmp_path)
+    (record,) = Record.all_in(tmp_path)
     assert record.determined is None
-    assert all(x is False for x in record.scores["noticed"])
+    assert all(x is False for x in record.scored.noticed)
 
 
 # Refusals
@@ -414,16 +408,16 @@ def test_no_suite_is_no_suite(kind: str, tmp_path: Path) -> None:
     [
         ({"budget": 61}, ["with budget 61 and not 60"]),
         ({"steps": 7}, ["with steps 7 and not 20"]),
-        ({"versions": {**frame.versions(), "mujoco": "3.9"}}, ["with versions mujoco 3.9 and not mujoco "]),
+        ({"versions": {**measurement.versions(), "mujoco": "3.9"}}, ["with versions mujoco 3.9 and not mujoco "]),
     ],
 )
 def test_results_of_another_kind_are_left_alone(
     changes: dict[str, Any], words: list[str], undisturbed: Path, tmp_path: Path
 ) -> None:
-    other = replace(load_all(undisturbed)[0], **changes)
+    other = replace(Record.all_in(undisturbed)[0], **changes)
     other.write(tmp_path)
     refused(measured(tmp_path, *PENDULUM), *words, "choose another folder")
-    assert load_all(tmp_path) == [other]
+    assert Record.all_in(tmp_path) == [other]
 
 
 def test_read_only_folder(tmp_path: Path) -> None:
@@ -440,7 +434,7 @@ def test_read_only_folder(tmp_path: Path) -> None:
 
 def test_versions_of_cells_not_asked_for_count_too(undisturbed: Path, tmp_path: Path) -> None:
     """Tables would mix them."""
-    other = replace(load_all(undisturbed)[0], versions={**frame.versions(), "mujoco": "3.9"})
+    other = replace(Record.all_in(undisturbed)[0], versions={**measurement.versions(), "mujoco": "3.9"})
     other.write(tmp_path)
     elsewhere = ["--select", "cartpole/prior/direct/default/seed0"]
     refused(measured(tmp_path, *elsewhere), "with versions mujoco 3.9", other.id, "choose another folder")
@@ -450,7 +444,7 @@ def test_a_folder_that_is_elsewhere(undisturbed: Path) -> None:
     """On a machine that does not see the folder of results a cell makes its simulations itself: the same result, their cost apart,
     and nothing left behind."""
     nowhere, cell = Path("/proc/nowhere"), replace(Cell("Pendulum", "regression"), budget=60, steps=20)
-    done = measure.run(cell, nowhere, "")
+    done = ESTIMATES.run(cell, nowhere, "")
     assert not done.failed, done.line
     record = json.loads(done.files[1][1])
     assert record["simulation_cpu_seconds"] > 0
@@ -493,7 +487,7 @@ PENDULUM_BANK = Bank("Pendulum", "in_distribution", 0, 20)
 
 
 def filled(folder: Path, budget: int) -> int:
-    return run.simulate(PENDULUM_BANK, budget, folder, Inline, "", print)
+    return run.simulate(PENDULUM_BANK, budget, run.Order(folder, Inline))
 
 
 def test_shards_merge_resume_and_verify(tmp_path: Path) -> None:
@@ -541,7 +535,7 @@ def test_simulate_command_serves_the_benchmark(tmp_path: Path) -> None:
     assert "verified" in found.output
     assert sipe("simulate", "Pendulum", "--budget", "120", *out, "--verify").exit_code == 1
     assert "1/1 " in measured(tmp_path, "--select", "pendulum/regression/direct/in_distribution/seed0").stdout
-    assert load_all(tmp_path)[0].simulation_cpu_seconds > 0
+    assert Record.all_in(tmp_path)[0].simulation_cpu_seconds > 0
     refused(sipe("simulate", "Pendulumm", *out), "did you mean 'Pendulum'")
     refused(sipe("simulate", "Pendulum", "--variant", "odd", *out), "--variant odd")
 
@@ -555,11 +549,11 @@ def test_shard_that_cannot_be_made_stops_nothing(
     monkeypatch.setattr(bank, "_simulate", damaged)
     found = measured(tmp_path, "--select", "pendulum/regression/direct/in_distribution/seed0")
     assert "left out: RuntimeError: diverged" in found.stdout
-    (record,) = load_all(tmp_path)
+    (record,) = Record.all_in(tmp_path)
     assert (record.id, what_counts(tmp_path)[record.id]) in what_counts(undisturbed).items()
 
 
 def test_cells_that_share_simulations_are_the_prior_sampling_ones() -> None:
     for name in ESTIMATORS:
-        shares = run._bank(Cell("Pendulum", name)) is not None
+        shares = run.bank_of(Cell("Pendulum", name)) is not None
         assert shares is issubclass(estimator_class(name), PriorSampling)

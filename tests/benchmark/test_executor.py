@@ -3,17 +3,18 @@
 import os
 import threading
 import time
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from sipe_bayes.benchmark import measure, run
+from sipe_bayes.benchmark import run
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.executors.pool import Inline, Pool
 from sipe_bayes.benchmark.executors.work import Done, Unit
-from sipe_bayes.benchmark.records import Record, load_all
+from sipe_bayes.benchmark.measure import EstimateMeasurement
+from sipe_bayes.benchmark.records import Record
 from tests.problems.benchmarks import what_counts
 from tests.problems.workers import gave_up, told
 
@@ -40,17 +41,22 @@ def test_pool_survives_the_death_of_its_processes() -> None:
     assert dict(os.environ) == before
 
 
-def once_stuck(cell: Cell, folder: Path, command: str, head: str) -> Done:
-    """A cell that hangs where it is tried on another node than the head, the first time one is."""
-    import ray
+@dataclass(frozen=True)
+class OnceStuck(EstimateMeasurement):
+    """Cells of which one hangs where it is tried on another node than the head, the first time one is."""
 
-    node = ray.get_runtime_context().get_node_id()
-    with (folder / "tries").open("a") as file:
-        file.write(f"{cell.id} {node}\n")
-    if node != head and not (folder / "stuck").exists():
-        (folder / "stuck").write_text(node)
-        time.sleep(600)
-    return measure.run(cell, folder, command)
+    head: str
+
+    def run(self, cell: Cell, folder: Path, command: str) -> Done:
+        import ray
+
+        node = ray.get_runtime_context().get_node_id()
+        with (folder / "tries").open("a") as file:
+            file.write(f"{cell.id} {node}\n")
+        if node != self.head and not (folder / "stuck").exists():
+            (folder / "stuck").write_text(node)
+            time.sleep(600)
+        return super().run(cell, folder, command)
 
 
 def test_ray_cluster_loses_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,11 +73,11 @@ def test_ray_cluster_loses_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         other = cluster.add_node(num_cpus=1)
         head = cluster.head_node.node_id
         with monkeypatch.context() as patched:
-            patched.setattr(measure, "run", partial(once_stuck, head=head))
+            patched.setattr(run, "ESTIMATES", OnceStuck(head))
             killer = threading.Thread(target=_kill_when_stuck, args=(cluster, other, out))
             killer.start()
             said: list[str] = []
-            failed = run.run(CELLS, out, lambda: RayExecutor(cluster.address), report=said.append)
+            failed = run.run(CELLS, run.Order(out, lambda: RayExecutor(cluster.address), report=said.append))
             killer.join()
     finally:
         cluster.shutdown()
@@ -81,7 +87,7 @@ def test_ray_cluster_loses_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert len(said) == 1 + len(CELLS), said  # every cell once
     assert [cell for cell, node in tries if node == stuck], tries
     assert len(tries) > len(CELLS), tries  # the one that was lost began again
-    assert run.run(CELLS, tmp_path / "local", Inline, report=said.append) == 0
+    assert run.run(CELLS, run.Order(tmp_path / "local", Inline, report=said.append)) == 0
     assert what_counts(out) == what_counts(tmp_path / "local")
 
 
@@ -94,7 +100,7 @@ def _kill_when_stuck(cluster: Any, node: Any, out: Path) -> None:
 
 def test_pool_gives_what_one_process_gives(tmp_path: Path) -> None:
     chosen = CELLS[2:5]
-    assert run.run(chosen, tmp_path / "pool", lambda: Pool(2), report=lambda _: None) == 0
-    assert run.run(chosen, tmp_path / "inline", Inline, report=lambda _: None) == 0
+    assert run.run(chosen, run.Order(tmp_path / "pool", lambda: Pool(2), report=lambda _: None)) == 0
+    assert run.run(chosen, run.Order(tmp_path / "inline", Inline, report=lambda _: None)) == 0
     assert what_counts(tmp_path / "pool") == what_counts(tmp_path / "inline")
-    assert all(isinstance(record, Record) for record in load_all(tmp_path / "pool"))
+    assert all(isinstance(record, Record) for record in Record.all_in(tmp_path / "pool"))

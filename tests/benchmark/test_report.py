@@ -16,9 +16,10 @@ import typer
 from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.benchmark import figures, findings, report_contents, report_html, report_latex, spent, tables
+from sipe_bayes.benchmark import figures, findings, report_contents, report_html, report_latex, tables
 from sipe_bayes.benchmark.cells import suite
-from sipe_bayes.benchmark.records import Record, RecordError, plan
+from sipe_bayes.benchmark.records import Look, Record, RecordError, plan
+from sipe_bayes.benchmark.run_log import Run, Took, by_suite
 from sipe_bayes.cli.benchmark import report
 from sipe_bayes.diagnostics.scores import score
 from sipe_bayes.posterior import Dirac, Posterior, prior
@@ -43,8 +44,8 @@ def make(
     made: dict[str, Any] = {
         "budget": 1000, "steps": 50, "status": "done", "seconds": 2.0, "cpu_seconds": 3.0, "rollouts": 1000,
         "names": list(NAMES), "truth": truth.tolist(), "mean": posterior.mean.tolist(), "sd": posterior.stddev.tolist(),
-        "scores": score(posterior, truth).to_dict(), "determined": [True, False] if variant == "in_distribution" else None,
-        "history": [{"rollouts": n, "mean_accuracy": 0.6 + n / 1e4, "mean_crps": 0.1} for n in (100, 1000)],
+        "scores": score(posterior, truth), "determined": [True, False] if variant == "in_distribution" else None,
+        "history": [Look(n, 0.6 + n / 1e4, 0.1) for n in (100, 1000)],
         "log": "excitation", "versions": {"mujoco": "4.0.0"}, "checksums": {"log": f"{task}{variant}{seed}", "source": "a"}, "command": "sipe benchmark run --suite quick",
     }  # fmt: skip
     cell = f"{task}/{estimator}/{label or setting}/{variant}/seed{seed}"
@@ -78,7 +79,7 @@ def every() -> list[Record]:
         for t in ("FetchPush", "Relocate") for n, error in ((4, 0.05), (10, 0.2)) for s in range(3)
     ]  # fmt: skip
     failed = make(
-        "Door", "npe", status="failed", traceback=f"Traceback\n  File\nValueError: {EVIL}", scores={}, mean=[], sd=[]
+        "Door", "npe", status="failed", traceback=f"Traceback\n  File\nValueError: {EVIL}", scores=None, mean=[], sd=[]
     )
     records[0] = dataclasses.replace(records[0], warnings=[f"mass_1 at a bound: {EVIL}"], command=EVIL)
     return [*records, failed]
@@ -143,7 +144,7 @@ def test_skill_over_determined_parameters() -> None:
 
 
 def column(values: dict[str, list[float]]) -> str | None:
-    return tables._best({name: tuple(v) for name, v in values.items()}, 1)
+    return tables.best_of({name: tuple(v) for name, v in values.items()}, 1)
 
 
 def test_the_best_is_set_apart_only_outside_noise() -> None:
@@ -166,10 +167,10 @@ def test_nothing_is_best_where_the_truth_is_the_centre() -> None:
     assert apart is not None
     assert same is not None
     assert [sum(e.best for _, row in t.rows for e in row if e) for t in (apart, same)] == [0, 1]
-    section = report_contents._group("direct-default", "", records, tables.Context.of(records))
+    section = report_contents.setting_section("direct-default", "", records, tables.Context.of(records))
     assert len(section.sentences) == 2
     assert "nothing is set in bold" in section.sentences[0]
-    assert section.sentences[1] == report_contents._RADARS
+    assert section.sentences[1] == report_contents.RADARS
 
 
 def test_what_stands_beside_from_another_setting_does_not_compete(found: report_contents.Contents) -> None:
@@ -269,33 +270,28 @@ def test_search_is_held_against_the_defaults() -> None:
     errors = {4: 0.05, 6: 0.05, 10: 0.3}
     mine = [make("FetchPush", "adr", s, "sweep", at=near(e, s), label=f"sweep,particles={n}", values={"particles": n}) for n, e in errors.items() for s in range(3)]  # fmt: skip
     mine.append(make("FetchPush", "prior_mean"))
-    rows = tables.sweep_rows(mine)
-    assert [(row[0], row[3]) for row in rows] == [
+    rows = findings.sweep_rows(mine)
+    assert [(row.estimator, row.default) for row in rows] == [
         ("adr", False),
         ("adr", False),
         ("adr", True),
         ("prior_mean, direct", False),
     ]
-    (said,) = findings.sweep_findings([row for row in rows if row[1]])
+    (said,) = findings.sweep_findings([row for row in rows if row.values])
     assert "the best of 3, and not the defaults, particles = 10" in said
     assert "they differ outside noise" in said
 
 
 def test_wall_time_is_summed_by_suite() -> None:
-    row = {
-        "workers": 2,
-        "units": 3,
-        "seconds": 1800.0,
-        "cpu_seconds": 3000.0,
-        "simulating": {"seconds": 100.0, "cpu_seconds": 190.0},
-    }
-    runs = [{**row, "command": f"sipe benchmark run --suite {name} --out x"} for name in ("direct", "direct", "policy")]
-    assert spent.by_suite(runs)["direct"] == {
+    run = Run("", workers=2, units=3, seconds=1800.0, cpu_seconds=3000.0, simulating=Took(100.0, 190.0))
+    commands = [f"sipe benchmark run --suite {name} --out x" for name in ("direct", "direct", "policy")]
+    runs = [dataclasses.replace(run, command=command) for command in commands]
+    assert dataclasses.asdict(by_suite(runs)["direct"]) == {
         "seconds": 3600.0, "cpu_seconds": 6000.0, "workers": 2, "simulating_seconds": 200.0,
         "cpu_use": pytest.approx(6000 / 7200), "cpu_use_simulating": pytest.approx(0.95),
     }  # fmt: skip
-    assert spent.by_suite([{**row, "command": "sipe benchmark run --out x"}]).keys() == {"paper"}
-    assert spent.by_suite([{**row, "command": "sipe simulate Door"}]).keys() == {"sipe simulate"}
+    assert by_suite([dataclasses.replace(run, command="sipe benchmark run --out x")]).keys() == {"paper"}
+    assert by_suite([dataclasses.replace(run, command="sipe simulate Door")]).keys() == {"sipe simulate"}
     said = dict(findings.facts([make()], runs))["wall time"]
     assert (
         said
@@ -341,7 +337,7 @@ def test_accuracy_against_rollouts_prefers_whole_runs() -> None:
 
 def test_histories_of_seeds_on_other_grids_are_carried_on() -> None:
     rows = [[(100, 0.5), (300, 0.7)], [(200, 0.9)]]
-    runs = [make(seed=s, history=[{"rollouts": n, "mean_accuracy": a} for n, a in row]) for s, row in enumerate(rows)]
+    runs = [make(seed=s, history=[Look(n, a) for n, a in row]) for s, row in enumerate(rows)]
     line = figures.accuracy_against_rollouts(runs).axes[0].lines[0]
     np.testing.assert_allclose(line.get_xdata(), [100, 200, 300])
     np.testing.assert_allclose(line.get_ydata(), [0.5, 0.7, 0.8])
@@ -518,7 +514,7 @@ def test_what_is_not_known_of_old_records_is_counted() -> None:
 
 
 def test_one_seed_is_no_test() -> None:
-    records = [make("Door", name, scores={**make().scores}) for name in ("adr", "simopt")]
+    records = [make("Door", name, scores=make().scores) for name in ("adr", "simopt")]
     made = [
         t
         for n in ("accuracy", "CRPS skill")

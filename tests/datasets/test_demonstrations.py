@@ -118,7 +118,7 @@ def test_the_excitation_is_smooth() -> None:
 @pytest.fixture
 def agents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder in place of that of the agents, and no stored sets."""
-    monkeypatch.setattr(demonstration, "_FOLDER", tmp_path)
+    monkeypatch.setattr(demonstration, "AGENT_FILES", tmp_path)
     monkeypatch.setattr(demonstration, "SHIPPED", tmp_path / "none")
     return tmp_path
 
@@ -220,7 +220,7 @@ def test_wrong_input() -> None:
         (lambda: sipe.demonstrations("Pendulum", split="train"), ValueError, "split: expected one of reference"),
         (lambda: sipe.demonstrations("Pendulums"), ValueError, "did you mean 'Pendulum'"),
         (lambda: sipe.demonstrations("Pendulum", variant="other"), ValueError, "variant: no 'other'"),
-        (lambda: sipe.demonstrations("Pendulum", count=0), ValueError, "at least 1 of each"),
+        (lambda: sipe.demonstrations("Pendulum", count=0), ValueError, "count: expected at least 1, got 0"),
         (lambda: quietly("Pendulum", noise=[0.1, 0.1]), ValueError, r"noise: expected one number or \(3,\)"),
         (lambda: quietly("Pendulum", noise=-0.1), ValueError, "none below zero"),
         (lambda: sipe.demonstrations(pendulum()), ValueError, "no starting states"),

@@ -92,7 +92,7 @@ def test_loading_shows_what_is_stored_and_simulates_no_further(task: str, tmp_pa
     column = simulator.environment.state_columns(simulator.model)[3]
     assert column is not None
     states[0, 7, column] += 0.25
-    trajectory_sets.write(tmp_path, name, simulator, replace(made, states=states), goals, {"seed": 0})
+    trajectory_sets.write(tmp_path, name, simulator, replace(made, states=states), goals, trajectory_sets.Origin(0))
     found = trajectory_sets.read(tmp_path, name, simulator, 2, STEPS)
     np.testing.assert_allclose(found.states, states, rtol=1e-7, atol=1e-9)
     moved = np.abs(found.observations[..., 3] - made.observations[..., 3]) > 0.1
@@ -179,7 +179,7 @@ def test_a_task_with_other_defaults_is_another(tmp_path: Path) -> None:
 
 
 def test_missing_agents_are_said_and_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demonstration, "_FOLDER", tmp_path)
+    monkeypatch.setattr(demonstration, "AGENT_FILES", tmp_path)
     agent(sipe.make_task("Pendulum")).save(tmp_path / "Pendulum-expert.safetensors")
     names = trajectory_sets.names(["Pendulum"], ["default"], ["test"])
     made = {m.name.type: m for m in generate(names, tmp_path / "sets", count=2, steps=5, num_threads=1)}
@@ -187,7 +187,7 @@ def test_missing_agents_are_said_and_passed_over(tmp_path: Path, monkeypatch: py
     assert not made["expert"].missing
     assert not made["random"].missing
     entries = trajectory_sets.manifest(tmp_path / "sets")
-    assert [bool(e["agent_sha256"]) for _, e in sorted(entries.items())] == [True, False]
+    assert [bool(e.agent_sha256) for _, e in sorted(entries.items())] == [True, False]
     found = sipe.demonstrations("Pendulum", split="test", count=2, steps=5, folder=tmp_path / "sets")
     simulated = sipe.demonstrations("Pendulum", split="test", count=2, steps=5)
     np.testing.assert_array_equal(found.actions, simulated.actions)
@@ -244,12 +244,12 @@ def test_a_file_that_nobody_lists_is_named(tmp_path: Path) -> None:
 def test_what_is_shipped_is_whole_and_of_today_s_parameters() -> None:
     assert trajectory_sets.verify(SHIPPED) == []
     entries = trajectory_sets.manifest(SHIPPED)
-    assert sum(e["bytes"] for e in entries.values()) <= 60e6
+    assert sum(e.bytes for e in entries.values()) <= 60e6
     known = {name.file: name for name in trajectory_sets.names()}
     assert entries.keys() == known.keys()
     for file, entry in entries.items():
         actor = demonstration.agent_file(known[file].task, known[file].type)
-        assert entry["agent_sha256"] == (hashlib.sha256(actor.read_bytes()).hexdigest() if actor else ""), file
+        assert entry.agent_sha256 == (hashlib.sha256(actor.read_bytes()).hexdigest() if actor else ""), file
     for task in {known[file].task for file in entries}:
         simulator = Simulator(sipe.make_task(task), 1)
         mine = [(known[file], entry) for file, entry in entries.items() if known[file].task == task]

@@ -14,6 +14,8 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.report import calibration_plots as plots
+from sipe_bayes.report import panels
+from sipe_bayes.report.drawing import POSTERIOR, png
 from tests.problems.calibrations import (
     make_calibration,
     ridge,
@@ -46,20 +48,20 @@ def test_density_integrates_to_one_within_the_bounds(centre: float) -> None:
     theta = np.abs(np.random.default_rng(0).normal(centre, 0.02, 4000))
     theta = np.where(theta > 1, 2 - theta, theta)
     grid = np.linspace(0, 1, 801)
-    mass = np.trapezoid(plots.density(theta, grid), grid)
+    mass = np.trapezoid(panels.density(theta, grid), grid)
     assert mass == pytest.approx(1, abs=0.01)
-    assert (plots.density(theta, np.array([-0.001, 1.001])) == 0).all()
+    assert (panels.density(theta, np.array([-0.001, 1.001])) == 0).all()
 
 
 def test_density_is_not_rounded_off_at_a_bound() -> None:
     theta = np.random.default_rng(0).uniform(size=8000)
-    height = plots.density(theta, np.array([0.0, 0.5, 1.0]))
+    height = panels.density(theta, np.array([0.0, 0.5, 1.0]))
     assert height == pytest.approx(1, abs=0.12)
 
 
 def test_density_does_not_depend_on_repeated_draws() -> None:
     theta, grid = np.random.default_rng(0).normal(0.5, 0.1, 200), np.linspace(0, 1, 50)
-    assert plots.density(np.repeat(theta, 40), grid) == pytest.approx(plots.density(theta, grid), rel=0.02)
+    assert panels.density(np.repeat(theta, 40), grid) == pytest.approx(panels.density(theta, grid), rel=0.02)
 
 
 def test_autocorrelation_of_an_autoregression_with_a_gap() -> None:
@@ -88,8 +90,8 @@ def test_marginals_have_one_panel_per_parameter_nuisance_last(monkeypatch: pytes
     found.parameters[0] = dataclasses.replace(found.parameters[0], nuisance=True)
     (figure,) = plots.marginals(found)
     assert [ax.get_title() for ax in figure.axes] == [f"p{i}" for i in (1, 2, 3, 4, 5, 6, 0)]
-    monkeypatch.setattr(plots, "_PANELS", 3)
-    assert [len(f.axes) for f in plots.marginals(found)] == [2, 3, 2]
+    monkeypatch.setattr(plots, "SIZES", plots.Sizes(parameters=3))
+    assert [len(f.axes) for f in plots.marginals(found)] == [2, 2, 3]
 
 
 def test_marginals_stay_within_the_bounds(calibration: Calibration) -> None:
@@ -111,7 +113,7 @@ def test_a_wide_log_scale_is_drawn_as_one() -> None:
     )
     (figure,) = plots.marginals(found)
     assert [ax.get_xscale() for ax in figure.axes] == ["log", "linear"]
-    plots.png(figure)
+    png(figure)
 
 
 def test_pairs_show_every_pair_and_the_correlation(calibration: Calibration) -> None:
@@ -127,7 +129,7 @@ def test_pairs_show_every_pair_and_the_correlation(calibration: Calibration) -> 
 
 def test_pairs_choose_the_ridge_among_many() -> None:
     found = dataclasses.replace(make_calibration(12), ridges=[])
-    theta = plots.draws(found.posterior)
+    theta = panels.draws(found.posterior)
     assert {"p10", "p11"} < set(plots.pair_names(found, theta))
     assert len(plots.pair_names(found, theta)) == plots.MAX_PAIRS
     found.ridges.append(ridge("p3"))
@@ -156,7 +158,7 @@ def test_signals_have_an_error_panel_for_each_channel(channels: int, panels: lis
 
 def test_signals_break_the_line_between_windows(calibration: Calibration) -> None:
     (figure,) = plots.signals(calibration, "train_0")
-    mode = next(line for line in figure.axes[0].lines if line.get_color() == plots.POSTERIOR)
+    mode = next(line for line in figure.axes[0].lines if line.get_color() == POSTERIOR)
     assert np.isnan(np.asarray(mode.get_ydata())).sum() == 3  # four windows
 
 
@@ -168,7 +170,7 @@ def test_a_long_log_gets_a_close_up_of_its_worst_stretch() -> None:
     assert len(figure.axes) == 4
     low, high = figure.axes[2].get_xlim()
     assert low < 20.1 < 20.9 < high < 25
-    plots.png(figure)
+    png(figure)
 
 
 def test_a_default_that_runs_away_does_not_flatten_the_signal() -> None:
@@ -194,7 +196,7 @@ def test_residuals_without_a_sample(calibration: Calibration) -> None:
     empty = np.full(201, np.nan)
     row = dataclasses.replace(calibration.residuals[0], residual=empty, whitened=empty)
     (figure,) = plots.residuals(dataclasses.replace(calibration, residuals=[row]))
-    plots.png(figure)
+    png(figure)
 
 
 def test_chains_have_one_row_per_parameter(calibration: Calibration) -> None:
@@ -205,6 +207,6 @@ def test_chains_have_one_row_per_parameter(calibration: Calibration) -> None:
 
 
 def test_figures_are_the_same_bytes_each_time(calibration: Calibration) -> None:
-    first, second = (plots.png(plots.residuals(calibration)[0]) for _ in range(2))
+    first, second = (png(plots.residuals(calibration)[0]) for _ in range(2))
     assert first == second
     assert first.startswith(b"\x89PNG")

@@ -16,7 +16,7 @@ from rich.console import Console
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark import cells
-from sipe_bayes.diagnostics.scores import crps, score
+from sipe_bayes.diagnostics.scores import Scores, crps, score
 from sipe_bayes.posterior import Dirac, prior
 from sipe_bayes.report import sipe_plot as plot
 
@@ -25,13 +25,13 @@ TRUTH = np.array([0.2, 0.7, 0.9])
 ENVIRONMENTS = list(cells.NINE)
 
 
-def dirac(*theta: float) -> dict[str, Any]:
-    return score(Dirac(list(theta), SPACE), TRUTH).to_dict()
+def dirac(*theta: float) -> Scores:
+    return score(Dirac(list(theta), SPACE), TRUTH)
 
 
 def some(
     estimators: int = 2, environments: list[str] = ENVIRONMENTS, seeds: int = 2
-) -> dict[str, dict[str, list[Any]]]:
+) -> dict[str, dict[str, list[Scores]]]:
     rng = np.random.default_rng(0)
     results = {
         f"e{k}": {e: [dirac(*rng.uniform(size=3)) for _ in range(seeds)] for e in environments}
@@ -70,7 +70,7 @@ def test_curves_are_means_over_seeds_and_gaps_stay_gaps() -> None:
     order = plot.environments(results)
     assert order == ["FetchPush", "Relocate", "Door"]  # the benchmark's
     for line, mode in zip(drawn(accuracy), plot.MODES, strict=False):
-        wanted = [np.mean([s[f"{mode}_accuracy"] for s in results["e0"].get(e, [])] or np.nan) for e in order]
+        wanted = [np.mean([getattr(s, f"{mode}_accuracy") for s in results["e0"].get(e, [])] or np.nan) for e in order]
         np.testing.assert_allclose(line.get_ydata(), [*wanted, wanted[0]])
     np.testing.assert_allclose(drawn(accuracy)[3].get_ydata(), 4 * [1 - np.abs(TRUTH - 0.5).mean()])  # prior mean
 
@@ -96,7 +96,7 @@ def test_with_too_few_spokes_for_a_line_nothing_lies_on_anything(names: list[str
     assert (len(points), len(arcs)) == (2 * len(names), len(names))
     for k, name in enumerate(n for n in ENVIRONMENTS if n in names):
         two = [points[k], points[k + len(names)]]
-        value = np.mean([s["mean_accuracy"] for s in results["e0"][name]])
+        value = np.mean([s.mean_accuracy for s in results["e0"][name]])
         np.testing.assert_allclose([line.get_ydata()[0] for line in two], value)
         places = sorted(float(line.get_xdata()[0]) for line in two)
         assert places[1] - places[0] > 0.1

@@ -79,7 +79,7 @@ def success(settings: Settings, steps: int) -> float:
     trainer = Trainer(POINT, settings, 0)
     while trainer.steps < steps:
         trainer.advance()
-    return float(evaluate(trainer.policy(), POINT, 100, 1)["success_rate"])
+    return float(evaluate(trainer.policy(), POINT, 100, 1).success_rate or 0.0)
 
 
 def test_hindsight_makes_a_sparse_task_learnable() -> None:

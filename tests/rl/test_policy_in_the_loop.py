@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -87,15 +87,15 @@ def run_of(of: Estimator, updates: int = 2, steps: int = 120, **settings: Any) -
 def test_every_estimator(name: str, environment: str) -> None:
     method = estimator(name, task(environment), **CHOSEN.get(name, {}))
     found = loop(method)
-    assert [row["update"] for row in found.history] == [1, 2]
-    assert [row["reference_rollouts"] for row in found.history] == [1, 2]
-    spent = [row["rollouts"] for row in found.history]
+    assert [row.update for row in found.history] == [1, 2]
+    assert [row.reference_rollouts for row in found.history] == [1, 2]
+    spent = [row.rollouts for row in found.history]
     assert 0 < spent[0] < spent[1] <= method.budget
-    assert not any(row["failure"] for row in found.history)
-    assert found.history[0]["mean"] != found.history[1]["mean"] != method.prior.mean.tolist()
+    assert not any(row.failure for row in found.history)
+    assert found.history[0].mean != found.history[1].mean != tuple(method.prior.mean.tolist())
     truth = task(environment).theta("in_distribution")
-    assert found.history[1]["mean"] == found.posterior.mean.tolist()
-    assert found.history[1]["accuracy"] == pytest.approx(1 - np.abs(found.posterior.mean.numpy() - truth).mean())
+    assert found.history[1].mean == tuple(found.posterior.mean.tolist())
+    assert found.history[1].accuracy == pytest.approx(1 - np.abs(found.posterior.mean.numpy() - truth).mean())
     assert found.policy.task == environment
 
 
@@ -105,8 +105,8 @@ def test_learned_rewards(name: str) -> None:
         loop(estimator(name, reward=reward, **more))
         for reward, more in (("state_difference", {}), ("learned", {"discriminator_hidden": 8}))
     )
-    assert plain.history[1]["mean"] != learned.history[1]["mean"]
-    assert plain.history[1]["rollouts"] == learned.history[1]["rollouts"] == 80
+    assert plain.history[1].mean != learned.history[1].mean
+    assert plain.history[1].rollouts == learned.history[1].rollouts == 80
 
 
 @pytest.mark.parametrize("environment", ["Pendulum", "FetchPush"])
@@ -153,20 +153,20 @@ def test_demonstrations_are_learnt_from_and_tell_runs_apart() -> None:
 def test_budgets_follow_the_training() -> None:
     """A fit gets what is left of its share so far, a search takes steps until it is level."""
     fitted = told(budget=100)
-    assert [row["rollouts"] for row in loop(fitted, 4, 240).history] == [7, 14, 21, 28]
+    assert [row.rollouts for row in loop(fitted, 4, 240).history] == [7, 14, 21, 28]
     assert fitted.budgets == [25, 43, 61, 79]
     assert fitted.budget == 100
     searched = loop(estimator("simopt", budget=60, updates=2, particles=5), 6, 360)
-    assert [row["rollouts"] for row in searched.history] == [10, 20, 30, 40, 50, 60]
+    assert [row.rollouts for row in searched.history] == [10, 20, 30, 40, 50, 60]
     slow = loop(estimator("simopt", budget=60, updates=6, particles=5), 6, 360)
-    assert [row["rollouts"] for row in slow.history] == [30, 30, 30, 60, 60, 60]
-    assert [row["reference_rollouts"] for row in slow.history] == [1, 1, 1, 2, 2, 2]
+    assert [row.rollouts for row in slow.history] == [30, 30, 30, 60, 60, 60]
+    assert [row.reference_rollouts for row in slow.history] == [1, 1, 1, 2, 2, 2]
 
 
 def test_a_failed_update_leaves_the_estimate() -> None:
     found = loop(told(fails=(2,)), 3, 180)
-    assert [row["failure"] for row in found.history] == [None, "no idea", None]
-    assert found.history[1]["mean"] == [0.25] * 3
+    assert [row.failure for row in found.history] == [None, "no idea", None]
+    assert found.history[1].mean == (0.25,) * 3
     assert found.warnings == ("update 2: no idea",)
     with pytest.raises(ValueError, match=r"no idea \(the first of 3 updates, with 33 rollouts\)$"):
         loop(told(fails=(1,)), 3, 180)
@@ -210,7 +210,7 @@ def test_a_diverging_draw_ends_its_episode_and_is_counted(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(engine, "advance", diverging)
     run.iterate(None)
-    assert run.history[0]["diverged"] == 1
+    assert run.history[0].diverged == 1
     assert (seen[9] == seen[0]).all()
     assert (seen[10] != seen[9]).all()
     (given,) = run.estimator.given  # type: ignore[attr-defined]
@@ -269,7 +269,7 @@ def test_a_resumed_run_is_the_undisturbed_one(tmp_path: Path, name: str, setting
     assert states[0].keys() == states[1].keys()
     for key, value in states[0].items():
         np.testing.assert_array_equal(value, states[1][key], err_msg=key)
-    assert states[0]["trainer"]["updates"] > 10
+    assert states[0]["trainer"]["agent"]["updates"] > 10
 
 
 def test_what_the_folder_holds(tmp_path: Path) -> None:
@@ -280,10 +280,11 @@ def test_what_the_folder_holds(tmp_path: Path) -> None:
     assert files == sorted([*pairs, "checkpoint/replay-2.npz", CHECKPOINT, *own])
     with (tmp_path / "history.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["accuracy"]) for row in rows] == [row["accuracy"] for row in found.history]
-    assert [float(row["mean_length"]) for row in rows] == [row["mean"][1] for row in found.history]
+    assert [float(row["accuracy"]) for row in rows] == [row.accuracy for row in found.history]
+    assert [float(row["mean_length"]) for row in rows] == [row.mean[1] for row in found.history]
     said = json.loads((tmp_path / "result.json").read_text())
-    assert (said["converged"], said["estimator"], said["history"]) == (found.converged, "adr", list(found.history))
+    history = [{**asdict(row), "mean": list(row.mean), "sd": list(row.sd)} for row in found.history]
+    assert (said["converged"], said["estimator"], said["history"]) == (found.converged, "adr", history)
     assert torch.equal(sipe.load_posterior(tmp_path / "posterior").mean, found.posterior.mean)
 
 

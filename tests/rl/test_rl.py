@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import astuple, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,21 +13,19 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from typer.testing import CliRunner
 
 import sipe_bayes as sipe
-from sipe_bayes.cli.app import app
-from sipe_bayes.models.policy import Policy, PolicyError, load_policy
+from sipe_bayes.models.policy import PolicyError, load_policy
 from sipe_bayes.posterior import prior
 from sipe_bayes.rl.ddpg import Agent
-from sipe_bayes.rl.evaluation import AGENTS, beside, check_agents, evaluate, install, write_card
 from sipe_bayes.rl.normaliser import Normaliser
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.replay import Batch
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.rl.train import CHECKPOINT, choose, read_curve, train
+from sipe_bayes.rl.train import CHECKPOINT, read_curve, train
 from sipe_bayes.rl.trainer import Trainer
 from tests.problems.checkpoints import contents
+from tests.problems.policies import SMALL, policy
 
 SEEN, DONE, BATCH = 5, 2, 32
 
@@ -136,20 +134,6 @@ def test_actor_finds_the_best_action_of_a_known_reward() -> None:
         returns = -((actions - best(observations)) ** 2).sum(1).astype(np.float32)
         agent.update(Batch(observations, actions, returns, np.zeros(128, np.float32), observations))
     assert error(held_out) < 0.25 < 0.5 < before, (error(held_out), before)
-
-
-def policy(seed: int = 0, normalised: bool = True, task: str = "Pendulum") -> Policy:
-    made = sipe.make_task(task)
-    rng = np.random.default_rng(seed)
-    agent = Agent(len(made.channels), made.num_actions, made.action_low, made.action_high, SMALL, rng)
-    found = agent.policy(task)
-    if not normalised:
-        return found
-    mean, scale = rng.standard_normal((2, len(made.channels))).astype(np.float32)
-    return Policy(task, found.layers, found.action_low, found.action_high, mean, np.abs(scale) + 0.1)
-
-
-SMALL = Settings(hidden=(8, 8), batch=16, start_steps=60, learning_rate=1e-3)
 
 
 @pytest.mark.parametrize("normalised", [False, True])
@@ -271,7 +255,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, setti
     resumed = train(task, 270, 3, short, settings, resume=True, **run)  # type: ignore[arg-type]
     for a, b in zip(whole.layers, resumed.layers, strict=True):
         np.testing.assert_array_equal(a[0], b[0])
-    curves = [[row[:4] for row in read_curve(tmp_path / name)] for name in ("whole", "short")]
+    curves = [[astuple(row)[:4] for row in read_curve(tmp_path / name)] for name in ("whole", "short")]
     assert curves[0] == curves[1]
     assert len(curves[0]) == 3
     states = [contents(tmp_path / name / CHECKPOINT) for name in ("whole", "short")]
@@ -279,8 +263,8 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, setti
     for name, value in states[0].items():
         if name not in ("seconds", "curve"):  # the time it took
             np.testing.assert_array_equal(value, states[1][name], err_msg=name)
-    assert states[0]["updates"] > 100
-    assert states[0]["redrawn"] > 0
+    assert states[0]["trainer"]["agent"]["updates"] > 100
+    assert states[0]["trainer"]["redrawn"] > 0
     assert len(list((short / "checkpoint").glob("replay-*.npz"))) == 1
 
 
@@ -356,71 +340,11 @@ def test_demonstrations_fill_their_share_of_a_batch() -> None:
         Trainer(task, settings)
 
 
-def test_choice_of_the_agents() -> None:
-    rows = [[10, 5.0], [20, 9.0], [30, 1.0], [40, 3.0], [50, 2.0]]
-    assert choose(rows, 50) == {"suboptimal": 30, "expert": 40}
-    assert choose(rows[:1], 10) == {"suboptimal": 10, "expert": 10}
-
-
-def test_evaluation_is_that_of_single_episodes() -> None:
-    agent = policy(task="FetchPush", normalised=False)
-    found = evaluate(agent, "FetchPush", episodes=3, seed=5, theta=np.array([0.2, 0.9]))
-    returns, success = [], []
-    environment = sipe.make("FetchPush")
-    for lane in range(3):
-        environment.np_random = np.random.default_rng([5, lane])
-        observation, _ = environment.reset(options={"theta": np.array([0.2, 0.9])})
-        total, over = 0.0, False
-        while not over:
-            observation, reward, terminated, truncated, info = environment.step(agent(observation[None])[0])
-            total, over = total + reward, terminated or truncated
-        returns.append(total)
-        success.append(info["success"])
-    assert found["mean"] == pytest.approx(np.mean(returns))
-    assert found["sd"] == pytest.approx(np.std(returns, ddof=1))
-    assert found["success_rate"] == np.mean(success)
-
-
-def test_cards_are_checked(tmp_path: Path) -> None:
-    path = tmp_path / "Pendulum-expert.safetensors"
-    policy().save(path)
-    task = sipe.make_task("Pendulum")
-    write_card(path, task, {"seed": 0}, beside(task, 20), episodes=20)
-    (row,) = check_agents(tmp_path, episodes=20)
-    assert row["agrees"], row
-    card = json.loads(path.with_suffix(".json").read_text())
-    card["evaluation"]["mean"] += 10 * card["evaluation"]["standard_error"]
-    path.with_suffix(".json").write_text(json.dumps(card))
-    (row,) = check_agents(tmp_path, episodes=20)
-    assert not row["agrees"]
-    path.with_suffix(".json").unlink()
-    with pytest.raises(ValueError, match=r"card Pendulum-expert\.json cannot be read"):
-        list(check_agents(tmp_path))
-    with pytest.raises(FileNotFoundError, match="no agents"):
-        list(check_agents(tmp_path / "nowhere"))
-
-
-def test_a_pair_is_installed_with_its_cards(tmp_path: Path) -> None:
-    made, there = tmp_path / "run", tmp_path / "agents"
-    for seed, name in enumerate(("expert", "suboptimal")):
-        policy(seed).save(made / f"{name}.safetensors")
-        with pytest.raises(FileNotFoundError, match=r"expert|suboptimal"):
-            install(made, there)  # the card, or the other agent, is missing
-        assert not there.exists()
-        (made / f"{name}.json").write_text(name)
-    paths = install(made, there)
-    assert paths == [there / "Pendulum-expert.safetensors", there / "Pendulum-suboptimal.safetensors"]
-    assert len(list(there.iterdir())) == 4
-    for seed, (path, name) in enumerate(zip(paths, ("expert", "suboptimal"), strict=True)):
-        assert path.with_suffix(".json").read_text() == name
-        np.testing.assert_array_equal(load_policy(path).layers[0][0], policy(seed).layers[0][0])
-
-
 def test_settings_out_of_range_are_refused() -> None:
     cases = {
-        "discount: expected a number from 0 to 1, got 1.5": {"discount": 1.5},
-        "batch: expected a number at least 1, got 0": {"batch": 0},
-        "tau: expected a number from 0 to 1, got nan": {"tau": float("nan")},
+        "discount: expected a share at least 0 and at most 1, got 1.5": {"discount": 1.5},
+        "batch: expected at least 1, got 0": {"batch": 0},
+        "tau: expected a share at least 0 and at most 1, got nan": {"tau": float("nan")},
         "hidden: expected the sizes": {"hidden": ()},
         "clip_targets: expected a discount below 1": {"clip_targets": True, "discount": 1.0},
     }
@@ -432,43 +356,3 @@ def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match="device: 'tpu' is not available here; use 'cpu'"):
         Trainer(sipe.make_task("Pendulum"), Settings(), device="tpu")
     assert Settings(lanes=4).deviations() == {"lanes": 4}
-
-
-def test_commands_train_write_cards_and_check_them(tmp_path: Path) -> None:
-    out, runner = tmp_path / "run", CliRunner()
-    short = ["--start-steps", "60", "--batch", "8", "--evaluate-every", "50", "--evaluation-episodes", "1"]
-    arguments = ["train", "FetchPush", "--steps", "100", "--episodes", "3", "--out", str(out), "--clip-targets", *short]
-    done = runner.invoke(app, arguments)
-    assert done.exit_code == 0, done.output
-    assert "expert: return" in done.output
-    card = json.loads((out / "suboptimal.json").read_text())
-    assert card["deviations"] == {"batch": 8, "start_steps": 60, "clip_targets": True}
-    assert (card["kept_at_step"], card["steps"], card["evaluation"]["episodes"]) == (50, 100, 3)
-    assert {"idle", "random", "command", "wall_seconds", "versions", "solved_at"} <= card.keys()
-    assert list((out / "tensorboard").glob("events*"))
-    refused = runner.invoke(app, arguments)
-    assert refused.exit_code == 2
-    assert "add --resume" in refused.stderr
-    card["evaluation"]["mean"] = 1.0
-    (out / "suboptimal.json").write_text(json.dumps(card))
-    checked = runner.invoke(app, ["agents", str(out), "--episodes", "3"])
-    assert checked.exit_code == 1
-    assert "BEYOND" in checked.output
-
-
-def test_the_readmes_table_is_that_of_the_cards() -> None:
-    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    cards = sorted(AGENTS.glob("*-expert.json"))
-    assert len(cards) == 7
-    for path in cards:
-        task = path.stem.removesuffix("-expert")
-        row = [line for line in text.splitlines() if line.startswith(f"| `{task}` |")][-1]
-        for file, kind in (
-            (path, "evaluation"),
-            (path.with_name(path.name.replace("expert", "suboptimal")), "evaluation"),
-            (path, "idle"),
-            (path, "random"),
-        ):
-            found = json.loads(file.read_text(encoding="utf-8"))[kind]
-            rate = "" if found["success_rate"] is None else f" ({found['success_rate']:.2f})"
-            assert f"| {found['mean']:,.0f} ± {found['standard_error']:.0f}{rate} |" in row

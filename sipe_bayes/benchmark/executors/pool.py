@@ -1,7 +1,7 @@
 """The executors of one machine: a pool of processes, each on one thread, and none, for a debugger.
 
-The pool keeps at most one unit in each process, so that it knows what a process was doing that died: the unit gets a new one,
-and after the second death it is given up. Processes end with the one that started them.
+The pool keeps at most one unit in each process, so that it knows what a process was doing that died: the unit gets a
+new one, and after the second death it is given up. Processes end with the one that started them.
 """
 
 from __future__ import annotations
@@ -18,24 +18,29 @@ from typing import Self
 
 from sipe_bayes.benchmark.executors.work import ONE_THREAD, Done, Unit
 
-_LIVES = 2
-
 
 class Pool:
-    """``workers`` processes; see the module."""
+    """Processes of this machine; see the module.
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    Args:
+        workers: how many.
+        lives: deaths of its process after which a unit is given up.
+    """
+
+    def __init__(self, workers: int, lives: int = 2) -> None:
+        self.workers, self._lives = workers, lives
         self._queue: deque[Unit] = deque()
         self._busy: dict[Connection, tuple[BaseProcess, Unit]] = {}
         self._idle: list[tuple[BaseProcess, Connection]] = []
         self._deaths: dict[str, int] = {}
 
     def submit(self, unit: Unit) -> None:
+        """See ``Executor``."""
         self._queue.append(unit)
         self._start()
 
     def next(self) -> tuple[Unit, Done]:
+        """See ``Executor``."""
         while True:
             self._start()
             ready = wait(list(self._busy))[0]
@@ -44,10 +49,10 @@ class Pool:
             try:
                 done = ready.recv()
             except (EOFError, OSError):
-                found = self._buried(process, unit)
-                if found is None:
+                instead = self._after_death(process, unit)
+                if instead is None:
                     continue
-                return unit, found
+                return unit, instead
             self._idle.append((process, ready))
             return unit, done
 
@@ -74,21 +79,21 @@ class Pool:
 
     def _worker(self) -> tuple[BaseProcess, Connection]:
         context = multiprocessing.get_context("spawn")
-        here, there = context.Pipe()
+        own_end, workers_end = context.Pipe()
         with _environment():
-            process = context.Process(target=_work, args=(there,), daemon=True)
+            process = context.Process(target=_work, args=(workers_end,), daemon=True)
             process.start()
-        there.close()
-        return process, here
+        workers_end.close()
+        return process, own_end
 
-    def _buried(self, process: BaseProcess, unit: Unit) -> Done | None:
+    def _after_death(self, process: BaseProcess, unit: Unit) -> Done | None:
         """What stands in for the result of a unit whose process died; None while it is tried again."""
         process.join()
         self._deaths[unit.name] = self._deaths.get(unit.name, 0) + 1
-        if self._deaths[unit.name] < _LIVES:
+        if self._deaths[unit.name] < self._lives:
             self._queue.appendleft(unit)
             return None
-        return unit.gave_up(f"its process ended with exit code {process.exitcode}, {_LIVES} times")
+        return unit.gave_up(f"its process ended with exit code {process.exitcode}, {self._lives} times")
 
 
 class Inline:
@@ -100,9 +105,11 @@ class Inline:
         self._queue: deque[Unit] = deque()
 
     def submit(self, unit: Unit) -> None:
+        """See ``Executor``."""
         self._queue.append(unit)
 
     def next(self) -> tuple[Unit, Done]:
+        """See ``Executor``."""
         unit = self._queue.popleft()
         return unit, unit()
 

@@ -1,9 +1,9 @@
 """The executor of many machines: Ray's, from `pip install sipe-bayes[ray]`.
 
-A unit is a task of one CPU that returns its files; the process that started the run writes them. When a node dies, Ray runs its units
-again on another. The folder of results may be on a file system that the nodes share: then they read its simulations, and a training
-goes on from its checkpoints; where it is not, each cell makes the rows it needs itself, and they are the same. Agents of the transfer
-read the estimates that they train under, and so need a shared one.
+A unit is a task of one CPU that returns its files; the process that started the run writes them. When a node dies, Ray
+runs its units again on another. The folder of results may be on a file system that the nodes share: then they read its
+simulations, and a training goes on from its checkpoints; where it is not, each cell makes the rows it needs itself, and
+they are the same. Agents of the transfer read the estimates that they train under, and so need a shared one.
 """
 
 from __future__ import annotations
@@ -15,16 +15,22 @@ from typing import Any, Self
 
 from sipe_bayes.benchmark.executors.work import ONE_THREAD, Done, Unit
 
-_RETRIES = 5
-_PATIENCE = 5.0  # seconds for a cluster's port to answer
-
 
 class RayExecutor:
-    """address: HOST:PORT of a cluster, or None for one on this machine. Raises ValueError where there is none."""
+    """A cluster's CPUs.
 
-    def __init__(self, address: str | None = None) -> None:
+    Args:
+        address: HOST:PORT of a cluster, or None for one on this machine.
+        retries: times that a unit is begun again when its node dies.
+        patience: seconds for the cluster's port to answer.
+
+    Raises:
+        ValueError: where there is no such cluster.
+    """
+
+    def __init__(self, address: str | None = None, retries: int = 5, patience: float = 5.0) -> None:
         if address is not None:
-            _answers(address)
+            _check_answers(address, patience)
         try:
             import ray
         except ImportError:
@@ -38,14 +44,16 @@ class RayExecutor:
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ValueError(f"--address {address}: {error}; start a cluster with `ray start --head`") from None
         self.workers = int(ray.cluster_resources().get("CPU", 1))
-        remote = ray.remote(num_cpus=1, max_retries=_RETRIES, runtime_env={"env_vars": ONE_THREAD})
+        remote = ray.remote(num_cpus=1, max_retries=retries, runtime_env={"env_vars": ONE_THREAD})
         self._call = remote(_call)
         self._running: dict[Any, Unit] = {}
 
     def submit(self, unit: Unit) -> None:
+        """See ``Executor``."""
         self._running[self._call.remote(unit)] = unit
 
     def next(self) -> tuple[Unit, Done]:
+        """See ``Executor``."""
         reference = self._ray.wait(list(self._running), num_returns=1)[0][0]
         unit = self._running.pop(reference)
         try:
@@ -64,14 +72,15 @@ def _call(unit: Unit) -> Done:
     return unit()
 
 
-def _answers(address: str) -> None:
+def _check_answers(address: str, patience: float) -> None:
     """Raises ValueError where nobody listens: Ray itself would wait for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
         raise ValueError(f"--address {address}: expected HOST:PORT, such as 10.0.0.1:6379")
     try:
-        socket.create_connection((host, int(port)), _PATIENCE).close()
+        socket.create_connection((host, int(port)), patience).close()
     except OSError as error:
         raise ValueError(
-            f"--address {address}: does not answer ({error}); start the cluster with `ray start --head`, or leave it out"
+            f"--address {address}: does not answer ({error}); start the cluster with `ray start --head`, or leave it "
+            "out"
         ) from None

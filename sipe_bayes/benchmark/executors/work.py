@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
 """Environment of a worker: set before it starts, as numerical libraries read it when they are loaded."""
@@ -13,8 +13,15 @@ ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPEN
 
 @dataclass(frozen=True)
 class Done:
-    """What a unit came to. files: (path in the folder of results, bytes), to be written in this order; line: a few words; spent: a path in
-    the folder of results that nothing needs any more once the files are written."""
+    """What a unit came to.
+
+    Args:
+        files: (path in the folder of results, bytes), to be written in this order.
+        line: a few words.
+        cpu_seconds: that it took.
+        failed: whether it did.
+        spent: a path in the folder of results that nothing needs any more once the files are written.
+    """
 
     files: tuple[tuple[str, bytes], ...]
     line: str
@@ -25,12 +32,19 @@ class Done:
 
 @dataclass(frozen=True)
 class Unit:
-    """A call of a module's function, which does not write where the results lie. needs: names of units that have to be written
-    before. broken: what it comes to when it raises, or its process dies again and again."""
+    """A call of a function that can be pickled and does not write where the results lie.
+
+    Args:
+        name: of the unit.
+        function: what is called.
+        arguments: with which.
+        broken: what it comes to when it raises, or its process dies again and again.
+        needs: names of units that have to be written before.
+    """
 
     name: str
     function: Callable[..., Done]
-    arguments: Mapping[str, Any]
+    arguments: Mapping[str, object]
     broken: Callable[..., Done]
     needs: frozenset[str] = field(default=frozenset())
 
@@ -44,6 +58,7 @@ class Unit:
             return self.gave_up(traceback.format_exc().strip().splitlines()[-1])
 
     def gave_up(self, why: str) -> Done:
+        """What it comes to where it cannot be done."""
         return self.broken(why=why, **self.arguments)
 
 
@@ -52,9 +67,11 @@ class Executor(Protocol):
 
     workers: int
 
-    def submit(self, unit: Unit) -> None: ...
+    def submit(self, unit: Unit) -> None:
+        """Hand a unit over."""
 
-    def next(self) -> tuple[Unit, Done]: ...
+    def next(self) -> tuple[Unit, Done]:
+        """The next one that ends, and what it came to."""
 
     def __enter__(self) -> Self: ...
 

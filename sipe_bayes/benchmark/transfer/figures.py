@@ -5,34 +5,41 @@ Records or rows in, one Matplotlib figure out, no pyplot, no state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.typing import LineStyleType
 
 from sipe_bayes.benchmark.tables import order_tasks
-from sipe_bayes.benchmark.transfer.rows import WORDS, Row, label, ordered
+from sipe_bayes.benchmark.transfer.rows import WORDS, Row, Target, label, ordered
 from sipe_bayes.benchmark.transfer.study import PRIOR as PRIOR_NAME
-from sipe_bayes.benchmark.transfer.study import TRUTH, TransferRecord
-from sipe_bayes.report.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, _figure, _styled
+from sipe_bayes.benchmark.transfer.study import TRUTH, Point, TransferRecord
+from sipe_bayes.report.drawing import CHAINS, DASHED, DEFAULT, MEASURED, PRIOR, STYLE, new_figure, styled
 
 _COLOURS = {"truth": MEASURED, "prior": PRIOR, "default": DEFAULT}
 
 
-@_styled
-def bars(found: Sequence[Row]) -> Figure:
-    """The paper's Figure 6: a group of bars for each task and variant, means over seeds in percent of the mean oracle, the seeds as dots; the
-    oracle as the line at 100 % with its seeds as a shade, the uniform prior as a dashed line."""
-    groups = list(dict.fromkeys(row.group for row in found if row.percent is not None))
-    most = max((len(_shown(found, group)) for group in groups), default=1)
+@styled
+def bars(given: Sequence[Row]) -> Figure:
+    """The paper's Figure 6: a group of bars for each task and variant, means over seeds in percent of the mean oracle.
+
+    The seeds are dots; the oracle is the line at 100 % with its seeds as a shade, the uniform prior a dashed line.
+
+    Args:
+        given: rows of all targets.
+    """
+    groups = list(dict.fromkeys(row.group for row in given if row.percent is not None))
+    most = max((len(_shown(given, group)) for group in groups), default=1)
     across = min(3, max(1, len(groups)))
     down = -(-max(1, len(groups)) // across)
-    figure = _figure(down * (0.9 + 0.22 * most) + 0.3, max(4.8, 3.7 * across))
+    figure = new_figure(down * (0.9 + 0.22 * most) + 0.3, max(4.8, 3.7 * across))
     for k, group in enumerate(groups):
         axes = figure.add_subplot(down, across, k + 1)
-        _group(axes, _shown(found, group), next((r for r in found if r.group == group and r.name == TRUTH), None))
+        _group(axes, _shown(given, group), next((r for r in given if r.group == group and r.name == TRUTH), None))
         axes.set_title(f"{group[0]}, {group[1].replace('_', ' ')}")
     if groups:
         figure.supxlabel(
@@ -43,45 +50,47 @@ def bars(found: Sequence[Row]) -> Figure:
     return figure
 
 
-def _shown(found: Sequence[Row], group: tuple[str, str]) -> list[Row]:
-    return [row for row in found if row.group == group and row.percent is not None and row.name != TRUTH]
+def _shown(given: Sequence[Row], group: Target) -> list[Row]:
+    return [row for row in given if row.group == group and row.percent is not None and row.name != TRUTH]
 
 
-def _group(axes: Any, rows: Sequence[Row], oracle: Row | None) -> None:
+def _group(axes: Axes, rows: Sequence[Row], oracle: Row | None) -> None:
     if oracle is not None and oracle.by_seed:
         axes.axvspan(min(oracle.by_seed.values()), max(oracle.by_seed.values()), color=MEASURED, alpha=0.1, lw=0)
     for place, row in enumerate(rows):
         assert row.percent is not None
-        varied = "," in row.name
-        axes.barh(
-            place, row.percent[0], 0.75, color=_COLOURS.get(row.name, CHAINS[0]), alpha=0.45 if varied else 0.85, lw=0
-        )
+        colour, alpha = _COLOURS.get(row.name, CHAINS[0]), 0.45 if "," in row.name else 0.85
+        axes.barh(place, row.percent[0], 0.75, color=colour, alpha=alpha, lw=0)
         seeds = list(row.by_seed.values())
         axes.plot(seeds, np.full(len(seeds), place), "o", color=MEASURED, ms=2.6, zorder=3)
         if row.name == PRIOR_NAME:
-            axes.axvline(row.percent[0], color=PRIOR, ls=(0, (3, 2)), lw=1.2)
-    axes.axvline(100, color=MEASURED, lw=1.2)
+            axes.axvline(row.percent[0], color=PRIOR, ls=DASHED, lw=STYLE.reference)
+    axes.axvline(100, color=MEASURED, lw=STYLE.reference)
     axes.set_yticks(range(len(rows)), [WORDS.get(row.name, row.name) for row in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
 
 
-@_styled
+@styled
 def curves(records: Sequence[TransferRecord]) -> Figure:
-    """Return in the target along the training, the mean over seeds, and their range as a shade; a panel for each task and variant."""
+    """Return in the target along the training, the mean over seeds, and their range as a shade.
+
+    Args:
+        records: of the agents; there is a panel for each task and variant.
+    """
     done = [r for r in records if r.done]
     groups = [
         (t, v) for t in order_tasks({r.task for r in done}) for v in sorted({r.variant for r in done if r.task == t})
     ]
-    names, drawn = [n for n in ordered(done) if n != TRUTH], dict[str, Any]()
+    names, drawn = [n for n in ordered(done) if n != TRUTH], dict[str, Line2D]()
     across = min(2, len(groups))
-    figure = _figure(0.6 + 2.8 * -(-len(groups) // across), 4.8 * across)
+    figure = new_figure(0.6 + 2.8 * -(-len(groups) // across), 4.8 * across)
     for k, group in enumerate(groups):
         axes = figure.add_subplot(-(-len(groups) // across), across, k + 1)
         for name in [TRUTH, *names]:
             mine = [r.curve for r in done if (r.task, r.variant) == group and label(r) == name]
             if mine:
-                drawn[name] = _curve(axes, mine, _look(name, names))
+                drawn[name] = _curve(axes, mine, look_of(name, names))
         axes.set_title(f"{group[0]}, {group[1].replace('_', ' ')}")
         axes.set_xlabel("control steps")
         axes.set_ylabel("return in the target")
@@ -89,14 +98,14 @@ def curves(records: Sequence[TransferRecord]) -> Figure:
     return figure
 
 
-def _legend(figure: Figure, drawn: dict[str, Any], names: Sequence[str]) -> None:
+def _legend(figure: Figure, drawn: Mapping[str, Line2D], names: Sequence[str]) -> None:
     """What is drawn of the randomisations, in their order."""
-    there = [n for n in names if n in drawn]
-    words = [WORDS.get(n, n) for n in there]
+    shown = [n for n in names if n in drawn]
+    words = [WORDS.get(n, n) for n in shown]
     width = 0.55 + 0.075 * max((len(word) for word in words), default=0)  # inches of a column, at most
     columns = max(1, min(4, int(figure.get_figwidth() / width)))
     figure.legend(
-        [drawn[n] for n in there],
+        [drawn[n] for n in shown],
         words,
         loc="outside lower center",
         ncols=columns,
@@ -105,26 +114,32 @@ def _legend(figure: Figure, drawn: dict[str, Any], names: Sequence[str]) -> None
     )
 
 
-def _curve(axes: Any, mine: Sequence[Sequence[dict[str, Any]]], look: _Look) -> Any:
-    points = min(len(curve) for curve in mine)
-    steps = [row["step"] for row in mine[0][:points]]
-    earned = np.array([[row["target_return"] for row in curve[:points]] for curve in mine])
-    axes.fill_between(steps, earned.min(0), earned.max(0), color=look.colour, alpha=0.08, lw=0)
-    return axes.plot(steps, earned.mean(0), color=look.colour, lw=1.4, ls=look.line)[0]
-
-
 @dataclass(frozen=True)
-class _Look:
+class Look:
     """Of a randomisation's curve."""
 
     colour: str
-    line: Any
+    line: LineStyleType
 
 
-def _look(name: str, names: Sequence[str]) -> _Look:
-    """Colours go round once with full lines and once with dashes, so that no two randomisations look alike."""
+def _curve(axes: Axes, mine: Sequence[Sequence[Point]], look: Look) -> Line2D:
+    points = min(len(curve) for curve in mine)
+    steps = [point.step for point in mine[0][:points]]
+    earned = np.array([[point.target_return for point in curve[:points]] for curve in mine])
+    axes.fill_between(steps, earned.min(0), earned.max(0), color=look.colour, alpha=0.08, lw=0)
+    return axes.plot(steps, earned.mean(0), color=look.colour, lw=STYLE.curve, ls=look.line)[0]
+
+
+def look_of(name: str, names: Sequence[str]) -> Look:
+    """Of one of the randomisations: colours go round once with full lines, then with dashes, so that no two look alike.
+
+    Args:
+        name: of the randomisation.
+        names: of all that are drawn.
+    """
     if name in _COLOURS:
-        return _Look(_COLOURS[name], "-" if name == TRUTH else (0, (3, 2)))
+        return Look(_COLOURS[name], "-" if name == TRUTH else DASHED)
     others, palette = [n for n in names if n not in _COLOURS], [c for c in CHAINS if c != DEFAULT]
     turn, k = divmod(others.index(name), len(palette))
-    return _Look(palette[k], ("-", (0, (6, 1.5)), (0, (1, 1)), (0, (4, 1, 1, 1)))[turn % 4])
+    dashes: tuple[LineStyleType, ...] = ("-", (0, (6, 1.5)), (0, (1, 1)), (0, (4, 1, 1, 1)))
+    return Look(palette[k], dashes[turn % 4])

@@ -1,19 +1,20 @@
-"""What the transfer's records come to: rows of a randomisation over its seeds, percentages of the oracle, and differences.
+"""What the transfer's records come to: a randomisation over its seeds, in percent of the oracle, and differences.
 
-Every return R in the target stands as a percentage of the oracle's O, the agent trained in the target itself, both as means over the seeds that
-both have. The paper (B. Mehta, A. Handa, D. Fox, F. Ramos 2020, https://arxiv.org/abs/2011.08985, Section 3.4) takes 100 R / O, which
-means something only where returns are positive. Deviation: here zero is a policy Z that acts at random in the target,
+Every return R in the target stands as a percentage of the oracle's O, the agent trained in the target itself, both as
+means over the seeds that both have. The paper (B. Mehta, A. Handa, D. Fox, F. Ramos 2020,
+https://arxiv.org/abs/2011.08985, Section 3.4) takes 100 R / O, which means something only where returns are positive.
+Intervals: 95 %, percentile bootstrap over seeds (B. Efron 1979, "Bootstrap Methods: Another Look at the Jackknife",
+https://doi.org/10.1214/aos/1176344552), a seed's agent and oracle drawn together. With three seeds it has ten different
+resamples and ends at the least and the greatest ratio of a seed's agent to its own oracle.
 
-    100 (R - Z) / (O - Z),
+What a randomisation is worth against another one is told by differences in that percentage, seed by seed, in each
+target and over all that have both (``contrasts``). Whether a better posterior trains a better policy is told by rank
+correlations of the percentage with the CRPS of what was drawn from (``by_quality``).
 
-and the paper's percentage stands beside it. Neither is given where an oracle earns hardly more than zero (``relative``). Intervals:
-95 %, percentile bootstrap over seeds (B. Efron 1979, "Bootstrap Methods: Another Look at the Jackknife",
-https://doi.org/10.1214/aos/1176344552), a seed's agent and oracle drawn together. With three seeds it has ten different resamples and ends
-at the least and the greatest ratio of a seed's agent to its own oracle.
+Deviations:
 
-What a randomisation is worth against another one is told by differences in that percentage, seed by seed, in each target and over all
-that have both (``contrasts``). Whether a better posterior trains a better policy is told by rank correlations of the percentage with the CRPS
-of what was drawn from (``by_quality``).
+- Zero is a policy Z that acts at random in the target, 100 (R - Z) / (O - Z); the paper's percentage stands beside it.
+- Neither is given where an oracle earns hardly more than zero (``relative``).
 """
 
 from __future__ import annotations
@@ -22,32 +23,63 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from sipe_bayes.benchmark.tables import order_estimators, order_tasks
 from sipe_bayes.benchmark.transfer.study import DISTURBING, PRIOR, REFERENCES, SETTING, TRUTH, TransferRecord
-
-FloatArray = NDArray[np.float64]
+from sipe_bayes.core.arrays import FloatArray
 
 WORDS = {"truth": "truth (oracle)", "prior": "prior (uniform)", "default": "default model"}
-_RESAMPLES = 10_000
-_LEVEL = 0.95
-_LEAST_LEAD = 0.1
-_LEAST_RANKED, _PERMUTATIONS = 4, 10_000
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How percentages are judged.
+
+    Args:
+        resamples: of the bootstrap.
+        level: of its interval.
+        lead: share of the oracles' mean above zero that each has to earn.
+        ranked: randomisations of a target whose ranks are correlated, at least.
+        permutations: of the test of that.
+    """
+
+    resamples: int = 10_000
+    level: float = 0.95
+    lead: float = 0.1
+    ranked: int = 4
+    permutations: int = 10_000
+
+
+RULES = Rules()
 
 Target = tuple[str, str]
 """Task and variant."""
 
 Percent = tuple[float, tuple[float, float] | None] | None
-"""Of the oracle, with its interval over seeds (None for one seed); None where an oracle is lacking or fails."""
+"""Of the oracle, with its interval over seeds (None for one seed); None where an oracle is missing or fails."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A randomisation of one task and variant, over its seeds. returns: by seed; spread: mean sd in theta of what was drawn from, crps: its
-    mean CRPS in theta, None where some seed's is not known; percent: of the oracle, random being zero; paper: the paper's percentage;
-    by_seed: percent of each seed, of the mean oracle; success (K,) or None. solved: how many seeds solve the target. diverged, redrawn: in all trainings together. seconds: of a training, mean."""
+    """A randomisation of one task and variant, over its seeds.
+
+    Args:
+        task: of the target.
+        variant: of the target.
+        name: of the randomisation with its variations.
+        returns: by seed.
+        spread: mean sd in theta of what was drawn from.
+        crps: its mean CRPS in theta; None where some seed's is not known.
+        percent: of the oracle, random being zero.
+        paper: the paper's percentage.
+        by_seed: percent of each seed, of the mean oracle.
+        success: (K,), or None where only the return counts.
+        solved: how many seeds solve the target.
+        redrawn: theta, in all trainings together.
+        diverged: episodes, in all trainings together.
+        seconds: of a training, mean.
+    """
 
     task: str
     variant: str
@@ -66,6 +98,7 @@ class Row:
 
     @property
     def group(self) -> Target:
+        """The target."""
         return self.task, self.variant
 
 
@@ -74,33 +107,46 @@ def label(record: TransferRecord) -> str:
     return record.estimator + record.setting.removeprefix(SETTING).replace(",", ", ")
 
 
-def relative(mine: FloatArray, oracle: FloatArray, zero: float) -> tuple[float, tuple[float, float] | None] | None:
-    """100 (R - Z) / (O - Z) of returns (K,) of the same K seeds, and its interval over seeds, None for one seed. None altogether unless
-    every oracle earns a tenth at least of what they earn on average above zero."""
+def relative(mine: FloatArray, oracle: FloatArray, zero: float) -> Percent:
+    """100 (R - Z) / (O - Z) of returns of the same K seeds, and its interval over seeds.
+
+    Args:
+        mine: R (K,).
+        oracle: O (K,).
+        zero: Z.
+
+    Returns:
+        None unless every oracle earns a tenth at least of what they earn on average above zero.
+    """
     lead = oracle - zero
-    if not len(mine) or lead.mean() <= 0 or lead.min() < _LEAST_LEAD * lead.mean():
+    if not len(mine) or lead.mean() <= 0 or lead.min() < RULES.lead * lead.mean():
         return None
-    rows = np.random.default_rng(0).integers(0, len(mine), (_RESAMPLES, len(mine)))
+    rows = np.random.default_rng(0).integers(0, len(mine), (RULES.resamples, len(mine)))
     value = 100 * (mine.mean() - zero) / lead.mean()
     if len(mine) < 2:
         return float(value), None
     again = 100 * (mine[rows].mean(1) - zero) / lead[rows].mean(1)
-    low, high = np.quantile(again, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    low, high = np.quantile(again, [(1 - RULES.level) / 2, (1 + RULES.level) / 2])
     return float(value), (float(low), float(high))
 
 
 def rows(records: Sequence[TransferRecord], crps: Mapping[str, float] | None = None) -> list[Row]:
-    """Of all finished records, by task, variant and randomisation, the references first. crps: by record."""
+    """Of all finished records, by task, variant and randomisation, the references first.
+
+    Args:
+        records: of the agents.
+        crps: by record, as far as it is known.
+    """
     done = [r for r in records if r.done]
-    found = []
+    made = []
     for task in order_tasks({r.task for r in done}):
         for variant in sorted({r.variant for r in done if r.task == task}):
             of = [r for r in done if (r.task, r.variant) == (task, variant)]
-            oracle = {r.seed: r.evaluation["mean"] for r in of if r.estimator == TRUTH}
-            zero = float(np.mean([r.random["mean"] for r in of]))
+            oracle = {r.seed: r.earned.mean for r in of if r.estimator == TRUTH}
+            zero = float(np.mean([r.earned_at_random.mean for r in of]))
             for name in ordered(of):
-                found.append(_row([r for r in of if label(r) == name], name, oracle, zero, crps or {}))
-    return found
+                made.append(_row([r for r in of if label(r) == name], name, oracle, zero, crps or {}))
+    return made
 
 
 def ordered(records: Sequence[TransferRecord]) -> list[str]:
@@ -123,12 +169,12 @@ def _row(
     mine: Sequence[TransferRecord], name: str, oracle: dict[int, float], zero: float, crps: Mapping[str, float]
 ) -> Row:
     mine = sorted(mine, key=lambda r: r.seed)
-    returns = {r.seed: float(r.evaluation["mean"]) for r in mine}
+    returns = {r.seed: r.earned.mean for r in mine}
     both = [seed for seed in returns if seed in oracle]
     ours, theirs = np.array([returns[s] for s in both]), np.array([oracle[s] for s in both])
     percent = relative(ours, theirs, zero)
     lead = theirs.mean() - zero if percent is not None else np.nan
-    rates = [r.evaluation["success_rate"] for r in mine]
+    rates = [r.earned.success_rate for r in mine]
     return Row(
         task=mine[0].task,
         variant=mine[0].variant,
@@ -149,8 +195,14 @@ def _row(
 
 @dataclass(frozen=True)
 class Contrast:
-    """A randomisation held against another: differences in percent of the oracle, one for each seed, in each target that has both with the
-    same seeds, and in their mean over these targets."""
+    """A randomisation held against another: differences in percent of the oracle, one for each seed.
+
+    Args:
+        name: of the one.
+        other: of the other.
+        gains: mean over the targets that have both with the same seeds.
+        by_target: in each of these.
+    """
 
     name: str
     other: str
@@ -158,18 +210,24 @@ class Contrast:
     by_target: dict[Target, list[float]]
 
 
-def contrasts(found: Sequence[Row]) -> list[Contrast]:
-    """Every randomisation against the prior with the same noise and delay, what makes it wider or less against the whole posterior, and
-    noise and delay against none."""
+def contrasts(given: Sequence[Row]) -> list[Contrast]:
+    """What every randomisation is worth against others.
+
+    Each is held against the prior with the same noise and delay; what makes it wider or less against the whole
+    posterior; noise and delay against none.
+    """
     by_name: dict[str, dict[Target, dict[int, float]]] = {}
-    for row in found:
+    for row in given:
         by_name.setdefault(row.name, {})[row.group] = row.by_seed
-    said = []
-    for name in in_order(set(by_name) - {TRUTH}):
-        for parts in _partners(_parts(name)):
-            others = [other for other in by_name if _parts(other) == parts]
-            said += [c for other in others if (c := _contrast(name, by_name[name], other, by_name[other])) is not None]
-    return said
+    pairs = [
+        (name, other)
+        for name in in_order(set(by_name) - {TRUTH})
+        for parts in _partners(_parts(name))
+        for other in by_name
+        if _parts(other) == parts
+    ]
+    compared = (_contrast(name, by_name[name], other, by_name[other]) for name, other in pairs)
+    return [contrast for contrast in compared if contrast is not None]
 
 
 def _parts(name: str) -> frozenset[str]:
@@ -180,8 +238,8 @@ def _partners(parts: frozenset[str]) -> list[frozenset[str]]:
     """What a randomisation of these parts is held against."""
     noise = frozenset(part for part in parts if part.split("=")[0] in DISTURBING)
     shape = frozenset(part for part in parts if "=" in part) - noise
-    found = [] if PRIOR in parts else [noise | {PRIOR}]
-    return found + [parts - shape] * bool(shape) + [parts - noise] * bool(noise)
+    prior = [] if PRIOR in parts else [noise | {PRIOR}]
+    return prior + [parts - shape] * bool(shape) + [parts - noise] * bool(noise)
 
 
 def _contrast(
@@ -199,33 +257,34 @@ def _contrast(
     return Contrast(name, other, gains, {target: list(gained.values()) for target, gained in by_target.items()})
 
 
-def by_quality(found: Sequence[Row]) -> tuple[dict[Target, float], float] | None:
-    """Spearman's rank correlation of percent of the oracle with -CRPS over a target's randomisations, by target with four of them at least,
-    and the p-value of their mean by permutations within the targets; None without such a target. The oracle, of the best CRPS by definition,
-    and variations, which share a posterior, do not count."""
+def by_quality(given: Sequence[Row]) -> tuple[dict[Target, float], float] | None:
+    """Spearman's rank correlation of percent of the oracle with -CRPS over a target's randomisations.
+
+    The oracle, of the best CRPS by definition, and variations, which share a posterior, do not count.
+
+    Args:
+        given: of all targets.
+
+    Returns:
+        Correlations by target with four randomisations at least, and the p-value of their mean by permutations within
+        the targets; None without such a target.
+    """
     ranked = {}
-    for target in dict.fromkeys(row.group for row in found):
-        of = [
-            (-row.crps, row.percent[0])
-            for row in found
-            if row.group == target
-            and row.name != TRUTH
-            and row.crps is not None
-            and row.percent is not None
-            and "," not in row.name
-        ]
-        if len(of) >= _LEAST_RANKED:
+    for target in dict.fromkeys(row.group for row in given):
+        plain = [row for row in given if row.group == target and row.name != TRUTH and "," not in row.name]
+        of = [(-r.crps, r.percent[0]) for r in plain if r.crps is not None and r.percent is not None]
+        if len(of) >= RULES.ranked:
             ranked[target] = np.array([_standard_ranks(column) for column in np.array(of).T])
     if not ranked:
         return None
     rng = np.random.default_rng(0)
     correlations = {target: float(np.mean(one * other)) for target, (one, other) in ranked.items()}
+    size = (RULES.permutations, 1)
     chance = np.mean(
-        [rng.permuted(np.tile(other, (_PERMUTATIONS, 1)), axis=1) @ one / len(one) for one, other in ranked.values()],
-        axis=0,
+        [rng.permuted(np.tile(other, size), axis=1) @ one / len(one) for one, other in ranked.values()], axis=0
     )
     observed = float(np.mean(list(correlations.values())))
-    return correlations, float((1 + (np.abs(chance) >= abs(observed) - 1e-12).sum()) / (1 + _PERMUTATIONS))
+    return correlations, float((1 + (np.abs(chance) >= abs(observed) - 1e-12).sum()) / (1 + RULES.permutations))
 
 
 def _standard_ranks(values: FloatArray) -> FloatArray:

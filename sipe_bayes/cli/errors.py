@@ -1,0 +1,85 @@
+"""How the commands end on wrong input and on an interruption, and what every command says of itself."""
+
+from __future__ import annotations
+
+import errno
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+
+BAD_INPUT = 2
+"""Exit code where input is at fault."""
+_INTERRUPTED = 130  # exit code, as shells have it for SIGINT
+_REMEDIES = {
+    errno.EACCES: "make it writable, or choose another folder",
+    errno.ENOSPC: "free some space, and the same command goes on",
+    errno.ENOENT: "look at the name, or choose another folder",
+}
+
+
+@contextmanager
+def exit_on_error(then: str = "") -> Iterator[None]:
+    """Input errors are one line on standard error and exit code 2.
+
+    Args:
+        then: what is said to do after an interruption.
+
+    Raises:
+        typer.Exit: in place of the error.
+    """
+    try:
+        yield
+    except (ValueError, ImportError, OSError, RuntimeError) as error:
+        if type(error).__name__.endswith("LinAlgError") or isinstance(error, NotImplementedError | RecursionError):
+            raise  # no input is at fault
+        print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
+        raise typer.Exit(BAD_INPUT) from None
+    except KeyboardInterrupt:
+        print(f"sipe: interrupted{then}", file=sys.stderr)
+        raise typer.Exit(_INTERRUPTED) from None
+
+
+def _text(error: Exception) -> str:
+    """Of an error of the file system: the path, what is wrong, and a remedy."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror.lower()}; {_REMEDIES.get(error.errno or 0, 'choose another folder')}"
+    return str(error)
+
+
+def check_least(least: int, **options: float | None) -> None:
+    """See that options are large enough; one that is left out is.
+
+    Args:
+        least: that they may be.
+        **options: by name, with ``_`` for ``-``.
+
+    Raises:
+        ValueError: which names the option.
+    """
+    for name, value in options.items():
+        if value is not None and value < least:
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} {value}: expected at least {least}; raise it or leave it out")
+
+
+def check_one_of(option: str, value: str, known: tuple[str, ...]) -> None:
+    """See that an option is one of the legal words.
+
+    Args:
+        option: its name, without ``--``.
+        value: that was given.
+        known: the legal words.
+
+    Raises:
+        ValueError: which lists them.
+    """
+    if value not in known:
+        raise ValueError(f"--{option} {value}: expected one of {', '.join(known)}")
+
+
+def command_line() -> str:
+    """The command that is running, as a shell takes it."""
+    return shlex.join(["sipe", *sys.argv[1:]])

@@ -1,0 +1,41 @@
+"""Jinja environments: one way in which every report's template is found and read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jinja2
+
+
+def html_templates(package: str) -> jinja2.Environment:
+    """Templates of HTML pages: what is put in is escaped, and a name that is missing is an error.
+
+    Args:
+        package: the package with the folder ``templates``.
+    """
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader(package, "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def latex_templates(package: str, escape: Callable[[object], str]) -> jinja2.Environment:
+    """Templates of LaTeX documents, with ``<% %>``, ``<< >>`` and ``<# #>`` in place of braces.
+
+    Args:
+        package: the package with the folder ``templates``.
+        escape: what is done to everything that is put in.
+    """
+    return html_templates(package).overlay(
+        autoescape=False,
+        finalize=escape,
+        block_start_string="<%",
+        block_end_string="%>",
+        variable_start_string="<<",
+        variable_end_string=">>",
+        comment_start_string="<#",
+        comment_end_string="#>",
+    )
