@@ -314,12 +314,12 @@ class Estimator(ABC, Generic[S]):
         return self._observed
 
     def fresh(self) -> Self:
-        """A twin that shares what was learned, and neither files, progress, findings nor the logs in hand."""
-        twin = copy.copy(self)
-        twin.checkpoint = twin.progress = None
-        twin.findings, twin.diagnostics = Findings(), {}
-        twin._given, twin._bound = Given(), None
-        return twin
+        """A copy that shares what was learned, and neither files, progress, findings nor the logs in hand."""
+        again = copy.copy(self)
+        again.checkpoint = again.progress = None
+        again.findings, again.diagnostics = Findings(), {}
+        again._given, again._bound = Given(), None
+        return again
 
     @property
     def snapshot(self) -> Snapshot[S] | None:
