@@ -265,7 +265,9 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             raise ValueError(f"seed: expected one number or {self.num_envs}, got {len(seed)}")
         return [None if s is None else int(s) for s in seed]
 
-    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, Info]:  # type: ignore[override]
+    def step(  # type: ignore[override]  # Gymnasium's type has floats where it wants truth values
+        self, actions: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, Info]:
         """One control step of all with actions (B, A); raises ValueError before the first ``reset``."""
         if self._episodes is None:
             raise ValueError("step: nothing has begun yet; call reset first")
