@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -80,8 +82,9 @@ def rival(xml: str, table: tuple[FloatArray, ...], unknowns: tuple[Any, ...]) ->
     sequence = sysid.ModelSequences("model", spec, "log", state, control, measured)
     residual = sysid.build_residual_fn(models_sequences=[sequence])
     start = params.as_vector()
-    found, _ = sysid.optimize(params, residual, verbose=False)
-    return SimpleNamespace(start=start, value=found.as_vector())
+    with contextlib.redirect_stdout(io.StringIO()):  # it reports its steps whether asked to or not
+        best, _ = sysid.optimize(params, residual, verbose=False)
+    return SimpleNamespace(start=start, value=best.as_vector())
 
 
 def _modifier(spec: Any, target: str) -> tuple[float, Any]:
