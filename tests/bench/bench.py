@@ -1,7 +1,7 @@
 """`make bench`: tables of ratios.
 
 Whatever stands in one row was run in one process, the two sides in turn (first the one, then the other first), seven
-pairs or more; a row gives the medians and the median of the pairs' ratios.
+pairs unless told otherwise; a row gives the medians and the median of the pairs' ratios.
 
 Seconds depend on the machine and on what else it does; ratios should not.
 """
