@@ -30,7 +30,8 @@ def check(
 ) -> None:
     """Simulation-based calibration: do the estimator's intervals hold the truth on this model, noise and commands?
 
-    Exit code 1 where they do not."""
+    Exit code 1 where they do not.
+    """
     with exit_on_error("; the same command goes on"):
         from sipe_bayes.calibration import check as checks
         from sipe_bayes.calibration import study as studies

@@ -35,7 +35,8 @@ def generate(
 ) -> None:
     """Simulate trajectory sets; the same command gives the same bytes on the same versions and kind of processor.
 
-    One process at a time to a folder: its manifest is written anew after each set."""
+    One process at a time to a folder: its manifest is written anew after each set.
+    """
     from sipe_bayes.datasets.generation import generate as made_one_by_one
 
     made, missing = 0, 0
@@ -117,7 +118,8 @@ def demonstrate(
 ) -> None:
     """Make demonstrations for `sipe train --demonstrations`, by a scripted controller, or by a plan.
 
-    A plan (Door, Relocate) is searched for minutes. It is kept beside OUT, and the same command goes on with it."""
+    A plan (Door, Relocate) is searched for minutes. It is kept beside OUT, and the same command goes on with it.
+    """
     from sipe_bayes.cli.progress import Progress
     from sipe_bayes.rl.demonstrate import make
 

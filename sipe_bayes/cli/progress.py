@@ -29,10 +29,12 @@ class Progress:
         self.stop()
 
     def stop(self) -> None:
+        """Leave the line as it is."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
 
     def update(self, what: str, rollouts: int, budget: int) -> None:
+        """Say what is being done, and how many rollouts of the budget are used."""
         if self._bar is not None:
             self._bar.update(self._task, description=what, completed=rollouts, total=budget)

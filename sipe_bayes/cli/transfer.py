@@ -67,7 +67,7 @@ def run(
     address: Address = None,
     retry_failed: Retry = False,
 ) -> None:
-    """Measure a suite's cells that have no record yet, after the estimates that they need; exit code 1 if one failed."""
+    """Measure a suite's cells that have no record yet, after the estimates they need; exit code 1 if one failed."""
     with exit_on_error("; the same command goes on"):
         from sipe_bayes.benchmark.cells import changed
         from sipe_bayes.benchmark.transfer.study import varied

@@ -1,0 +1,1 @@
+"""What is shown: figures, words and the page of a calibration."""

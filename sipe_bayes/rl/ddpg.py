@@ -277,7 +277,7 @@ class Agent:
         return squashed * self._half + self._middle
 
     def _targets(self, following: Tensor, returns: Tensor, discounts: Tensor) -> Tensor:
-        """y (B, 1)."""
+        """``y`` (B, 1)."""
         actions = self._bounded(self.target_actor.forward(following)[0].tanh_())
         values = self.target_critic.forward(torch.cat([following, actions], 1))[0]
         targets = torch.addcmul(returns[:, None], discounts[:, None], values)

@@ -49,6 +49,7 @@ class Unit:
     needs: frozenset[str] = field(default=frozenset())
 
     def __call__(self) -> Done:
+        """Do the work."""
         import torch
 
         torch.set_num_threads(1)
