@@ -29,7 +29,7 @@ class Progress:
         self.stop()
 
     def stop(self) -> None:
-        """Leave the line as it is."""
+        """End the bar, if there is one."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
