@@ -92,7 +92,7 @@ def _flattened(name: str, value: Any, arrays: dict[str, Any]) -> Any:
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         return {k: _flattened(f"{name}.{k}", v, arrays) for k, v in fields.items()}
     if isinstance(value, enum.Enum):
-        return value.value
+        return value.name
     if isinstance(value, tuple | list):
         return [_flattened(f"{name}.{k}", v, arrays) for k, v in enumerate(value)]
     if isinstance(value, dict):
@@ -120,7 +120,7 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
             }
         )
     if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return kind(plain)
+        return kind[plain]
     if origin in (tuple, list):
         items = [arguments[0] if arguments[1:] in ((), (...,)) else arguments[k] for k in range(len(plain))]
         return origin(_restored(f"{name}.{k}", v, items[k], arrays) for k, v in enumerate(plain))

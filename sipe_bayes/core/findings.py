@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from typing import Self
 
 from sipe_bayes.core.finding_texts import TEXTS, Code, Severity
@@ -37,9 +36,8 @@ class Finding:
 
     def to_dict(self) -> dict[str, object]:
         """As JSON has it."""
-        return {k: str(v) if isinstance(v, StrEnum) else v for k, v in asdict(self).items()} | {
-            "parameters": list(self.parameters)
-        }
+        plain = {"code": str(self.code), "severity": str(self.severity), "parameters": list(self.parameters)}
+        return asdict(self) | plain
 
     @classmethod
     def from_dict(cls, data: dict[str, object]) -> Self:
@@ -48,13 +46,8 @@ class Finding:
         if not isinstance(names, list | tuple):
             raise ValueError(f"parameters: expected a list of names, got {names!r}")
         log = data.get("log")
-        return cls(
-            Code(str(data["code"])),
-            Severity(str(data["severity"])),
-            str(data["text"]),
-            tuple(map(str, names)),
-            None if log is None else str(log),
-        )
+        code, severity = Code[str(data["code"]).upper()], Severity(str(data["severity"]))
+        return cls(code, severity, str(data["text"]), tuple(map(str, names)), None if log is None else str(log))
 
 
 def finding(

@@ -24,7 +24,7 @@ def in_other_words(code: Code, text: Text) -> Text:
     """No word of it is left; the places stay, in reverse."""
     fields = [(name, spec) for _, name, spec, _ in string.Formatter().parse(text.template) if name]
     places = " ".join(f"{{{name}:{spec}}}" for name, spec in reversed(fields))
-    return Text(text.severity, f"{code.upper()} {places}".strip(), f"row of {code}" if text.row else "")
+    return Text(text.severity, f"{code.name} {places}".strip(), f"row of {code}" if text.row else "")
 
 
 def change_all(monkeypatch: pytest.MonkeyPatch) -> None:
