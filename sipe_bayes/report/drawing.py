@@ -264,15 +264,7 @@ def line_handle(
         mew: width of its edge, points.
     """
     return Line2D(
-        [],
-        [],
-        color=colour,
-        label=label,
-        linestyle=ls,
-        linewidth=lw,
-        marker=marker,
-        markersize=ms,
-        markeredgewidth=mew,
+        [], [], color=colour, label=label, linestyle=ls, linewidth=lw, marker=marker, markersize=ms, markeredgewidth=mew
     )
 
 

@@ -96,13 +96,7 @@ _SMALL_AGENT = Settings(
     hidden=(64, 64), batch=128, learning_rate=1e-3, start_steps=1_000, lanes=4, updates_per_step=0.5
 )
 _AGENT = Settings(
-    hidden=(128,),
-    learning_rate=1e-3,
-    start_steps=5_000,
-    normalise=True,
-    layer_norm=True,
-    lanes=8,
-    updates_per_step=0.5,
+    hidden=(128,), learning_rate=1e-3, start_steps=5_000, normalise=True, layer_norm=True, lanes=8, updates_per_step=0.5
 )
 _GOAL_AGENT = Settings(
     hidden=(128, 128),
