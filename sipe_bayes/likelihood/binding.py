@@ -9,7 +9,7 @@ from sipe_bayes.likelihood.callable_windows import CallableWindows
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.indirect_positions import indirect_positions
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood.windows import Windows, check_seen
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -25,15 +25,7 @@ def bind(
 def bind(
     likelihood: Segments | StateSpace, simulator: Simulator | CallableSimulator, trajectories: Trajectories
 ) -> Windows | Chain:
-    """Hold the trajectories against the simulator as a likelihood does.
-
-    Args:
-        likelihood: its settings.
-        simulator: what is calibrated.
-        trajectories: the logs.
-
-    Returns:
-        Windows of ``Segments``, or the Chain of a ``StateSpace``.
+    """Hold the trajectories against the simulator: Windows of ``Segments``, or the Chain of a ``StateSpace``.
 
     Raises:
         ValueError: for logs or simulators that do not fit.
@@ -41,12 +33,9 @@ def bind(
     if isinstance(likelihood, StateSpace):
         return _chain(likelihood, simulator, trajectories)
     if isinstance(simulator, CallableSimulator):
-        windows: Windows = CallableWindows(likelihood, simulator, trajectories)
-    else:
-        windows = Windows(likelihood, simulator, trajectories)
-    for name, seen in zip(windows.fitted, windows.observed.any(axis=(0, 1)), strict=True):
-        if not seen:
-            raise ValueError(f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`")
+        return CallableWindows(likelihood, simulator, trajectories)
+    windows = Windows(likelihood, simulator, trajectories)
+    check_seen(windows.fitted, windows.observed.any(axis=(0, 1)))
     return windows
 
 

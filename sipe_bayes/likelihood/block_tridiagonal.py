@@ -25,8 +25,6 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 
-_LEAST_EIGENVALUE = 1e-12  # of a precision scaled to ones on its diagonal: what rounding leaves of an open direction
-
 
 @dataclass(frozen=True)
 class Eliminated:
@@ -154,5 +152,5 @@ def inverse(precision: FloatArray) -> tuple[FloatArray, float]:
     """Covariance (N, N), positive definite also where rounding leaves a precision that is not, and log|precision|."""
     sd = 1 / np.sqrt(np.diag(precision))
     eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)
-    kept = np.maximum(eigenvalues, _LEAST_EIGENVALUE)
+    kept = np.maximum(eigenvalues, 1e-12)  # what rounding leaves of an open direction
     return sd[:, None] * ((axes / kept) @ axes.T) * sd, float(np.log(kept).sum() - 2 * np.log(sd).sum())

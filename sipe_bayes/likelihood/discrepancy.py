@@ -15,10 +15,6 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.likelihood.callable_windows import CallableWindows
 from sipe_bayes.likelihood.windows import Windows
 
-_BATCH = 32  # thetas simulated at once
-_STILL = 1e-3  # of the median channel's spread: less motion than that is scaled as if it were that much
-_ROUNDING = 1e-7  # of a function's output: outputs that differ by less are equal
-
 
 class StateDifference:
     """Mean squared difference between simulated and recorded channels.
@@ -43,26 +39,18 @@ class StateDifference:
 
 
 def channel_scale(windows: Windows, first: FloatArray) -> FloatArray:
-    """What a channel's differences are divided by, so that nothing depends on the channels' units.
+    """What a channel's differences are divided by (C,), so that nothing depends on the channels' units.
 
     Its recorded spread, of channels that hardly move a thousandth of the median channel's. One observed x of a function
-    has no spread: there it is that of the first simulations, and the channel's magnitude where they do not differ.
-
-    Args:
-        windows: the recorded logs.
-        first: (B, W, L, C), simulations.
-
-    Returns:
-        (C,), NaN where no simulation was valid.
+    has no spread: there it is that of the ``first`` simulations (B, W, L, C), and the channel's magnitude where they do
+    not differ; NaN where none was valid.
     """
     if isinstance(windows, CallableWindows):
         return _simulated_scale(windows, first)
-    spread = np.array(
-        [_spread(windows.measured[..., c][windows.observed[..., c]]) for c in range(len(windows.channels))]
-    )
+    seen = [windows.measured[..., c][windows.observed[..., c]] for c in range(len(windows.channels))]
+    spread = np.array([values.std() if len(values) else 0.0 for values in seen])
     moving = spread[spread > 0]
-    floor = _STILL * float(np.median(moving)) if len(moving) else 1.0
-    return np.maximum(spread, floor)
+    return np.maximum(spread, 1e-3 * float(np.median(moving)) if len(moving) else 1.0)
 
 
 def _simulated_scale(windows: CallableWindows, first: FloatArray) -> FloatArray:
@@ -72,29 +60,15 @@ def _simulated_scale(windows: CallableWindows, first: FloatArray) -> FloatArray:
         return np.full(first.shape[-1], np.nan)
     size = np.maximum(np.abs(samples).max(0), np.nanmax(np.abs(windows.measured[:, 1]), axis=0))
     spread = samples.std(0)
-    return np.where(spread > _ROUNDING * size, spread, np.where(size > 0, size, 1.0))
+    return np.where(spread > 1e-7 * size, spread, np.where(size > 0, size, 1.0))  # less is rounding
 
 
 def simulate(windows: Windows, theta: FloatArray) -> FloatArray:
-    """Predictions from the windows' own starts.
-
-    Args:
-        windows: the logs.
-        theta: (B, N).
-
-    Returns:
-        (B, W, L, C).
+    """Predictions (B, W, L, C) of thetas (B, N) from the windows' own starts.
 
     Raises:
         BudgetExhausted: instead of simulating beyond the budget.
     """
-    starts = windows.no_starts()
-    parts = [
-        windows.predict(rows, np.broadcast_to(starts, (len(rows), *starts.shape)))[0]
-        for rows in np.split(theta, range(_BATCH, len(theta), _BATCH))
-    ]
+    starts, batches = windows.no_starts(), np.split(theta, range(32, len(theta), 32))
+    parts = [windows.predict(rows, np.broadcast_to(starts, (len(rows), *starts.shape)))[0] for rows in batches]
     return np.concatenate(parts)
-
-
-def _spread(values: FloatArray) -> float:
-    return float(values.std()) if len(values) else 0.0

@@ -9,21 +9,13 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 
-_GAIN, _MOST_STEPS, _LONGEST_STEP = 1e-3, 100, 2.0  # nats, steps, of a coordinate: the losses are in nats of logarithms
-_RIDGE = 1e-12  # of the mean diagonal: parameters that change nothing leave a zero there
+_GAIN, _LONGEST_STEP = 1e-3, 2.0  # nats, and of a coordinate: the losses are in nats of logarithms
 
 
 def box_quadratic(hessian: FloatArray, slope: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray | None:
-    """Minimiser of a quadratic within a box, by MuJoCo's mju_boxQP.
+    """Minimiser (N,) of a quadratic within the box from low to high, by MuJoCo's mju_boxQP.
 
-    Args:
-        hessian: (N, N), positive definite.
-        slope: (N,) at zero.
-        low: (N,) lower bounds.
-        high: (N,) upper bounds.
-
-    Returns:
-        (N,), or None where rounding leaves the Hessian not positive definite.
+    Of the Hessian (N, N) and the slope (N,) at zero; None where rounding leaves the Hessian not positive definite.
     """
     n = len(slope)
     minimum, factor, index = np.zeros(n), np.zeros((n, n + 7)), np.zeros(n, np.int32)
@@ -32,19 +24,14 @@ def box_quadratic(hessian: FloatArray, slope: FloatArray, low: FloatArray, high:
 
 
 def damped_box_step(hessian: FloatArray, gradient: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
-    """Step within the unit cube that maximises a damped quadratic model.
+    """Step (N,) within the unit cube around theta that maximises a quadratic model.
 
-    Args:
-        hessian: (N, N) precision.
-        gradient: (N,) pull on theta.
-        theta: (N,) where the model was made.
-        damping: Levenberg and Marquardt's, relative.
-
-    Returns:
-        (N,), zero where rounding leaves no positive definite model.
+    Of the precision (N, N) and the pull (N,) there, damped by a share of the diagonal (Levenberg, Marquardt); zero
+    where rounding leaves no positive definite model.
     """
     n = len(theta)
-    damped = hessian + damping * np.diag(np.diag(hessian)) + _RIDGE * np.trace(hessian) / n * np.eye(n)
+    # parameters that change nothing leave a zero on the diagonal
+    damped = hessian + damping * np.diag(np.diag(hessian)) + 1e-12 * np.trace(hessian) / n * np.eye(n)
     step = box_quadratic(damped, -gradient, -theta, 1 - theta)
     return np.zeros(n) if step is None else step
 
@@ -64,7 +51,7 @@ def minimise(
     """
     hessian = np.diag(np.maximum(curvature, 1.0))
     value, slope = loss(x)
-    for _ in range(_MOST_STEPS):
+    for _ in range(100):
         low, high = np.maximum(bounds[0] - x, -_LONGEST_STEP), np.minimum(bounds[1] - x, _LONGEST_STEP)
         move = box_quadratic(hessian, slope, low, high)
         if move is None:

@@ -29,18 +29,10 @@ class Noise:
 
 
 def chosen_sd(given: tuple[float | None, ...] | None, channels: list[int], names: tuple[str, ...]) -> FloatArray:
-    """Noise sds of some channels.
-
-    Args:
-        given: one for each of ``names``, None where unknown.
-        channels: which of them (C,).
-        names: of all channels.
-
-    Returns:
-        (C,), NaN where none is given.
+    """Noise sds (C,) of the given ``channels`` of all ``names``, NaN where none is given.
 
     Raises:
-        ValueError: unless there is one for each of ``names``.
+        ValueError: unless there is one, or None, for each of ``names``.
     """
     if given is None:
         return np.full(len(channels), np.nan)

@@ -9,22 +9,14 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts import smoothed
 
-_ROBUST = 1.4826  # sd of a normal over the median of its absolute values
-_SMOOTHED = np.sqrt(2)  # five points of a local quadratic take away about half of white noise's variance
+NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
 
 
 def noise_level(trajectories: Trajectories, likelihood: Segments | StateSpace) -> FloatArray:
-    """Sd of each channel's noise.
+    """Sd (O,) of each channel's noise in its unit.
 
     As ``likelihood.noise_sd`` states it; else zero for trajectories with recorded states; else the robust sd of what
     local quadratics over 60 ms leave of the recorded samples.
-
-    Args:
-        trajectories: the logs.
-        likelihood: its settings.
-
-    Returns:
-        (O,), in the channels' units.
 
     Raises:
         ValueError: where the settings state another number of sds than there are channels.
@@ -42,13 +34,10 @@ def _residual_sd(trajectories: Trajectories) -> FloatArray:
     left = []
     for trajectory in trajectories:
         series = trajectory.observations
-        finite = np.isfinite(series)
-        filled = np.stack(
-            [
-                np.interp(np.arange(len(series)), np.flatnonzero(g), column[g]) if g.any() else np.zeros(len(series))
-                for column, g in zip(series.T, finite.T, strict=True)
-            ],
-            axis=1,
-        )
+        finite, filled = np.isfinite(series), np.zeros(series.shape)
+        for c, seen in enumerate(finite.T):
+            if seen.any():
+                filled[:, c] = np.interp(np.arange(len(series)), np.flatnonzero(seen), series[seen, c])
         left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan))
-    return np.nan_to_num(_ROBUST * np.nanmedian(np.abs(np.concatenate(left)), axis=0) * _SMOOTHED)
+    # five points of a local quadratic take away about half of white noise's variance
+    return np.nan_to_num(NORMAL_MAD * np.nanmedian(np.abs(np.concatenate(left)), axis=0) * np.sqrt(2))

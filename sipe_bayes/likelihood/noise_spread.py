@@ -10,24 +10,12 @@ from sipe_bayes.likelihood.noise import Noise, coefficients
 from sipe_bayes.likelihood.restricted import Pulls, restricted, restricted_slopes
 from sipe_bayes.likelihood.sequences import Sequence
 
-_DIFFERENCE = 1e-3  # of a logarithm, in finite differences of slopes
-_CURVATURE = (1.0, 1e4)  # of the log likelihood: what is less known than a factor e, or better than a percent
-
 
 def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArray) -> FloatArray:
-    """Inverse curvature of the restricted likelihood, sds held between 0.01 and 1.
+    """Inverse curvature (F, F) of the restricted likelihood by the ``free`` (F,) of (log sd (C), log tau (C)).
 
-    Args:
-        moments: of a linearisation.
-        noise: where the curvature is taken.
-        pulls: priors and bounds.
-        free: (F,), entries of (log sd (C), log tau (C)) that are unknown.
-
-    Returns:
-        Covariance (F, F) of those.
+    Sds are held between 0.01 and 1: what is better known than a percent, or less than a factor e.
     """
-    if not len(free):
-        return np.zeros((0, 0))
     centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
 
     def slopes(x: FloatArray) -> FloatArray:
@@ -36,10 +24,10 @@ def noise_covariance(moments: Moments, noise: Noise, pulls: Pulls, free: IntArra
         _, by_sd, by_tau = restricted_slopes(moments, _from_logs(logs, noise), pulls)
         return np.concatenate([by_sd, by_tau])[free]
 
-    h, here = _DIFFERENCE, slopes(np.zeros(len(free)))
+    h, here = 1e-3, slopes(np.zeros(len(free)))  # of a logarithm
     curvature = np.array([(here - slopes(step)) / h for step in h * np.eye(len(free))])
     eigenvalues, axes = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    return (axes / np.clip(eigenvalues, *_CURVATURE)) @ axes.T
+    return (axes / np.clip(eigenvalues, 1.0, 1e4)) @ axes.T
 
 
 def _from_logs(logs: FloatArray, like: Noise) -> Noise:
@@ -51,54 +39,34 @@ def _from_logs(logs: FloatArray, like: Noise) -> Noise:
 def noise_cloud(
     moments: Moments, noise: Noise, pulls: Pulls, free: IntArray, longest: float
 ) -> list[tuple[float, Noise]]:
-    """Weighted points that stand for the uncertainty of the noise.
+    """Weighted points that stand for the uncertainty of the noise; the weights sum to one.
 
     Two along each principal axis of its covariance, at sqrt(dimensions) sds, weighted by the restricted likelihood
-    against its normal approximation.
-
-    Args:
-        moments: of a linearisation.
-        noise: the best one.
-        pulls: priors and bounds.
-        free: (F,), entries of (log sd (C), log tau (C)) that are unknown.
-        longest: correlation time at most, in seconds.
-
-    Returns:
-        Weights, which sum to one, and noise values.
+    against its normal approximation. free (F,): entries of (log sd (C), log tau (C)) that are unknown; longest: seconds
+    of a correlation time at most.
     """
     if not len(free):
         return [(1.0, noise)]
     covariance, d = noise_covariance(moments, noise, pulls, free), len(free)
     eigenvalues, axes = np.linalg.eigh(covariance)
-    best = restricted(moments, noise, pulls)
+    best = restricted(moments, noise, pulls)[0]
     centre = np.log(np.maximum(np.concatenate([noise.sd, noise.tau]), 1e-300))
-    points = []
-    for direction in np.concatenate(
-        [axes.T * np.sqrt(d * eigenvalues)[:, None], -axes.T * np.sqrt(d * eigenvalues)[:, None]]
-    ):
+    points, along = [], axes.T * np.sqrt(d * eigenvalues)[:, None]
+    for direction in np.concatenate([along, -along]):
         logs = centre.copy()
         logs[free] += direction
         logs[len(noise.sd) :] = np.minimum(logs[len(noise.sd) :], np.log(longest))
         point = _from_logs(logs, noise)
-        surplus = restricted(moments, point, pulls) - best + d / 2
+        surplus = restricted(moments, point, pulls)[0] - best + d / 2
         points.append((float(np.exp(np.clip(surplus, -2.0, 2.0))), point))
     total = sum(w for w, _ in points)
     return [(w / total, point) for w, point in points]
 
 
 def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
-    """X' V X of the rows X of one channel, V its residual covariance.
+    """X' V X (N, N) of the rows X (n, N) of one channel, V its residual covariance.
 
     With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion.
-
-    Args:
-        rows: (n, N).
-        sequence: the channel's samples.
-        sd: in the channel's unit.
-        tau: in seconds.
-
-    Returns:
-        (N, N).
     """
     a = coefficients(sequence.gaps, tau)[sequence.gap]
     scale = sd * np.sqrt(1 - a**2)

@@ -22,11 +22,9 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import estimate_states, first_states, moved
+from sipe_bayes.likelihood.starts import estimate_states, first_states, moved, with_history
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
-
-_BEGINNING, _LEAST_STEPS = 0.2, 4  # s and steps of a log on which the estimate of its start depends, and more
 
 
 def observation_noise(
@@ -34,10 +32,8 @@ def observation_noise(
 ) -> Noise:
     """Noise of all O channels.
 
-    Args:
-        diagnostics: of an estimator, which say ``noise_sd`` and ``noise_tau`` of the channels that it fitted.
-        trajectories: the logs; ``noise_level`` tells of the other channels, as white.
-        likelihood: its settings, which say what was fitted.
+    As an estimator's ``diagnostics`` say (``noise_sd``, ``noise_tau``) of the channels that it fitted; ``noise_level``
+    tells of the others, as white.
     """
     sd = noise_level(trajectories, likelihood)
     tau = np.zeros(len(sd))
@@ -72,15 +68,7 @@ class Replicas:
         self.starts = _starts(simulator, trajectories)
 
     def make(self, theta: FloatArray, rng: np.random.Generator) -> Trajectories | None:
-        """One replica of every trajectory, with states where the recording has them.
-
-        Args:
-            theta: (N,), the truth.
-            rng: of the noise.
-
-        Returns:
-            None where one diverges.
-        """
+        """One replica of every trajectory at theta (N,), with states where these have some; None where one diverges."""
         return self.many(theta[None], rng)[0]
 
     def many(self, theta: FloatArray, rng: np.random.Generator, estimated: bool = False) -> list[Trajectories | None]:
@@ -171,7 +159,7 @@ class Replicas:
         assert isinstance(self.simulator, Simulator)
         beginnings = []
         for recorded in self.trajectories:
-            steps = min(len(recorded), max(_LEAST_STEPS, math.ceil(_BEGINNING / recorded.dt)))
+            steps = min(len(recorded), max(4, math.ceil(0.2 / recorded.dt)))  # more than the estimate depends on
             begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
             beginnings.append((begin, estimate_states(self.simulator, begin)[0]))
         return beginnings
@@ -193,7 +181,4 @@ def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories
     starts = first_states(simulator, trajectories)
     if isinstance(simulator, CallableSimulator) or trajectories.states is not None:
         return starts
-    starts[:, 0] = 0.0
-    past = [actions[:1] for actions in trajectories.actions]
-    timestep = np.array([simulator.physics_steps(float(dt))[1] for dt in trajectories.dt])
-    return simulator.environment.history(simulator.model, starts, past, timestep)
+    return with_history(simulator, starts, [actions[:1] for actions in trajectories.actions], trajectories.dt)

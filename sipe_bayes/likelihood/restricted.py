@@ -19,9 +19,6 @@ from sipe_bayes.likelihood.minimise import minimise
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients
 
-_RIDGE = 1e-12  # of a parameter's own precision: what rounding leaves of two that do the same may be negative
-_SHORTEST_TAU = 0.1  # of a sample period; below it the noise is white to a part in 10^4
-
 
 @dataclass(frozen=True)
 class Pulls:
@@ -84,14 +81,8 @@ def eliminate_starts(
 def marginal(moments: Moments, noise: Noise, starts: FloatArray, precision: FloatArray) -> tuple[float, FloatArray]:
     """Log-likelihood of residuals with the windows' starts integrated out, theta as it is.
 
-    Args:
-        moments: of residuals at ``starts`` and their Jacobian by the starts alone.
-        noise: of the residuals.
-        starts: (W, D).
-        precision: (D,) of the starts' prior.
-
-    Returns:
-        The value up to a constant, and the change (W, D) of the starts that minimises the squares.
+    ``moments`` are of the residuals at ``starts`` (W, D) and their Jacobian by the starts alone, ``precision`` (D,)
+    of the starts' prior. Returns the value up to a constant, and the change (W, D) of the starts that minimises the squares.
     """
     normal = moments.normal(noise)
     solved = eliminate_starts(normal, 0, precision, -precision * starts)
@@ -100,13 +91,12 @@ def marginal(moments: Moments, noise: Noise, starts: FloatArray, precision: Floa
     return -0.5 * total, solved.shift
 
 
-def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> float:
-    """Restricted log-likelihood of the noise, up to a constant."""
-    return _restricted(moments, noise, pulls)[0]
+def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray, Eliminated]:
+    """Restricted log-likelihood of the noise, up to a constant, and what it is made of.
 
-
-def _restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray, Eliminated]:
-    """Restricted log-likelihood; best step (N,) and covariance (N, N) of theta, zero where it may not move."""
+    Returns:
+        The value; best step (N,) and covariance (N, N) of theta, zero where it may not move; the starts eliminated.
+    """
     normal = moments.normal(noise)
     solved = eliminate_starts(normal, moments.num_theta, pulls.start_precision, pulls.start_pull)
     square = float(normal[:, -1, -1].sum())
@@ -117,7 +107,7 @@ def _restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Fl
         free = np.ix_(pulls.free, pulls.free)
         precision = solved.precision[free] + pulls.prior[free]
         # what rounding leaves of two parameters that do the same may be negative
-        factor = np.linalg.cholesky(precision + _RIDGE * np.diag(np.diag(precision)))
+        factor = np.linalg.cholesky(precision + 1e-12 * np.diag(np.diag(precision)))
         inverse = np.linalg.inv(factor)
         half = inverse @ (solved.gradient + pulls.prior_pull)[pulls.free]
         value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)
@@ -126,20 +116,12 @@ def _restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Fl
 
 
 def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray]:
-    """Restricted log-likelihood and its derivatives.
+    """Restricted log-likelihood up to a constant, and its derivatives (C,) by log sd and by log tau.
 
     With A the precision of all unknowns u = (theta, starts), v_w = (u_w, -1) and dM_w the change of the products of
     window w, -2 dl = d log|V| + sum_w <A^-1 of that window + v_w v_w', dM_w>.
-
-    Args:
-        moments: of the linearisation.
-        noise: where it is evaluated.
-        pulls: what holds theta and the starts besides the data.
-
-    Returns:
-        The value up to a constant, and its derivatives (C,) by log sd and by log tau.
     """
-    value, move, covariance, solved = _restricted(moments, noise, pulls)
+    value, move, covariance, solved = restricted(moments, noise, pulls)
     n, d, windows = moments.num_theta, moments.num_start, moments.windows
     size = n + 2 * d
     by_start = np.zeros((windows, size, n))  # how the window's unknowns follow theta
@@ -205,7 +187,8 @@ def estimate_noise(
             slope = np.concatenate([by_sd, by_tau + by_sd * a**2 * ratio / (1 - a**2)])
         return (-value, -slope) if np.isfinite(value) and np.isfinite(slope).all() else (1e12, np.zeros_like(x))
 
-    low, high = np.log(_SHORTEST_TAU * shortest), np.log(longest)
+    # with tau a tenth of a sample period the noise is white to a part in 10^4
+    low, high = np.log(0.1 * shortest), np.log(longest)
     tau = np.clip(np.log(np.maximum(noise.tau, 1e-12)), low, high)
     if coloured and (noise.tau <= 0).all():
         tau = np.clip(np.log(moments.correlation_times()), low, high)

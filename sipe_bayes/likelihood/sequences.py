@@ -8,8 +8,6 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
-_LONGEST_GAP = 20  # samples; after a longer gap a new sequence begins
-
 
 @dataclass(frozen=True)
 class Sequence:
@@ -33,16 +31,13 @@ class Sequence:
 
 
 def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
-    """The observed samples of each channel in order of time.
+    """One Sequence for each of C channels: its samples in order of time; a gap of over 20 samples begins a new one.
 
     Args:
         observed: (W, L, C), samples that count.
         sample: (W, L), their number within the log.
         log: (W,), the log of each window.
         dt: (W,), seconds per sample.
-
-    Returns:
-        One Sequence for each of the C channels.
     """
     _, length, channels = observed.shape
     by_channel = []
@@ -52,7 +47,7 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
         steps = np.diff(number, prepend=0)
         linked = np.zeros(len(index), bool)
         if len(index) > 1:
-            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= _LONGEST_GAP)
+            linked[1:] = (log[window[1:]] == log[window[:-1]]) & (np.diff(window) <= 1) & (steps[1:] <= 20)
         previous = np.where(linked, np.concatenate([[-1], index[:-1]])[: len(index)], -1)
         seconds = np.where(linked, steps * dt[window], np.inf)
         gaps, gap = np.unique(np.asarray(np.round(seconds, 12), np.float64), return_inverse=True)

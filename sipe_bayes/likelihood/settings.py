@@ -18,17 +18,10 @@ class BudgetTooSmall(ValueError):
     """A budget that ran out before there was anything to estimate from."""
 
 
-def check_settings(fit: object, noise_sd: object, zero: bool = True) -> None:
-    """Hold what two likelihoods take against what it may be.
-
-    Args:
-        fit: names of channels, or None.
-        noise_sd: an sd or None for each channel, or None.
-        zero: whether an sd may be zero.
-
-    Raises:
-        ValueError: for anything else.
-    """
+def check_settings(starts: object, fit: object, noise_sd: object, zero: bool = True) -> None:
+    """Raise ValueError where what both likelihoods take is wrong; zero: whether an sd may be zero."""
+    if starts not in ("estimated", "recorded"):
+        raise ValueError(f"starts: expected 'estimated' or 'recorded', got {starts!r}")
     if fit is not None and (
         not isinstance(fit, tuple | list | np.ndarray) or not len(fit) or not all(isinstance(n, str) for n in fit)
     ):
@@ -72,13 +65,11 @@ class Segments:
     starts: str = "estimated"
 
     def __post_init__(self) -> None:
-        if self.starts not in ("estimated", "recorded"):
-            raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
         if self.noise not in ("ar1", "white", "sandwich"):
             raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
-        check_settings(self.fit, self.noise_sd)
+        check_settings(self.starts, self.fit, self.noise_sd)
 
 
 @dataclass(frozen=True)
@@ -101,9 +92,7 @@ class StateSpace:
     noise: ClassVar[str] = "white"
 
     def __post_init__(self) -> None:
-        if self.starts not in ("estimated", "recorded"):
-            raise ValueError(f"starts: expected 'estimated' or 'recorded', got {self.starts!r}")
-        check_settings(self.fit, self.noise_sd, zero=False)
+        check_settings(self.starts, self.fit, self.noise_sd, zero=False)
 
 
 Likelihood = Segments | StateSpace

@@ -14,23 +14,15 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-_SMOOTHING = 0.06  # s, span of the local quadratics that smooth measurements into a first guess of the state
-_LONGEST_DELAY = 2000  # control steps before a start: longer than any actuator's delay
+STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
 
 
 def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
-    """A first guess of the states along a log: recorded ones, else measured ones.
+    """A first guess of the states (T+1, S) along a log: recorded ones, else measured ones.
 
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
     the slopes of the positions; what no channel measures stays at the model's reset state. The search starts here,
     and so do the windows of held-out logs.
-
-    Args:
-        simulator: tells which channel measures what.
-        trajectory: of T steps.
-
-    Returns:
-        (T+1, S).
     """
     if trajectory.states is not None:
         return trajectory.states
@@ -60,27 +52,15 @@ def first_states(simulator: Simulator | CallableSimulator, trajectories: Traject
 
 
 def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
-    """Local quadratics over 60 ms, at least 5 samples.
-
-    Args:
-        series: (T+1, ...).
-        dt: seconds between samples.
-        derivative: 0 for the values, 1 for their slopes in time.
-    """
-    span = min(max(5, 2 * round(_SMOOTHING / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
+    """Local quadratics over 60 ms, at least 5 samples, of a series (T+1, ...); derivative 1: their slopes in time."""
+    span = min(max(5, 2 * round(0.06 / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
     if span < 3:
         return np.gradient(series, dt, axis=0) if derivative else series
     return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
 
 
 def moved(model: mujoco.MjModel, states: FloatArray, tangent: FloatArray) -> FloatArray:
-    """States moved by tangents.
-
-    Args:
-        model: of the states.
-        states: (..., S).
-        tangent: (..., 2 nv + na); either may have fewer leading dimensions.
-    """
+    """States (..., S) moved by tangents (..., 2 nv + na); either may have fewer leading dimensions."""
     shape = np.broadcast_shapes(states.shape[:-1], tangent.shape[:-1])
     out = np.broadcast_to(states, (*shape, states.shape[-1])).copy()
     tangent = np.broadcast_to(tangent, (*shape, tangent.shape[-1]))
@@ -102,16 +82,18 @@ def past_commands(
 ) -> list[FloatArray]:
     """The commands before each start, one row a physics step; before the log its first command.
 
-    Args:
-        simulator: tells how many physics steps a control step has.
-        trajectories: the logs.
-        log: (W,), the log of each start.
-        start: (W,), its sample.
-        dt: (W,), seconds of a control step.
+    Of starts at samples ``start`` (W,) of the logs ``log`` (W,), whose control steps take ``dt`` (W,) seconds.
     """
     past = []
     for k, first, seconds in zip(log, start, dt, strict=True):
         skip = simulator.physics_steps(float(seconds))[0]
-        rows = trajectories.actions[k, max(0, first - _LONGEST_DELAY) : first]
+        rows = trajectories.actions[k, max(0, first - 2000) : first]  # longer than any actuator's delay
         past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
     return past
+
+
+def with_history(simulator: Simulator, states: FloatArray, past: list[FloatArray], dt: FloatArray) -> FloatArray:
+    """States (W, S) at time zero, with the ``past_commands`` that delayed actuators remember; dt (W,) in seconds."""
+    states[:, 0] = 0.0
+    timestep = np.array([simulator.physics_steps(float(seconds))[1] for seconds in dt])
+    return simulator.environment.history(simulator.model, states, past, timestep)

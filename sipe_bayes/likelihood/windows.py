@@ -26,14 +26,11 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
-from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands
+from sipe_bayes.likelihood.starts import STATE_STEP, estimate_states, moved, past_commands, with_history
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-_THETA_STEP = (1e-5, 1e-3)  # finite differences, of the unit cube: least, and for windows of one control step
-_START_STEP = 1e-5  # rad or m, rad/s or m/s
 START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
-_ROUNDING = 1e-7  # of a channel's size: what the tolerance of MuJoCo's contact solver leaves, in its rare worst steps
 
 
 def chosen_channels(
@@ -64,6 +61,12 @@ def fitted_channels(names: SequenceOf[str], fit: tuple[str, ...] | None) -> list
     if unknown:
         raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
     return [list(names).index(n) for n in fit]
+
+
+def check_seen(names: SequenceOf[str], seen: BoolArray) -> None:
+    """Raise ValueError for a fitted channel without any sample; seen (C,)."""
+    for name in np.array(names)[~seen]:
+        raise ValueError(f"trajectories: the fitted channel {str(name)!r} has no sample at all; leave it out of `fit`")
 
 
 @dataclass(frozen=True)
@@ -138,18 +141,13 @@ class Windows:
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
         guesses = [estimate_states(simulator, t) for t in trajectories]
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
-        reference[:, 0] = 0.0
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
-        self.reference = environment.history(simulator.model, reference, past, self._timestep())
+        self.reference = with_history(simulator, reference, past, self.dt)
         model = simulator.model
         free = np.array([model.nv, model.nv, model.na]) * (self.settings.starts == "estimated")
         self.num_start = int(free.sum())
-        sd = np.repeat(START_SD, free)
-        self.start_precision = sd**-2.0
-
-    def _timestep(self) -> FloatArray:
-        return np.array([self.simulator.physics_steps(float(d))[1] for d in self.dt])
+        self.start_precision = np.repeat(START_SD, free) ** -2.0
 
     def every_other(self) -> Windows:
         """Every other window, for a rough search; the windows themselves where a log has fewer than four.
@@ -182,10 +180,13 @@ class Windows:
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """Noise sd (C,) below which finite differences are mostly rounding: no fit comes closer."""
+        """Noise sd (C,) below which finite differences are mostly rounding: no fit comes closer.
+
+        A ten millionth of a channel's size: what the tolerance of MuJoCo's contact solver leaves, in rare steps.
+        """
         size = np.sqrt(np.nanmean(np.where(self.observed, self.measured, np.nan) ** 2, axis=(0, 1)))
         moving = size[size > 0]
-        return _ROUNDING * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
+        return 1e-7 * np.maximum(size, 1e-3 * np.median(moving) if len(moving) else 1e-3)
 
     @property
     def fixed_sd(self) -> FloatArray:
@@ -195,8 +196,7 @@ class Windows:
     @property
     def theta_step(self) -> float:
         """Of the finite differences: the longer a window, the less smooth the effect of a change."""
-        least, most = _THETA_STEP
-        return max(least, most / int(self.steps.max()))
+        return max(1e-5, 1e-3 / int(self.steps.max()))
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Least changes (N,) of theta (N,) that finite differences can be taken over."""
@@ -307,7 +307,7 @@ class Windows:
         for j in range(n):
             thetas[j + 1, j] += sign[j] * size[j]
         for j in range(d):
-            all_starts[n + 1 + j, :, j] += _START_STEP
+            all_starts[n + 1 + j, :, j] += STATE_STEP
         if residual is None:
             predicted, valid = self.predict(thetas, all_starts)
         else:
@@ -322,7 +322,7 @@ class Windows:
             again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
             inside = np.clip(again, 0, 1)
             predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
-        scale = np.concatenate([sign[:n] * size[:n], np.full(d, _START_STEP)])
+        scale = np.concatenate([sign[:n] * size[:n], np.full(d, STATE_STEP)])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
         jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
@@ -330,12 +330,7 @@ class Windows:
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
 
     def moments(self, lin: Linearisation, white: bool = False) -> Moments:
-        """Products of the linearised rows, from which every noise model's normal equations follow.
-
-        Args:
-            lin: a linearisation.
-            white: for white noise alone.
-        """
+        """Products of the linearised rows, from which the normal equations of any noise follow, or of white alone."""
         n = lin.jacobian.shape[-1] - self.num_start
         return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
 

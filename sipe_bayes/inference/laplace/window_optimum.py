@@ -73,7 +73,7 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
     solved = eliminate_starts(moments.normal(noise), moments.num_theta, windows.start_precision, start_pull)
     here = pulls(windows, prior, theta, starts, solved.gradient)
     prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
-    evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True))) - prior_energy
+    evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True)))[0] - prior_energy
     white = noise.sd
     if sandwiched:
         noise = updated_noise(windows, moments, noise, theta, starts, prior, coloured=True)

@@ -34,14 +34,11 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import chosen_sd
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
-from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands
-from sipe_bayes.likelihood.windows import START_SD, chosen_channels
+from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, with_history
+from sipe_bayes.likelihood.windows import START_SD, check_seen, chosen_channels
 from sipe_bayes.simulation.simulator import Simulator
 
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known, beyond rounding: position, velocity, activation
-_LEAST_MOVEMENT = 1e-2  # of the largest among positions, velocities or activations: one that rests has a scale, too
-_LEAST_SD = 1e-6  # of a channel's or coordinate's size: noise below it is not told from rounding
-_LEAST_SIZE = 1e-3  # of the usual size: one that is all but zero has a size, too
 
 
 class Chain:
@@ -82,10 +79,8 @@ class Chain:
         reference = np.concatenate([_measured_states(simulator, replace(t, states=None)) for t in trajectories])
         if known:
             reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
-        reference[:, 0] = 0.0
-        timestep = np.array([simulator.physics_steps(float(d))[1] for d in self.dt])
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt) if model.nhistory else []
-        self.reference = environment.history(model, reference, past, timestep)
+        self.reference = with_history(simulator, reference, past, self.dt)
         self.sizes = (model.nv, model.nv, model.na)
         start_sd = KNOWN_SD if known else START_SD
         self.prior_precision = np.where(self.first[:, None], np.repeat(start_sd, self.sizes) ** -2.0, 0.0)
@@ -100,11 +95,7 @@ class Chain:
         ahead[:-1][~self.linked] = np.nan
         self.late, self.measured = late, np.where(late, ahead, rows)
         self.observed = np.isfinite(self.measured)
-        for name, seen in zip(self.fitted, self.observed.T, strict=True):
-            if not seen.any():
-                raise ValueError(
-                    f"trajectories: the fitted channel {name!r} has no sample at all; leave it out of `fit`"
-                )
+        check_seen(self.fitted, self.observed.any(axis=(0,)))
 
     def place(self, reference: FloatArray, indirect: BoolArray, irrelevant: BoolArray) -> None:
         """Say which coordinates a channel tells, and put positions there that one tells only indirectly.
@@ -206,7 +197,7 @@ class Chain:
         size = np.sqrt((steps**2).mean(0))
         kinds = [part for part in np.split(size, np.cumsum(self.sizes)[:-1]) if len(part)]
         usual = np.concatenate([np.full(len(part), part.max()) for part in kinds])
-        return np.maximum(np.maximum(size, _LEAST_MOVEMENT * usual), self.least[1])
+        return np.maximum(np.maximum(size, 1e-2 * usual), self.least[1])
 
     def moved(self, states: FloatArray, tangent: FloatArray) -> FloatArray:
         """States (..., S) moved by tangents (..., D)."""
@@ -284,8 +275,9 @@ class Chain:
 
 
 def _floor(sizes: FloatArray) -> FloatArray:
+    """A millionth of each size: noise below is not told from rounding; one that is all but zero has a size, too."""
     usual = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
-    return np.asarray(_LEAST_SD * np.maximum(sizes, _LEAST_SIZE * usual))
+    return np.asarray(1e-6 * np.maximum(sizes, 1e-3 * usual))
 
 
 def _measured_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:

@@ -25,27 +25,17 @@ from dataclasses import replace
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.likelihood.starts import STATE_STEP
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation
-
-_THETA_STEP = 1e-4  # of the unit cube: the root of what a rollout rounds to
-_STATE_STEP = 1e-5  # rad or m, rad/s or m/s: likewise, for one control step
-_BENT = 0.5  # of a squared deviation from a line
 
 
 def compare(
     chain: Chain, theta: FloatArray, states: FloatArray, slopes: ChainLinearisation | None = None
 ) -> list[ChainLinearisation | None]:
-    """Hold what theta and states predict against the logs.
+    """Hold what thetas (B, N) and states (B, K, S) predict against the logs: B comparisons, None where one diverged.
 
-    Args:
-        chain: the logs.
-        theta: (B, N).
-        states: (B, K, S).
-        slopes: whose Jacobians and their error are taken over; else there are none.
-
-    Returns:
-        B comparisons, None where a simulation diverged.
+    Jacobians and their error are taken over from ``slopes``; else there are none.
     """
     predicted, ends, valid = chain.simulate(theta, states)
     return [
@@ -63,48 +53,43 @@ def _compared(
 ) -> ChainLinearisation:
     """Residual, jump and offset of states (K, S) with predictions (K, C) and ends of control steps (K, S)."""
     none = np.empty(0)
-    return ChainLinearisation(
+    new = ChainLinearisation(
         residual=np.where(chain.observed, chain.measured - predicted, 0.0),
         jump=np.where(chain.linked[:, None], chain.difference(states[1:], ends[:-1]), 0.0),
         offset=np.where(chain.first[:, None], chain.difference(states, chain.reference), 0.0),
         observed=chain.observed,
         linked=chain.linked,
         precision=chain.prior_precision,
-        measurement=none if slopes is None else slopes.measurement,
-        measurement_theta=none if slopes is None else slopes.measurement_theta,
-        transition=none if slopes is None else slopes.transition,
-        transition_theta=none if slopes is None else slopes.transition_theta,
-        error=np.zeros((1, 1)) if slopes is None else slopes.error,
+        measurement=none,
+        measurement_theta=none,
+        transition=none,
+        transition_theta=none,
+        error=np.zeros((1, 1)),
     )
+    return new if slopes is None else replace(slopes, residual=new.residual, jump=new.jump, offset=new.offset)
 
 
 def linearise(
     chain: Chain, theta: FloatArray, states: FloatArray, with_states: bool = True
 ) -> ChainLinearisation | None:
-    """Everything at a point, in one batch of 1 + N + D control steps a state.
+    """Everything at theta (N,) and states (K, S), in one batch of 1 + N + D control steps a state; None if it diverged.
 
-    Args:
-        chain: the logs.
-        theta: (N,).
-        states: (K, S).
-        with_states: else the states' Jacobians are zero.
-
-    Returns:
-        The linearisation, None where it diverged. A difference whose simulation diverges counts as zero.
+    A difference whose simulation diverges counts as zero; so do the states' Jacobians unless ``with_states``.
     """
     n, d = chain.num_theta, chain.num_start
     count = 1 + n + d * with_states
     # one row of the batch for the point, for each parameter and for each coordinate
-    size = np.maximum(_THETA_STEP, chain.simulator.environment.least_steps(theta))
+    # of theta by the root of what a rollout rounds to
+    size = np.maximum(1e-4, chain.simulator.environment.least_steps(theta))
     sign = np.where(theta + size <= 1, 1.0, -1.0)
     thetas, all_states = np.tile(theta, (count, 1)), np.tile(states, (count, 1, 1))
     thetas[np.arange(1, n + 1), np.arange(n)] += sign * size
     for j in range(count - 1 - n):
-        all_states[1 + n + j] = chain.moved(states, _along(np.full((len(states), d), _STATE_STEP), j))
+        all_states[1 + n + j] = chain.moved(states, _along(np.full((len(states), d), STATE_STEP), j))
     predicted, ends, valid = chain.simulate(thetas, all_states)
     if not valid[0].all():
         return None
-    length = np.concatenate([sign * size, np.full(count - 1 - n, _STATE_STEP)])[:, None, None]
+    length = np.concatenate([sign * size, np.full(count - 1 - n, STATE_STEP)])[:, None, None]
     both = valid[1:, :, None]
     seen = np.where(both & chain.observed, (predicted[1:] - predicted[0]) / length, 0.0)
     reached = np.where(both, chain.difference(ends[1:], ends[0]) / length, 0.0)[:, :-1]
@@ -116,18 +101,10 @@ def linearise(
 def linearise_widely(
     chain: Chain, theta: FloatArray, states: FloatArray, theta_step: FloatArray, state_step: FloatArray
 ) -> ChainLinearisation | None:
-    """Everything over the surroundings of a point, in one batch of 1 + 2 (N + D) control steps a state.
+    """Everything over the surroundings of theta (N,) and states (K, S), in one batch of 1 + 2 (N + D) control steps.
 
-    Args:
-        chain: the logs.
-        theta: (N,).
-        states: (K, S).
-        theta_step: (N,) to both sides, within the cube.
-        state_step: (K, D) to both sides.
-
-    Returns:
-        The linearisation, None where it diverged. A difference of which one side diverges counts as zero, and as
-        straight.
+    By differences of theta_step (N,), within the cube, and state_step (K, D) to both sides. None where it diverged; a
+    difference of which one side diverges counts as zero, and as straight.
     """
     n, d = chain.num_theta, chain.num_start
     count = n + d
@@ -154,7 +131,7 @@ def linearise_widely(
     # how far the point itself is from the line between both ends
     share = np.concatenate([down / (up + down), np.full(d, 0.5)])[:, None, None]
     bent = np.where(linked, (share * turned + (1 - share) * back)[:, :-1], 0.0)
-    error = _BENT * (bent**2).sum(0)
+    error = 0.5 * (bent**2).sum(0)
     return _with_slopes(chain, _compared(chain, states, predicted[0], ends[0]), seen, reached, error)
 
 

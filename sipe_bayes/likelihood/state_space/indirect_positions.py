@@ -16,11 +16,10 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.likelihood.starts import STATE_STEP
 from sipe_bayes.likelihood.state_space.chain import Chain
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-_DIFFERENCE = 1e-5  # rad or m, of a finite difference
-_MATTERS = 1e-6  # of a channel's spread: less is rounding
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def _dependent(chain: Chain, states: FloatArray, position: int, values: FloatArr
     tried = values[np.linspace(0, len(values) - 1, OPTIONS.values).astype(int)]
     predicted = _predicted(chain, states[at], 1 + position, np.repeat(tried[:, None], len(at), axis=1), at)
     spread = np.where(chain.observed[at], np.nan_to_num(np.ptp(predicted, axis=0) / size), 0.0)
-    return np.asarray((spread > _MATTERS).any(0))
+    return np.asarray((spread > 1e-6).any(0))  # less is rounding
 
 
 def _best(chain: Chain, states: FloatArray, column: int, values: FloatArray, size: FloatArray) -> FloatArray | None:
@@ -120,15 +119,15 @@ def _best(chain: Chain, states: FloatArray, column: int, values: FloatArray, siz
     misfit = np.where(np.isnan(residual), np.inf, residual**2).sum(-1)
     spacing = float(values[1] - values[0])
     circle = bool(np.isclose(spacing * OPTIONS.grid, 2 * np.pi))
-    seen = np.ptp(np.where(np.isfinite(misfit), misfit, 0.0), axis=0) > _MATTERS
+    seen = np.ptp(np.where(np.isfinite(misfit), misfit, 0.0), axis=0) > 1e-6
     if not seen.any() or (_lead(misfit[:, seen], circle) > OPTIONS.clear).mean() < OPTIONS.unique:
         return None
     # Gauss-Newton from there
     position = values[misfit.argmin(0)]
     for k in range(OPTIONS.steps):
-        tried = np.stack([position, position + _DIFFERENCE])
+        tried = np.stack([position, position + STATE_STEP])
         at, moved = _residual(chain, _predicted(chain, states, column, tried), size)
-        slope = np.nan_to_num((at - moved) / _DIFFERENCE)
+        slope = np.nan_to_num((at - moved) / STATE_STEP)
         steepness = (slope**2).sum(-1)
         step = (slope * np.nan_to_num(at)).sum(-1) / np.maximum(steepness, 1e-12)
         position = position + np.where(seen, np.clip(step, -spacing, spacing) / (1 + (k == 0)), 0.0)

@@ -190,16 +190,9 @@ def restricted(
 def expected_squares(
     linear: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Expected squares after a step.
+    """Expected squares after a step (N,) of theta, whose covariance (N, N) is given.
 
-    Args:
-        linear: the linearisation.
-        solved: its states eliminated.
-        step: (N,) of theta.
-        covariance: (N, N) of theta.
-
-    Returns:
-        Of the residuals (K, C), zero where not observed, and of the jumps (K-1, D).
+    Of the residuals (K, C), zero where not observed, and of the jumps (K-1, D).
     """
     moved = solved.blocks(step)
     own, cross = solved.covariances()
@@ -218,18 +211,7 @@ def expected_squares(
 def jump_normal(
     linear: ChainLinearisation, solved: Eliminated, step: FloatArray, covariance: FloatArray, at: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Posterior of some jumps after a step.
-
-    Args:
-        linear: the linearisation.
-        solved: its states eliminated.
-        step: (N,) of theta.
-        covariance: (N, N) of theta.
-        at: which jumps (J,).
-
-    Returns:
-        Means (J, D) and covariances (J, D, D).
-    """
+    """Means (J, D) and covariances (J, D, D) of the jumps ``at`` (J,) after a step (N,) of theta."""
     moved = solved.blocks(step)
     own, cross = solved.covariances()
     turn = linear.transition[at]

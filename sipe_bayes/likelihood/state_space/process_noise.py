@@ -11,8 +11,6 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.likelihood.state_space.chain import Chain
 
-_NAMED = 4  # times that a text names
-
 
 def process_noise_findings(
     chain: Chain, process: FloatArray, movement: FloatArray, outliers: Sequence[int] | IntArray = ()
@@ -43,10 +41,10 @@ def process_noise_findings(
 
 
 def _times(chain: Chain, outliers: Sequence[int] | IntArray) -> str:
-    """When the first of them happen."""
+    """When the first four of them happen."""
     many = len(chain.trajectories) > 1
     times = [
         f"{chain.sample[k] * chain.dt[k]:.3g} s" + (f" of {chain.names[k] or f'log {chain.log[k]}'}" if many else "")
-        for k in outliers[:_NAMED]
+        for k in outliers[:4]
     ]
-    return ", ".join(times) + (", ..." if len(outliers) > _NAMED else "")
+    return ", ".join(times) + (", ..." if len(outliers) > 4 else "")
