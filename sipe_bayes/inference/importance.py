@@ -30,9 +30,6 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.inference.search.gaussians import log_normal
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
-_JITTER = 1e-9  # of the variances: rounding leaves some kernels' covariance singular
-_TINY = 1e-300  # so that nothing is divided by zero
-
 
 @dataclass(frozen=True)
 class ImportanceTuning(Options):
@@ -102,7 +99,7 @@ def is_normal(
     sd, precision = np.sqrt(np.diag(covariance)), np.linalg.inv(covariance)
     along = (covariance / sd).T
     steps = tuning.probe * np.concatenate([along, -along])  # a row for each parameter and side
-    room = np.where(steps > 0, 1 - theta, theta) / np.maximum(np.abs(steps), _TINY)
+    room = np.where(steps > 0, 1 - theta, theta) / np.maximum(np.abs(steps), 1e-300)
     points = np.clip(theta + np.minimum(1.0, room.min(1))[:, None] * steps, 0.0, 1.0)
     all_points = np.concatenate([theta[None], points])
     values = target(all_points)
@@ -120,16 +117,7 @@ def batch_size(size: int, tuning: ImportanceTuning) -> int:
 def draw(
     draws: Draws, target: Target, normal: GaussianMixture, prior: Posterior, seed: int, tuning: ImportanceTuning
 ) -> Draws:
-    """One more batch.
-
-    Args:
-        draws: those until now.
-        target: log densities.
-        normal: that of Laplace's method.
-        prior: over theta.
-        seed: of the draws.
-        tuning: of the batches.
-    """
+    """One more batch; ``normal`` is that of Laplace's method, ``target`` gives log densities."""
     batches, size = draws.batches, batch_size(len(normal.space), tuning)
     if batches:
         share, (mean, covariance) = tuning.share, _moments(draws, normal, prior, tuning)
@@ -180,7 +168,8 @@ def kernels(
     comb = (np.arange(tuning.kernels) + np.random.default_rng([seed, 0, 1]).random()) / tuning.kernels
     picked = order[np.minimum(np.searchsorted(np.cumsum(weight[order]), comb), len(weight) - 1)]
     which, counts = np.unique(picked, return_counts=True)
-    spread = width**2 * covariance + _JITTER * np.diag(np.diag(covariance))
+    # rounding leaves some kernels' covariance singular
+    spread = width**2 * covariance + 1e-9 * np.diag(np.diag(covariance))
     means, spreads = shrunk[which], np.tile(spread, (len(which), 1, 1))
     masses = GaussianMixture(np.log(counts), means, spreads, space).log_masses.numpy()  # at a bound not whole
     return GaussianMixture(np.log(counts) - masses, means, spreads, space)

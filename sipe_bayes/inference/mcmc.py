@@ -36,7 +36,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
-from sipe_bayes.inference.laplace.strategy import distinct
+from sipe_bayes.inference.laplace.strategy import Optimum, distinct
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
@@ -189,8 +189,7 @@ class MCMC(Estimator[MCMCState]):
         assert isinstance(normals, GaussianMixture)
         # what was noticed on the way holds; what its posterior says of itself does not hold of the chains
         self.findings.extend(search.snapshot.findings)
-        optima = search.snapshot.state.search.optima
-        fit = self._fit(windows, optima[distinct(optima)[0]])
+        fit = self._fit(windows, distinct(search.snapshot.state.search.optima)[0])
         if search.snapshot.state.draws is not None:  # kernels, which are slow to draw from
             mean, covariance = normals.gaussian_moments()
             normals = GaussianMixture([0.0], mean[None], covariance[None], self.space)
@@ -215,7 +214,7 @@ class MCMC(Estimator[MCMCState]):
             random=RandomState.of(random),
         )
 
-    def _fit(self, windows: Windows | Chain, optimum: WindowOptimum | ChainOptimum) -> WindowFit | ChainFit:
+    def _fit(self, windows: Windows | Chain, optimum: Optimum) -> WindowFit | ChainFit:
         """What the target needs of an optimum."""
         if isinstance(windows, Chain):
             assert isinstance(optimum, ChainOptimum)
@@ -309,10 +308,6 @@ class MCMC(Estimator[MCMCState]):
 
     def posterior(self, state: MCMCState, trajectories: Trajectories) -> Particles:
         """The chain after warm-up, thinned.
-
-        Args:
-            state: of a fit.
-            trajectories: the logs.
 
         Raises:
             BudgetTooSmall: where there is no step yet.

@@ -82,7 +82,7 @@ def marginal(moments: Moments, noise: Noise, starts: FloatArray, precision: Floa
     """Log-likelihood of residuals with the windows' starts integrated out, theta as it is.
 
     ``moments`` are of the residuals at ``starts`` (W, D) and their Jacobian by the starts alone, ``precision`` (D,)
-    of the starts' prior. Returns the value up to a constant, and the change (W, D) of the starts that minimises the squares.
+    of the starts' prior. Returns the value up to a constant, and the change (W, D) of the starts that fits best.
     """
     normal = moments.normal(noise)
     solved = eliminate_starts(normal, 0, precision, -precision * starts)

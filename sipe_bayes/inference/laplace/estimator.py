@@ -31,9 +31,6 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
 
-_SHARP = 10 * SHORTEST  # an sd that the look around the optimum may have set
-_RANK = 1e-9  # of the largest eigenvalue of the data's information: below it a direction is open
-
 
 @dataclass(frozen=True)
 class LaplaceState:
@@ -78,7 +75,7 @@ class Laplace(Estimator[LaplaceState]):
     @property
     def problem(self) -> SearchProblem:
         """What its search is given."""
-        return SearchProblem(self.space, self.prior, self.seed, self.options, self.options.initial, self.findings.add)
+        return SearchProblem(self.space, self.prior, self.seed, self.options, self.findings.add)
 
     def start(self, trajectories: Trajectories) -> LaplaceState:
         """The first state of the search that fits the likelihood."""
@@ -111,13 +108,13 @@ class Laplace(Estimator[LaplaceState]):
         ended, tuning, n = replace(state, done=True), self.options.tuning.importance, len(self.space)
         if isinstance(windows, Chain) or windows.num_start or windows.settings.noise == "sandwich":
             return ended
-        kept = _kept(state)
+        kept = distinct(state.search.optima)
         batches = tuning.hopeless_after * importance.batch_size(n, tuning)
         least = (importance.probe_size(n) + batches) * len(windows.trajectories)
         if len(kept) != 1 or not isinstance(kept[0], WindowOptimum) or kept[0].guessed:
             return ended
-        if windows.rollouts + least > windows.budget or np.sqrt(np.diag(kept[0].covariance)).min() < _SHARP:
-            return ended
+        if windows.rollouts + least > windows.budget or np.sqrt(np.diag(kept[0].covariance)).min() < 10 * SHORTEST:
+            return ended  # an sd that the look around the optimum may have set
         target = self._target(windows, kept[0])
         if target.silent or importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
             return ended
@@ -125,7 +122,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts."""
-        kept, tuning, n = _kept(state), self.options.tuning.importance, len(self.space)
+        kept, tuning, n = distinct(state.search.optima), self.options.tuning.importance, len(self.space)
         normal, target = mixture(kept, self.space), self._target(windows, kept[0])
         draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
         effective = importance.effective(importance.weights(draws, self.prior))
@@ -141,14 +138,10 @@ class Laplace(Estimator[LaplaceState]):
     def posterior(self, state: LaplaceState, trajectories: Trajectories) -> GaussianMixture:
         """The optima's normals, or kernels on the draws that take their place.
 
-        Args:
-            state: of a fit.
-            trajectories: the logs.
-
         Raises:
             BudgetTooSmall: where there is no optimum yet.
         """
-        kept = _kept(state)
+        kept = distinct(state.search.optima)
         if not kept:
             step = self._strategy(self.windows(trajectories)).step_rollouts
             raise BudgetTooSmall(
@@ -184,7 +177,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
-        kept = [] if self.state is None else _kept(self.state)
+        kept = [] if self.state is None else distinct(self.state.search.optima)
         if not kept:
             raise ValueError("information: nothing has been fitted yet; call fit first")
         prior, mean, total = QuadraticPrior.of(self.prior), kept[0].mean, np.linalg.inv(kept[0].covariance)
@@ -192,9 +185,4 @@ class Laplace(Estimator[LaplaceState]):
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
-        return np.linalg.pinv(information, rcond=_RANK, hermitian=True) @ right, information
-
-
-def _kept(state: LaplaceState) -> list[Optimum]:
-    """The optima worth keeping, best first."""
-    return [state.search.optima[k] for k in distinct(state.search.optima)]
+        return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open

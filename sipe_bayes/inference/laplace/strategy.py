@@ -11,13 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.checkpoint import SearchState
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.inference.laplace.options import LaplaceOptions
@@ -61,7 +60,6 @@ class SearchProblem:
         prior: over theta.
         seed: of whatever is drawn.
         options: of ``laplace``.
-        initial: (R, N), starting points; None where the search looks for them.
         find: notes a finding.
     """
 
@@ -69,12 +67,11 @@ class SearchProblem:
     prior: Posterior
     seed: int
     options: LaplaceOptions
-    initial: FloatArray | None
     find: Callable[[Finding], None]
 
     def within(self, initial: FloatArray) -> Self:
         """The same problem from other starting points (R, N), a part of a search that notes no findings."""
-        return replace(self, initial=initial, find=lambda _: None)
+        return replace(self, options=replace(self.options, initial=initial), find=lambda _: None)
 
     @cached_property
     def quadratic_prior(self) -> QuadraticPrior:
@@ -82,15 +79,9 @@ class SearchProblem:
         return QuadraticPrior.of(self.prior)
 
     def normal(self, theta: FloatArray, precision: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The quadratic model of data and prior.
+        """Mean (N,) and covariance (N, N) of the posterior's normal, before truncation.
 
-        Args:
-            theta: (N,), where it is taken.
-            precision: (N, N), of the data alone.
-            gradient: (N,), downhill, of the data alone.
-
-        Returns:
-            Mean (N,) and covariance (N, N) of the normal, before truncation.
+        At theta (N,), of precision (N, N) and downhill gradient (N,) of the data alone.
         """
         prior = self.quadratic_prior
         covariance = inverse(precision + prior.precision + FLAT_PRECISION * np.eye(len(theta)))[0]
@@ -98,18 +89,52 @@ class SearchProblem:
         return theta + covariance @ pull, 0.5 * (covariance + covariance.T)
 
 
-class StrategyState(SearchState, Protocol):
-    """The state of a strategy: a frozen dataclass that ``core.checkpoint`` takes."""
+class Stepping(Protocol):
+    """Where the search from one starting point stands."""
 
     @property
-    def optima(self) -> Sequence[Optimum]:
-        """Those recorded until now."""
+    def iteration(self) -> int:
+        """Steps until now."""
+
+
+P = TypeVar("P", bound=Stepping)
+
+
+@dataclass(frozen=True)
+class StrategyState(Generic[P]):
+    """The state of a strategy, which follows one starting point after the other.
+
+    Args:
+        points: (R, N), starting points.
+        point: which of them is followed.
+        here: where that stands.
+        optima: those recorded.
+        done: whether the last point has been followed to its end.
+    """
+
+    points: FloatArray
+    point: int
+    here: P
+    optima: tuple[Optimum, ...] = ()
+    done: bool = False
 
     def describe(self) -> str:
-        """What is being done, for the progress bar."""
+        """Starting point and step, for the progress bar."""
+        return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
+
+    def at(self, here: P) -> Self:
+        """The search at another position."""
+        return replace(self, here=here)
+
+    def next_point(self, begin: Callable[[FloatArray], P]) -> Self:
+        """At the next starting point (N,), from which the search begins as ``begin`` says; or done."""
+        point = self.point + 1
+        if point >= len(self.points):
+            return replace(self, done=True)
+        return replace(self, point=point, here=begin(self.points[point]))
 
 
-S = TypeVar("S", bound=StrategyState)
+S = TypeVar("S", bound=StrategyState[Any])
 
 
 class Strategy(Protocol[S]):
@@ -130,23 +155,12 @@ class Strategy(Protocol[S]):
         """
 
 
-def distinct(optima: Sequence[Optimum], drop: float = 10.0) -> list[int]:
-    """Places of the optima worth keeping, best first, and not the same twice.
-
-    Args:
-        optima: of a search.
-        drop: nats below the best one at most; below it an optimum's weight is nothing.
-    """
-    if not optima:
-        return []
-    evidence = np.array([one.evidence for one in optima])
-    order = np.argsort(-evidence, kind="stable")
-    kept: list[int] = []
-    for m in map(int, order):
-        if evidence[m] < evidence[order[0]] - drop:
-            continue
-        if not any(optima[k].holds(optima[m]) for k in kept):
-            kept.append(m)
+def distinct(optima: Sequence[Optimum]) -> list[Optimum]:
+    """The optima worth keeping, best first, not the same twice; ten nats below the best their weight is nothing."""
+    kept: list[Optimum] = []
+    for one in sorted(optima, key=lambda optimum: -optimum.evidence):
+        if not kept or (one.evidence >= kept[0].evidence - 10 and not any(best.holds(one) for best in kept)):
+            kept.append(one)
     return kept
 
 

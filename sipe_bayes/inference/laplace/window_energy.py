@@ -21,8 +21,6 @@ from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_n
 from sipe_bayes.likelihood.windows import Windows
 
 _SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
-_STILL = 1e-9  # of the largest spread of a channel: one below it does not move
-_TINY = 1e-300  # so that nothing is divided by zero
 
 
 @dataclass(frozen=True)
@@ -127,16 +125,9 @@ def updated_noise(
     prior: QuadraticPrior,
     coloured: bool,
 ) -> Noise:
-    """Noise that maximises the restricted likelihood of one linearisation.
+    """Noise that maximises the restricted likelihood of one linearisation, at theta (N,) and starts (W, D).
 
-    Args:
-        windows: the logs.
-        moments: of the linearisation.
-        before: where the search for it begins.
-        theta: (N,), where it was taken.
-        starts: (W, D), likewise.
-        prior: on theta.
-        coloured: whether correlation times are estimated.
+    The search for it begins at ``before``; coloured: whether correlation times are estimated.
     """
     start_pull = -windows.start_precision * starts
     solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
@@ -173,6 +164,6 @@ def same_noise(a: Noise, b: Noise) -> bool:
 def misfit(windows: Windows, residual: FloatArray) -> float:
     """Root mean square of residuals (W, L, C), in units of the spread of each channel that has one."""
     spread = windows.spread
-    moves = spread > _STILL * spread.max()
+    moves = spread > 1e-9 * spread.max()
     size = np.where(moves, spread, np.inf) if moves.any() else np.ones_like(spread)
-    return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or _TINY
+    return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or 1e-300

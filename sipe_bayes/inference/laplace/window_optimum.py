@@ -27,9 +27,6 @@ from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
 from sipe_bayes.likelihood.restricted import eliminate_starts, restricted
 from sipe_bayes.likelihood.windows import Windows
 
-_RANK = 1e-12  # of the largest singular value: rounding
-_RIDGE_TRIALS = np.array([0.0, 1.0, 0.5, 0.25])  # of the way to the middle of a ridge; the first is the optimum itself
-
 
 @dataclass(frozen=True)
 class Ending:
@@ -93,18 +90,7 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
         centres.append((weight, centre))
     for weight, centre in centres:
         covariance += weight * np.outer(centre - mean, centre - mean)
-    return WindowOptimum(
-        theta=theta,
-        mean=mean,
-        covariance=covariance,
-        evidence=evidence,
-        sd=noise.sd,
-        tau=noise.tau,
-        starts=starts,
-        slope=solved.slope,
-        guessed=False,
-        finding=None,
-    )
+    return WindowOptimum(theta, mean, covariance, evidence, noise.sd, noise.tau, starts, solved.slope)
 
 
 def sandwiches(windows: Windows) -> bool:
@@ -114,8 +100,8 @@ def sandwiches(windows: Windows) -> bool:
 
 def _sandwiched(solved: Eliminated, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Precision and gradient of plain least squares when the residuals' covariance gives ``middle`` (N, N)."""
-    shift = np.linalg.pinv(solved.precision, rcond=_RANK, hermitian=True) @ solved.gradient
-    precision = solved.precision @ np.linalg.pinv(middle, rcond=_RANK, hermitian=True) @ solved.precision
+    shift = np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
+    precision = solved.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ solved.precision
     # rounding leaves some of an open direction negative
     eigenvalues, axes = np.linalg.eigh(0.5 * (precision + precision.T))
     precision = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
@@ -125,11 +111,7 @@ def _sandwiched(solved: Eliminated, middle: FloatArray) -> tuple[FloatArray, Flo
 def surroundings(
     problem: SearchProblem, windows: Windows, theta: FloatArray, noise: Noise, covariance: FloatArray
 ) -> Surroundings | None:
-    """What a pattern search sees around an optimum.
-
-    Returns:
-        None where starts are searched too, or the budget leaves no room.
-    """
+    """What a pattern search sees around an optimum; None where starts are searched too or the budget has no room."""
     tuning = problem.options.tuning.pattern
     if windows.num_start:
         return None
@@ -154,10 +136,9 @@ def surroundings(
 
 
 def middle_of_ridge(problem: SearchProblem, windows: Windows, optimum: WindowOptimum) -> FloatArray | None:
-    """Where the search goes on: the middle of a ridge, so that the width across it does not depend on the start.
+    """The middle (N,) of a ridge, to go on from, so that the width across it does not depend on the start.
 
-    Returns:
-        theta (N,); None where no direction is open or the middle does not fit as well.
+    None where no direction is open or the middle does not fit as well.
     """
     tuning = problem.options.tuning.windows
     theta, starts, noise = optimum.theta, optimum.starts, Noise(optimum.sd, optimum.tau)
@@ -166,7 +147,7 @@ def middle_of_ridge(problem: SearchProblem, windows: Windows, optimum: WindowOpt
     move = open_axes @ (open_axes.T @ (optimum.mean - theta))
     if not len(move) or np.abs(move).max() < tuning.off_centre:
         return None
-    trials = np.clip(theta + _RIDGE_TRIALS[:, None] * move, 0, 1)
+    trials = np.clip(theta + np.array([[0.0], [1.0], [0.5], [0.25]]) * move, 0, 1)  # first the optimum itself
     if windows.rollouts + len(trials) * len(windows.trajectories) > windows.budget:
         return None
     residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
@@ -180,12 +161,7 @@ def judged(
 ) -> WindowOptimum:
     """The optimum as wide as its surroundings ask for, with what is to be said against it.
 
-    Args:
-        problem: what the search is given.
-        windows: the logs.
-        optimum: as ``summarised``.
-        around: its surroundings; None where they were not looked at.
-        ending: how the search came to it.
+    ``around`` is None where they were not looked at.
     """
     unsmooth, covariance = ending.refused > problem.options.tuning.windows.most_drift, optimum.covariance
     reason: Finding | None = None

@@ -64,7 +64,6 @@ from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 _ROUGH = (Phase.WHOLE, Phase.ROUGH)
-_LEAST_SPREAD = 1e-12  # of a channel, in its unit
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class WindowSearch:
 
     def start(self) -> WindowState:
         """The first state: at the first starting point."""
-        initial = self.problem.initial
+        initial = self.problem.options.initial
         points = screen(self.problem, self.windows) if initial is None else initial
         return WindowState(points, 0, self._begin(points[0]))
 
@@ -157,7 +156,7 @@ class WindowSearch:
             kept=replace(here.kept, residual=point.residual if again or view is windows else None),
         )
         state = replace(state, here=here)
-        return self._next_point(state) if state.known else state
+        return state.next_point(self._begin) if state.known else state
 
     def _whole(self, state: WindowState) -> WindowState:
         """The first step on all windows: every other one went well, but perhaps not all do."""
@@ -256,19 +255,14 @@ class WindowSearch:
         ends = self._unrecorded(state) and (step.cut_short or self._leaves_no_room())
         if settled or ends or after.iteration >= self._tuning.windows.most_steps:
             return self._recorded(onward, state.here, step, settled, ends)
-        return self._next_point(onward) if not after.revisits and onward.known else onward
+        return onward.next_point(self._begin) if not after.revisits and onward.known else onward
 
     def _recorded(
         self, state: WindowState, before: Position, step: Step, settled: bool, cut_short: bool
     ) -> WindowState:
         """Record an optimum, and go on from a better or a more central one or from the next starting point.
 
-        Args:
-            state: after the last step.
-            before: where that was linearised, which is the optimum.
-            step: the last one.
-            settled: whether nothing moved any more.
-            cut_short: whether the budget ends.
+        ``state`` is that after the last step, ``before`` where this was linearised, which is the optimum.
         """
         windows, tuning, here = self.windows, self._tuning, state.here
         theta, noise = before.theta, step.noise
@@ -303,17 +297,10 @@ class WindowSearch:
         if around is not None and around.other is not None and len(state.points) < tuning.windows.most_points:
             state = replace(state, points=np.concatenate([state.points, around.other[None]]))
         if around is None or around.better is None or here.patterns >= tuning.windows.most_patterns:
-            return self._next_point(state)
+            return state.next_point(self._begin)
         size = min(here.theta_step, max(float(np.abs(around.better - theta).max()), SHORTEST))
         better = replace(here.afresh(tuning.damping), theta=around.better, theta_step=size, iteration=0)
         return replace(state, here=replace(better, patterns=here.patterns + 1))
-
-    def _next_point(self, state: WindowState) -> WindowState:
-        """Turn to the next starting point, or end."""
-        point = state.point + 1
-        if point >= len(state.points):
-            return replace(state, done=True)
-        return replace(state, point=point, here=self._begin(state.points[point]))
 
     def _begin(self, theta: FloatArray, subset: bool = True) -> Position:
         """At a starting point theta (N,); subset: whether every other window may be tried first."""
@@ -387,7 +374,7 @@ def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
 def _plain_loss(windows: Windows, points: FloatArray) -> FloatArray:
     """Squared residuals (B,) of points (B, N), in units of each channel's spread; infinite where one diverges."""
     residual, valid = windows.residuals(points, np.tile(windows.no_starts(), (len(points), 1, 1, 1)))
-    spread = np.maximum(windows.spread, _LEAST_SPREAD)
+    spread = np.maximum(windows.spread, 1e-12)
     return np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
 
 

@@ -11,13 +11,9 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
-from sipe_bayes.inference.laplace.strategy import Optimum
+from sipe_bayes.inference.laplace.strategy import Optimum, StrategyState
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.windows import Windows
-
-_FIRST_SHARE = 0.1  # of a channel's spread: a first guess of its noise, which the first step replaces
-_NEAR = 0.1  # of the way to a known optimum, within which a search has come to it
-_LEAST_SD = 1e-9  # of a first guess, in the channel's unit
 
 
 class Phase(StrEnum):
@@ -88,16 +84,12 @@ class Position:
 
     @classmethod
     def at(cls, windows: Windows, theta: FloatArray, rule: DampingRule, subset: bool) -> Self:
-        """At a starting point theta (N,), with a first guess of white noise.
+        """At a starting point theta (N,), with a first guess of white noise, which the first step replaces.
 
-        Args:
-            windows: the logs.
-            theta: (N,).
-            rule: of the damping.
-            subset: whether every other window is to be tried first.
+        subset: whether every other window is to be tried first.
         """
         fixed = windows.fixed_sd
-        sd = np.where(np.isnan(fixed), np.maximum(_FIRST_SHARE * windows.spread, _LEAST_SD), fixed)
+        sd = np.where(np.isnan(fixed), np.maximum(0.1 * windows.spread, 1e-9), fixed)
         phase = Phase.SUBSET if subset else Phase.ROUGH
         noise = Noise(sd, np.zeros(len(sd)))
         return cls(phase, theta, windows.no_starts(), noise, rule.first, windows.theta_step)
@@ -126,31 +118,16 @@ class WindowOptimum(Optimum):
 
     starts: FloatArray
     slope: FloatArray
-    guessed: bool
-    finding: Finding | None
+    guessed: bool = False
+    finding: Finding | None = None
 
 
 @dataclass(frozen=True)
-class WindowState:
-    """A search over windows.
+class WindowState(StrategyState[Position]):
+    """A search over windows."""
 
-    Args:
-        points: (R, N), starting points.
-        point: which of them is followed.
-        here: where that stands.
-        optima: those recorded.
-        done: whether the last point has been followed to its end.
-    """
-
-    points: FloatArray
-    point: int
     here: Position
     optima: tuple[WindowOptimum, ...] = ()
-    done: bool = False
-
-    def describe(self) -> str:
-        """Starting point and step."""
-        return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
 
     @property
     def known(self) -> bool:
@@ -164,6 +141,6 @@ class WindowState:
             sd = np.sqrt(eigenvalues)
             left = np.abs((self.here.theta - optimum.mean) @ axes) / sd
             whole = np.abs((begin - optimum.mean) @ axes) / sd
-            if (left < np.maximum(1.0, _NEAR * whole)).all():
+            if (left < np.maximum(1.0, 0.1 * whole)).all():
                 return True
         return False

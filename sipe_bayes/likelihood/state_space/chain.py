@@ -95,7 +95,7 @@ class Chain:
         ahead[:-1][~self.linked] = np.nan
         self.late, self.measured = late, np.where(late, ahead, rows)
         self.observed = np.isfinite(self.measured)
-        check_seen(self.fitted, self.observed.any(axis=(0,)))
+        check_seen(self.fitted, np.asarray(self.observed.any(0)))
 
     def place(self, reference: FloatArray, indirect: BoolArray, irrelevant: BoolArray) -> None:
         """Say which coordinates a channel tells, and put positions there that one tells only indirectly.

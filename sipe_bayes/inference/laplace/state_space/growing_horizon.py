@@ -32,15 +32,10 @@ from sipe_bayes.likelihood.windows import Windows
 
 
 def grown(problem: SearchProblem, chain: Chain) -> FloatArray | None:
-    """Starting points from ever longer beginnings.
+    """Starting points (R, N) from ever longer beginnings, perhaps fewer than asked for.
 
-    Args:
-        problem: prior, seed and options; of what is noticed on the way it learns only that the model as given diverges.
-        chain: the logs.
-
-    Returns:
-        (R, N), perhaps fewer than asked for; None where even the shortest beginnings diverge, or the budget is too
-        small for them.
+    Of what is noticed on the way the problem learns only that the model as given diverges. None where even the shortest
+    beginnings diverge, or the budget is too small for them.
     """
     tuning = problem.options.tuning.state_space.horizon
     limit = chain.rollouts + tuning.budget_share * (chain.budget - chain.rollouts)
@@ -86,7 +81,7 @@ def _attempt(
             break
         fitted = True
         if search.optima:
-            kept = [search.optima[k] for k in distinct(search.optima)]
+            kept = distinct(search.optima)
             points = np.stack([one.theta for one in kept[: problem.options.restarts]])
             posterior = mixture(kept, problem.space)
         else:

@@ -16,10 +16,9 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.state_space.options import SmoothingTuning
+from sipe_bayes.likelihood.starts import STATE_STEP
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
-
-_STEP = 1e-5  # rad or m, rad/s or m/s, of a finite difference
 
 
 def filtered(
@@ -30,26 +29,16 @@ def filtered(
     states: FloatArray,
     tuning: SmoothingTuning,
 ) -> FloatArray | None:
-    """Filter every log at once.
+    """States (K, S) of every log at theta (N,), filtered at once; None where the simulation diverges.
 
-    Measurements are linear about ``states``; each control step is linearised where the filter stands.
-
-    Args:
-        chain: the logs.
-        linear: the linearisation at ``states``.
-        noise: of measurements and jumps.
-        theta: (N,).
-        states: (K, S).
-        tuning: with the width of the first states.
-
-    Returns:
-        States (K, S), None where its simulation diverges.
+    Measurements are linear about ``states`` (K, S), where ``linear`` was taken; each control step is linearised where
+    the filter stands.
     """
     size, timely = chain.num_start, ~chain.late
     covariance = eliminate_states(linear, noise).covariances()[0][chain.first] * tuning.filter_width
     at, out = np.flatnonzero(chain.first), states.copy()
     mean, thetas = states[at], np.tile(theta, (1 + size, 1))
-    steps = np.concatenate([np.zeros((1, size)), _STEP * np.eye(size)])
+    steps = np.concatenate([np.zeros((1, size)), STATE_STEP * np.eye(size)])
     while True:
         # what the measurements say of where each log stands
         mean, covariance = _update(chain, linear, noise, timely, at, mean, covariance, states)
@@ -62,7 +51,7 @@ def filtered(
         _, ends, valid = chain.simulate(thetas, chain.moved(mean[None], steps[:, None]), at)
         if not valid[0].all():
             return None
-        turned = chain.difference(ends[1:], ends[0]) / _STEP
+        turned = chain.difference(ends[1:], ends[0]) / STATE_STEP
         transition = np.moveaxis(np.where(valid[1:, :, None], turned, 0.0), 0, -1)
         covariance = transition @ covariance @ np.swapaxes(transition, 1, 2) + np.diag(noise.process**2)
         at = at + 1

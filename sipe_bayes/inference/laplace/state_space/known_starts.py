@@ -38,7 +38,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
     unknown_noise,
 )
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.state_space.differences import linearise, linearise_widely
+from sipe_bayes.likelihood.state_space.differences import linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
     ChainNoise,
@@ -79,23 +79,23 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
 
     def start(self) -> KnownStartState:
         """The first state: at the first starting point."""
-        chain, points = self.chain, self.problem.initial
+        chain, points = self.chain, self.problem.options.initial
         chain.rollouts += chain.setup_rollouts
         if points is None:
             points = grown(self.problem, chain)
         if points is None:
             points = screened(self.problem, chain)
-        return KnownStartState(points, 0, self._begin(points[0]), chain.uncounted)
+        return KnownStartState(points, 0, self.begin(points[0]), uncounted=chain.uncounted)
 
-    def phases(self) -> dict[Phase, Callable[[KnownStartState], KnownStartState]]:
+    def phases(self) -> dict[Phase, Callable[[KnownStartState, ChainLinearisation], KnownStartState]]:
         """A function for each phase."""
-        return {
-            Phase.FOLLOW: self._follow,
-            Phase.SMOOTH: self._smooth,
-            Phase.NOISE: self._noise,
-        }
+        return {Phase.FOLLOW: self._follow, Phase.SMOOTH: self._smooth, Phase.NOISE: self._noise}
 
-    def _begin(self, theta: FloatArray) -> KnownStartPosition:
+    def linearised(self, here: KnownStartPosition) -> ChainLinearisation | None:
+        """Over the surroundings that are open, after short differences first."""
+        return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
+
+    def begin(self, theta: FloatArray) -> KnownStartPosition:
         """At a starting point (N,)."""
         chain, ones = self.chain, np.ones(self.chain.num_start)
         return KnownStartPosition(
@@ -112,57 +112,38 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
 
     # ------------------------------------------------------------------ phases
 
-    def _follow(self, state: KnownStartState) -> KnownStartState:
-        """The states that the commands lead to, and a first guess of the noise about them."""
+    def _follow(self, state: KnownStartState, linear: ChainLinearisation) -> KnownStartState:
+        """A first guess of the noise about the states that the commands lead to."""
         chain, theta, prior, tuning = self.chain, state.here.theta, self.problem.quadratic_prior, self.tuning.noise
-        states = chain.predicted(theta)
-        states = state.here.states if states is None else states
-        linear = linearise(chain, theta, states)
-        if linear is None:
-            return state.after_divergence(self._begin)
-        movement, fixed = chain.movement(states), chain.fixed_sd
+        movement, fixed = chain.movement(state.here.states), chain.fixed_sd
         noise = first_noise(chain, linear, movement, tuning)
         residual = np.sqrt((linear.residual**2).sum(0) / linear.observed.sum(0))
         smaller = np.maximum(np.minimum(noise.sd, residual), chain.least[0])
         noise = replace(noise, sd=np.where(np.isnan(fixed), smaller, fixed))
         noise = solvable(linear, likeliest_share(chain, linear, noise, prior, theta, tuning))
-        state = state.at(replace(state.here, phase=Phase.SMOOTH, states=states, noise=noise, movement=movement))
+        state = state.at(replace(state.here, phase=Phase.SMOOTH, noise=noise, movement=movement))
         # an optimum in case the budget ends before any step, as wide as that step is long
         value = evidence(self.problem, state.here, linear, noise, settled=False)
         optimum = optimum_at(self.problem, state, linear, noise, value, settled=False)
         away = optimum.mean - theta
-        optimum = replace(
-            optimum,
-            covariance=optimum.covariance + np.outer(away, away),
-            theta_step=state.here.theta_step,
-            state_step=state.here.state_step,
-        )
+        optimum = replace(optimum, covariance=optimum.covariance + np.outer(away, away))
         return self._with_differences(state.with_optimum(optimum), linear, noise)
 
-    def _smooth(self, state: KnownStartState) -> KnownStartState:
+    def _smooth(self, state: KnownStartState, linear: ChainLinearisation) -> KnownStartState:
         """A step of theta and all states."""
-        linear = self._linearised(state.here)
-        if linear is None:
-            return state.after_divergence(self._begin)
         return self._stepped(state, linear, solvable(linear, state.here.noise))
 
-    def _noise(self, state: KnownStartState) -> KnownStartState:
+    def _noise(self, state: KnownStartState, linear: ChainLinearisation) -> KnownStartState:
         """An estimate of the noise, which may be worth recording, and a step."""
-        linear = self._linearised(state.here)
-        if linear is None:
-            return state.after_divergence(self._begin)
         state, noise, ends = self.estimated(state, linear)
         if ends:
-            return state.next_point(self._begin)
+            return state.next_point(self.begin)
         try:
             return self._stepped(state, linear, noise)
         except BudgetExhausted:
             return state  # what was recorded is kept, and the next step ends the search
 
     # ------------------------------------------------------------------ what they are made of
-
-    def _linearised(self, here: KnownStartPosition) -> ChainLinearisation | None:
-        return linearise_widely(self.chain, here.theta, here.states, here.theta_step, here.state_step)
 
     def _stepped(self, state: KnownStartState, linear: ChainLinearisation, noise: ChainNoise) -> KnownStartState:
         """Where a step leads, and how long the differences are there."""
@@ -177,10 +158,6 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
 
     def estimated(self, state: KnownStartState, linear: ChainLinearisation) -> tuple[KnownStartState, ChainNoise, bool]:
         """Estimate the noise anew.
-
-        Args:
-            state: where the search stands.
-            linear: the linearisation there.
 
         Returns:
             The state with the noise, and with the optimum if it is worth recording; the noise that a step is made for;

@@ -25,6 +25,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.state_space.options import NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import border
 from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.noise_level import NORMAL_MAD
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import (
@@ -33,10 +34,6 @@ from sipe_bayes.likelihood.state_space.linearisation import (
     eliminate_states,
     restricted,
 )
-
-_IMPOSSIBLE = 1e300  # nats, in place of an infinity that L-BFGS does not take
-_NORMAL_MAD = 1.4826  # sds that the median of the size of a normal's draws stands for
-_REGRESSION_DAMPING = 1e-6  # jumps are all but linear in theta
 
 
 def infer_noise(
@@ -51,18 +48,8 @@ def infer_noise(
 ) -> tuple[ChainNoise, float]:
     """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten.
 
-    Args:
-        chain: the logs.
-        linear: the linearisation.
-        noise: where to begin.
-        prior: on theta.
-        theta: (N,), where the linearisation was taken.
-        movement: (D,), scales of the process noises' priors.
-        tuning: of the search.
-        held: as in ``restricted``.
-
-    Returns:
-        The noise, and the nats that it gains.
+    Begins at ``noise``; ``movement`` (D,) are the scales of the process noises' priors, ``held`` as in ``restricted``.
+    Returns the noise, and the nats that it gains.
     """
     channels, fixed = len(noise.sd), chain.fixed_sd
     hold = border(prior, theta, eliminate_states(linear, noise).gradient)
@@ -82,7 +69,7 @@ def infer_noise(
         try:
             value, by_sd, by_process = restricted(linear, tried, hold, held)
         except np.linalg.LinAlgError:  # so far apart that rounding rules
-            return _IMPOSSIBLE, np.zeros(len(logs))
+            return 1e300, np.zeros(len(logs))  # L-BFGS takes no infinity
         slope = tried.process / movement - tuning.prior_power
         return process_penalty(tried, movement, tuning) - value, np.concatenate([-by_sd, slope - by_process])[free]
 
@@ -101,45 +88,30 @@ def process_penalty(noise: ChainNoise, movement: FloatArray, tuning: NoiseTuning
 
 
 def regress(linear: ChainLinearisation, prior: QuadraticPrior, theta: FloatArray, tuning: NoiseTuning) -> FloatArray:
-    """One reweighted least-squares step of theta on the jumps, the states as they are.
+    """Theta (N,) after one reweighted least-squares step on the jumps, the states as they are.
 
     The weights are those of a Student t: contacts amplify the noise of a measurement manyfold.
-
-    Args:
-        linear: the linearisation.
-        prior: on theta.
-        theta: (N,), where it was taken.
-        tuning: with the degrees of freedom.
-
-    Returns:
-        (N,).
     """
     scale = jump_scale(linear)
     weights = linear.linked[:, None] / (scale**2 * (1 + (linear.jump / scale) ** 2 / tuning.freedom))
     slopes, hold = linear.transition_theta, border(prior, theta, np.zeros_like(theta))
     hessian = np.einsum("kdn,kd,kdm->nm", slopes, weights, slopes, optimize=True) + hold.precision
     gradient = np.einsum("kdn,kd->n", slopes, weights * linear.jump) + hold.pull
-    return np.asarray(np.clip(theta + damped_box_step(hessian, gradient, theta, _REGRESSION_DAMPING), 0.0, 1.0))
+    return np.asarray(np.clip(theta + damped_box_step(hessian, gradient, theta, damping=1e-6), 0.0, 1.0))
 
 
 def jump_scale(linear: ChainLinearisation) -> FloatArray:
     """Robust sd (D,) of the jumps, from their median size; never zero."""
-    size = _NORMAL_MAD * np.median(np.abs(linear.jump[linear.linked]), axis=0)
+    size = NORMAL_MAD * np.median(np.abs(linear.jump[linear.linked]), axis=0)
     return np.asarray(np.maximum(size, 1e-9 * max(float(size.max()), 1e-300)))
 
 
 def first_noise(chain: Chain, linear: ChainLinearisation, movement: FloatArray, tuning: NoiseTuning) -> ChainNoise:
-    """A guess from the first guess of the states.
+    """A guess from the first guess of the states; movement (D,): of each coordinate in a control step.
 
     Measurement noise: what third differences of a channel leave, at most a third of the jumps of the coordinate that it
     measures. Process noise: as large as the jumps, or where states are what the commands lead to a share of a
     coordinate's movement.
-
-    Args:
-        chain: the logs.
-        linear: the linearisation at the guess.
-        movement: (D,), of each coordinate in a control step.
-        tuning: with the share.
     """
     jumps, fixed = jump_scale(linear), chain.fixed_sd
     least_sd, least_process = chain.least
@@ -159,13 +131,7 @@ def likeliest_share(
 ) -> ChainNoise:
     """The noise with its process noise as small as the likelihood of one linearisation likes best.
 
-    Args:
-        chain: the logs.
-        linear: the linearisation.
-        noise: whose process noise is the largest tried.
-        prior: on theta.
-        theta: (N,), where the linearisation was taken.
-        tuning: with the number of shares, each a tenth of the one before.
+    Tried are the given one and shares of it, each a tenth of the one before.
     """
     shares = [10.0**-k for k in range(tuning.shares)]
     tried = [ChainNoise(noise.sd, np.maximum(share * noise.process, chain.least[1])) for share in shares]
@@ -191,6 +157,6 @@ def roughness(chain: Chain) -> FloatArray:
     for c, values in enumerate(third.T):
         sizes = np.abs(values[np.isfinite(values)])
         if len(sizes):
-            sd[c] = _NORMAL_MAD * np.median(sizes) / np.sqrt(20)  # 1 + 9 + 9 + 1
+            sd[c] = NORMAL_MAD * np.median(sizes) / np.sqrt(20)  # 1 + 9 + 9 + 1
     spread = np.nanstd(series, axis=0)
     return np.where(np.isfinite(sd), sd, np.where(spread > 0, spread, 1.0))

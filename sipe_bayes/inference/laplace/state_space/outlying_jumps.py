@@ -48,20 +48,7 @@ def needed(
     theta: FloatArray,
     tuning: OutlierTuning,
 ) -> BoolArray:
-    """Of the outliers those that have to be.
-
-    The others are made regular one by one, first the one that gains most.
-
-    Args:
-        linear: the linearisation.
-        noise: with the outliers.
-        prior: on theta.
-        theta: (N,), where the linearisation was taken.
-        tuning: with how rare they are.
-
-    Returns:
-        (K-1,).
-    """
+    """Of the outliers (K-1,) those that have to be: the others are made regular, first the one that gains most."""
     outliers = np.zeros(len(linear.linked), bool) if noise.outliers is None else noise.outliers.copy()
     while outliers.any():
         gains = regular_gains(linear, solvable(linear, replace(noise, outliers=outliers)), prior, theta, tuning)
@@ -79,20 +66,10 @@ def regular_gains(
     theta: FloatArray,
     tuning: OutlierTuning,
 ) -> FloatArray:
-    """Nats of evidence that each outlier gains when made regular, exact for one linearisation.
+    """Nats (J,) of evidence that each of J outliers gains when made regular, exact for one linearisation.
 
     This is the Savage-Dickey ratio of what all else says of it (J. M. Dickey, "The weighted likelihood ratio, linear
     hypotheses on normal location parameters", 1971, https://doi.org/10.1214/aoms/1177693507).
-
-    Args:
-        linear: the linearisation.
-        noise: with J outliers.
-        prior: on theta.
-        theta: (N,), where the linearisation was taken.
-        tuning: with how rare they are.
-
-    Returns:
-        (J,).
     """
     assert noise.outliers is not None
     narrow, wide = noise.process, noise.outlier_sd

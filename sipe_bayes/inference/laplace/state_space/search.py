@@ -86,13 +86,13 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
 
     def start(self) -> StateSpaceState:
         """The first state: at the first starting point."""
-        chain, initial = self.chain, self.problem.initial
+        chain, initial = self.chain, self.problem.options.initial
         chain.rollouts += chain.setup_rollouts
         points = screened(self.problem, chain) if initial is None else initial
         none = np.empty((0, chain.num_theta))
-        return StateSpaceState(points, 0, self._begin(points[0]), chain.uncounted, regressed=none)
+        return StateSpaceState(points, 0, self.begin(points[0]), uncounted=chain.uncounted, regressed=none)
 
-    def phases(self) -> dict[Phase, Callable[[StateSpaceState], StateSpaceState]]:
+    def phases(self) -> dict[Phase, Callable[[StateSpaceState, ChainLinearisation], StateSpaceState]]:
         """A function for each phase."""
         return {
             Phase.REGRESS: self._regress,
@@ -101,7 +101,11 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
             Phase.NOISE: self._noise,
         }
 
-    def _begin(self, theta: FloatArray) -> SmoothingPosition:
+    def linearised(self, here: SmoothingPosition) -> ChainLinearisation | None:
+        """By short differences, by theta alone for the regression."""
+        return linearise(self.chain, here.theta, here.states, with_states=here.phase is not Phase.REGRESS)
+
+    def begin(self, theta: FloatArray) -> SmoothingPosition:
         """At a starting point (N,)."""
         chain = self.chain
         phase, ones = Phase.REGRESS if chain.determined.all() else Phase.FOLLOW, np.ones(chain.num_start)
@@ -110,44 +114,34 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
 
     # ------------------------------------------------------------------ phases
 
-    def _regress(self, state: StateSpaceState) -> StateSpaceState:
+    def _regress(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """A step of the regression; at its end a first guess of the noise."""
         chain, here, tuning = self.chain, state.here, self.tuning.smoothing
-        linear = linearise(chain, here.theta, here.states, with_states=False)
-        if linear is None:
-            return state.after_divergence(self._begin)
         theta = regress(linear, self.problem.quadratic_prior, here.theta, self.tuning.noise)
         still = np.abs(theta - here.theta).max() < tuning.still or here.iteration + 1 >= tuning.most_regressions
         here = replace(here, theta=theta, iteration=here.iteration + 1)
         if not still:
             return state.at(here)
         if any(np.abs(theta - earlier).max() < tuning.same for earlier in state.regressed):
-            return state.next_point(self._begin)
+            return state.next_point(self.begin)
         movement = chain.movement(here.states)
         noise = self._guessed(first_noise(chain, linear, movement, self.tuning.noise), movement)
         here = replace(here, phase=Phase.SMOOTH, noise=noise, movement=movement)
         return replace(state, here=here, regressed=np.concatenate([state.regressed, theta[None]]))
 
-    def _follow(self, state: StateSpaceState) -> StateSpaceState:
+    def _follow(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """The filter's states, about those that the commands lead to."""
         chain, theta, prior = self.chain, state.here.theta, self.problem.quadratic_prior
-        states = chain.predicted(theta)
-        states = state.here.states if states is None else states
-        linear = linearise(chain, theta, states)
-        if linear is None:
-            return state.after_divergence(self._begin)
-        movement, tuning = chain.movement(states), self.tuning.noise
+        states, tuning = state.here.states, self.tuning.noise
+        movement = chain.movement(states)
         noise = first_noise(chain, linear, movement, tuning)
         noise = solvable(linear, likeliest_share(chain, linear, noise, prior, theta, tuning))
         better = filtered(chain, linear, noise, theta, states, self.tuning.smoothing)
         states, noise = states if better is None else better, self._guessed(noise, movement)
         return state.at(replace(state.here, phase=Phase.SMOOTH, states=states, noise=noise, movement=movement))
 
-    def _smooth(self, state: StateSpaceState) -> StateSpaceState:
+    def _smooth(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """A step of theta and all states; where none gains anything, an estimate of the noise at once."""
-        linear = linearise(self.chain, state.here.theta, state.here.states)
-        if linear is None:
-            return state.after_divergence(self._begin)
         tuning, here = self.tuning.smoothing, replace(state.here, iteration=state.here.iteration + 1)
         here = replace(here, steps=here.steps + 1)
         prior, tolerance = self.problem.quadratic_prior, tuning.tolerance
@@ -158,11 +152,8 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         phase = Phase.NOISE if here.steps >= most else Phase.SMOOTH
         return state.at(replace(here, phase=phase, theta=point.theta, states=point.states, damping=fit.damping))
 
-    def _noise(self, state: StateSpaceState) -> StateSpaceState:
+    def _noise(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """An estimate of the noise, and a step."""
-        linear = linearise(self.chain, state.here.theta, state.here.states)
-        if linear is None:
-            return state.after_divergence(self._begin)
         here = replace(state.here, iteration=state.here.iteration + 1, steps=state.here.steps + 1)
         return self._estimated(state.at(here), linear, still=False)
 
@@ -239,7 +230,7 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
                 return state.at(replace(here, phase=Phase.SMOOTH, steps=0))
         value = evidence(self.problem, here, linear, noise, settled)
         if value <= worthwhile:
-            return state.next_point(self._begin)
+            return state.next_point(self.begin)
         state = state.at(here)
         state = state.with_optimum(optimum_at(self.problem, state, linear, noise, value, settled))
         # then from the optimum: without any outlier, or with those that stand out now
@@ -247,13 +238,13 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         if outliers.any():
             other = self._without_outliers(here, linear, noise)
             if other is None or other[1] <= value + tuning.smoothing.settled:
-                return state.next_point(self._begin)
+                return state.next_point(self.begin)
             end, _ = other
             again = replace(again, theta=end.point.theta, states=end.point.states, damping=end.damping)
             return state.at(replace(again, noise=replace(here.noise, outliers=np.zeros_like(outliers))))
         proposed = self._candidates(here, linear, noise)
         if not proposed.any():
-            return state.next_point(self._begin)
+            return state.next_point(self.begin)
         noise = replace(here.noise, outliers=proposed)
         return state.at(replace(again, noise=noise, proposals=here.proposals + 1))
 

@@ -20,8 +20,6 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, energy
 
-_LARGER = 3.0  # factor by which process noise grows until rounding leaves the equations positive definite
-
 
 @dataclass(frozen=True)
 class ChainPoint:
@@ -85,20 +83,10 @@ def smooth(
     tolerance: float,
     tuning: ChainTuning,
 ) -> tuple[ChainPoint, Descent[ChainPoint]]:
-    """The first of ever shorter damped steps that lowers the energy.
+    """The first of ever shorter damped steps from a point, at which ``linear`` was taken, that lowers the energy.
 
-    Args:
-        chain: the logs.
-        linear: the linearisation at the point.
-        noise: of measurements and jumps.
-        prior: on theta.
-        point: where to begin.
-        damping: of the first step tried.
-        tolerance: nats that a step must promise.
-        tuning: with the rule of the damping.
-
-    Returns:
-        Where it led, or the point itself; and how it went: ``point`` is None there where no step was taken.
+    damping: of the first step tried; tolerance: nats that a step must promise. Returns where it led, or the point
+    itself; and how it went: ``point`` is None there where no step was taken.
     """
     step = descend(LinearisedChain(chain, linear, noise, prior, point), damping, tolerance, tuning.damping)
     return point if step.point is None else step.point, step
@@ -110,6 +98,6 @@ def solvable(linear: ChainLinearisation, noise: ChainNoise) -> ChainNoise:
         try:
             eliminate_states(linear, noise)
         except np.linalg.LinAlgError:
-            noise = replace(noise, process=_LARGER * noise.process)
+            noise = replace(noise, process=3.0 * noise.process)
         else:
             return noise

@@ -17,7 +17,7 @@ from sipe_bayes.inference.laplace.state_space.noise import jump_scale, process_p
 from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import rarity
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, border, penalty
-from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, StrategyState
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare
 from sipe_bayes.likelihood.state_space.linearisation import (
@@ -117,58 +117,23 @@ P = TypeVar("P", bound=Position)
 
 
 @dataclass(frozen=True)
-class ChainState(Generic[P]):
-    """A search over a chain of states.
+class ChainState(StrategyState[P]):
+    """A search over a chain of states; ``uncounted``: part of a rollout that is not counted yet."""
 
-    Args:
-        points: (R, N), starting points.
-        point: which of them is followed.
-        here: where that stands.
-        uncounted: part of a rollout, not counted yet.
-        optima: those recorded, one of a starting point.
-        done: whether the last point has been followed to its end.
-    """
-
-    points: FloatArray
-    point: int
-    here: P
-    uncounted: float
     optima: tuple[ChainOptimum, ...] = ()
-    done: bool = False
-
-    def describe(self) -> str:
-        """Starting point and step."""
-        return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
+    uncounted: float = 0.0
 
     @property
     def best_evidence(self) -> float:
         """Of this starting point's optimum; minus infinity before there is one."""
         return max((one.evidence for one in self.optima if one.point == self.point), default=-np.inf)
 
-    def at(self, here: P) -> Self:
-        """The search at another position."""
-        return replace(self, here=here)
-
     def with_optimum(self, optimum: ChainOptimum) -> Self:
         """With an optimum in place of this starting point's earlier one."""
         return replace(self, optima=(*(one for one in self.optima if one.point != self.point), optimum))
 
-    def next_point(self, begin: Callable[[FloatArray], P]) -> Self:
-        """Turn to the next starting point, or end.
-
-        Args:
-            begin: the position at a starting point (N,).
-        """
-        point = self.point + 1
-        if point >= len(self.points):
-            return replace(self, done=True)
-        return replace(self, point=point, here=begin(self.points[point]))
-
     def after_divergence(self, begin: Callable[[FloatArray], P]) -> Self:
         """Turn to the next starting point after a linearisation that diverged.
-
-        Args:
-            begin: the position at a starting point (N,).
 
         Raises:
             ValueError: where none is left and no optimum was found.
@@ -202,20 +167,28 @@ class ChainSearch(Generic[S]):
         return self.problem.options.tuning.state_space
 
     @abstractmethod
-    def phases(self) -> dict[Phase, Callable[[S], S]]:
-        """What a step does in each phase."""
+    def phases(self) -> dict[Phase, Callable[[S, ChainLinearisation], S]]:
+        """What a step does in each phase with the linearisation where the search stands."""
+
+    @abstractmethod
+    def begin(self, theta: FloatArray) -> Any:
+        """The position at a starting point (N,)."""
+
+    @abstractmethod
+    def linearised(self, here: Any) -> ChainLinearisation | None:
+        """The linearisation that a step needs at a position; None where it diverges."""
 
     def step(self, state: S) -> S:
         """One linearisation and what follows from it; what it does is the phase's.
 
-        Args:
-            state: where the search stands.
-
         Raises:
             BudgetExhausted: the state that went in is kept.
         """
-        self.chain.uncounted = state.uncounted
-        after = self.phases()[state.here.phase](state)
+        self.chain.uncounted, here = state.uncounted, state.here
+        states = self.chain.predicted(here.theta) if here.phase is Phase.FOLLOW else None
+        state = state if states is None else state.at(replace(here, states=states))
+        linear = self.linearised(state.here)
+        after = state.after_divergence(self.begin) if linear is None else self.phases()[here.phase](state, linear)
         return replace(after, uncounted=self.chain.uncounted)
 
 
@@ -226,14 +199,9 @@ def unknown_noise(chain: Chain) -> ChainNoise:
 
 
 def screened(problem: SearchProblem, chain: Chain) -> FloatArray:
-    """Starting points: the model as given and the best of a few draws from the prior.
+    """Starting points (R, N): the model as given and the best of a few draws from the prior.
 
-    Args:
-        problem: prior, seed, and how many.
-        chain: the logs; what counts are the jumps that a point leaves between states as measured.
-
-    Returns:
-        (R, N).
+    What counts are the jumps that a point leaves between states as measured.
 
     Raises:
         ValueError: where all diverge.
@@ -261,12 +229,7 @@ def evidence(
 ) -> float:
     """Evidence log p(noise | y), states and theta integrated out, up to a constant.
 
-    Args:
-        problem: with the prior.
-        here: where the linearisation was taken.
-        linear: the linearisation.
-        noise: of measurements and jumps.
-        settled: else it lacks what the next step would gain, were the model linear.
+    Unless ``settled`` it lacks what the next step would gain, were the model linear.
     """
     prior, tuning = problem.quadratic_prior, problem.options.tuning.state_space
     hold = border(prior, here.theta, eliminate_states(linear, noise).gradient)
@@ -283,15 +246,9 @@ def optimum_at(
     value: float,
     settled: bool,
 ) -> ChainOptimum:
-    """The optimum at its linearisation, its normal about the best step from there.
+    """The optimum at its linearisation by short differences, its normal about the best step from there.
 
-    Args:
-        problem: with the prior.
-        state: where the search stands.
-        linear: the linearisation there, by short differences.
-        noise: of measurements and jumps.
-        value: the evidence.
-        settled: whether the noise has.
+    value: the evidence; settled: whether the noise has.
     """
     here, solved = state.here, eliminate_states(linear, noise)
     mean, covariance = problem.normal(here.theta, solved.precision, solved.gradient)

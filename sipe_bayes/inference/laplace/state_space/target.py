@@ -39,10 +39,6 @@ class ChainFit:
     def at(cls, chain: Chain, optimum: ChainOptimum) -> ChainFit:
         """Linearise at an optimum, by differences as long as the fit took them.
 
-        Args:
-            chain: the logs.
-            optimum: of the fit.
-
         Raises:
             ValueError: where the simulation diverges there.
         """
