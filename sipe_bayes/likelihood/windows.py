@@ -36,11 +36,7 @@ START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
 def chosen_channels(
     simulator: Simulator | CallableSimulator, trajectories: Trajectories, fit: tuple[str, ...] | None
 ) -> list[int]:
-    """Which channels ``fit`` names, default all.
-
-    Raises:
-        ValueError: for unknown ones and for trajectories of other sizes.
-    """
+    """Which channels ``fit`` names, default all; raises ValueError for unknown ones and other sizes."""
     environment = simulator.environment
     if trajectories.observations.shape[2] != len(environment.channels):
         raise ValueError(

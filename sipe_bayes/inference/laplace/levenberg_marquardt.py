@@ -38,12 +38,7 @@ class DampingRule(Options):
     least_refused: float = option(0.0, "damping before it grows, at least", least=0)
 
     def after(self, damping: float, lowered: bool) -> float:
-        """Damping of the next step.
-
-        Args:
-            damping: of this step.
-            lowered: whether it lowered the energy.
-        """
+        """The damping of the next step, after one that ``lowered`` the energy or did not."""
         if lowered:
             return max(self.least, damping * self.shrink)
         return max(damping, self.least_refused) * self.grow

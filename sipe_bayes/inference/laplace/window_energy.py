@@ -34,13 +34,7 @@ class WindowPoint:
 
 @dataclass(frozen=True)
 class WindowEnergy:
-    """The energy for one noise.
-
-    Args:
-        windows: the logs.
-        noise: of the residuals.
-        prior: on theta.
-    """
+    """The energy of theta and the starts for one noise of the residuals."""
 
     windows: Windows
     noise: Noise
@@ -57,13 +51,7 @@ class WindowEnergy:
 
 
 class LinearisedWindows:
-    """A ``levenberg_marquardt.LinearisedEnergy`` of windows.
-
-    Args:
-        of: the energy.
-        point: where it is known.
-        moments: of the linearisation there, or at an earlier point.
-    """
+    """A ``LinearisedEnergy`` of windows; ``moments`` are of the linearisation at the point, or at an earlier one."""
 
     def __init__(self, of: WindowEnergy, point: WindowPoint, moments: Moments) -> None:
         self.of, self.point, self.moments = of, point, moments

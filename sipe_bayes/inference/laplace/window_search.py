@@ -89,12 +89,7 @@ class Step:
 
 @dataclass(frozen=True)
 class WindowSearch:
-    """The ``Strategy`` for windows of the logs.
-
-    Args:
-        problem: prior, starting points, options.
-        windows: the logs.
-    """
+    """The ``Strategy`` for windows of the logs."""
 
     problem: SearchProblem
     windows: Windows

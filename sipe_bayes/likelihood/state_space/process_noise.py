@@ -15,16 +15,10 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 def process_noise_findings(
     chain: Chain, process: FloatArray, movement: FloatArray, outliers: Sequence[int] | IntArray = ()
 ) -> list[Finding]:
-    """Hold the process noise against how far states move in a control step.
+    """Hold the process noise (D,) against how far each coordinate moves in a control step (D,).
 
-    Args:
-        chain: the logs.
-        process: (D,), sd of the process noise.
-        movement: (D,), of each coordinate in a control step.
-        outliers: after which of the chain's states a jump is an outlier.
-
-    Returns:
-        Where process noise is largest, which steps stand out, and whether the model follows the logs.
+    Says where process noise is largest, which steps stand out (``outliers``: after which of the chain's states), and
+    whether the model follows the logs.
     """
     share = np.where(chain.irrelevant, 0.0, process / movement)
     worst = int(share.argmax())

@@ -42,15 +42,7 @@ def border(prior: QuadraticPrior, theta: FloatArray, gradient: FloatArray) -> Bo
 
 
 class LinearisedChain:
-    """A ``levenberg_marquardt.LinearisedEnergy`` of a chain of states.
-
-    Args:
-        chain: the logs.
-        linear: the linearisation at the point.
-        noise: of measurements and jumps.
-        prior: on theta.
-        point: where it was taken.
-    """
+    """A ``levenberg_marquardt.LinearisedEnergy`` of a chain of states, with its linearisation ``linear`` at a point."""
 
     def __init__(
         self, chain: Chain, linear: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, point: ChainPoint

@@ -151,12 +151,7 @@ S = TypeVar("S", bound="ChainState[Any]")
 
 @dataclass(frozen=True)
 class ChainSearch(Generic[S]):
-    """What both searches over a chain of states are.
-
-    Args:
-        problem: prior, starting points, options.
-        chain: the logs.
-    """
+    """What both searches over a chain of states are."""
 
     problem: SearchProblem
     chain: Chain
