@@ -29,7 +29,8 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import to_json, write_text
-from sipe_bayes.report.drawing import CHAINS, new_figure, styled
+from sipe_bayes.report.colours import CHAINS
+from sipe_bayes.report.drawing import new_figure, styled
 from sipe_bayes.report.show import save_figure
 from sipe_bayes.rl.evaluation import STARTS, evaluate
 from sipe_bayes.rl.settings import Settings

@@ -95,7 +95,8 @@ def draw(found: list[dict[str, Any]], posterior: sipe.Posterior) -> bytes:
     """Left: the posterior's mass and length. Middle: returns in the target along the training. Right: at the end."""
     from matplotlib.figure import Figure
 
-    from sipe_bayes.report.drawing import CHAINS, DEFAULT, MEASURED, PRIOR, png
+    from sipe_bayes.report.colours import CHAINS, DEFAULT, MEASURED, PRIOR
+    from sipe_bayes.report.drawing import png
 
     colours = dict(zip(NAMES, (MEASURED, CHAINS[0], CHAINS[1], PRIOR, DEFAULT), strict=True))
     figure = Figure(figsize=(9.6, 3.2), layout="constrained")

@@ -51,12 +51,7 @@ class _Blocks(Cache):
     """A cache whose blocks are made in any order."""
 
     def block(self, number: int, rows: int) -> Simulations:
-        """The first rows of a block, read or made.
-
-        Args:
-            number: of the block.
-            rows: how many.
-        """
+        """The first rows of a block, read or made."""
         self._blocks = [self._none()] * number
         self._blocks.append(self._read(number) or self._none())
         made = self._blocks[number]
@@ -76,21 +71,12 @@ def _opened(bank: Bank, folder: Path) -> _Blocks:
 
 
 def place(bank: Bank, folder: Path) -> Path:
-    """Where the blocks of a bank lie; its log is made to know that.
-
-    Args:
-        bank: which.
-        folder: of results.
-    """
+    """Where the blocks of a bank lie; its log is made to know that."""
     return folder / FOLDER / _opened(bank, folder / FOLDER).key
 
 
 def known_place(bank: Bank, folder: Path) -> Path | None:
     """Where they lie as far as the shards that are there tell.
-
-    Args:
-        bank: which.
-        folder: of results.
 
     Returns:
         None where there are none, or those of several logs.
@@ -152,12 +138,7 @@ def _simulate(bank: Bank, blocks: list[tuple[int, int]]) -> Done:
 
 
 def cost(folder: Path, key: str) -> float:
-    """CPU seconds that a bank took, as far as its shards are there.
-
-    Args:
-        folder: of all banks.
-        key: the bank's name.
-    """
+    """CPU seconds that a bank took, as far as its shards are there."""
     return float(
         sum(json.loads(p.read_text(encoding="utf-8"))["cpu_seconds"] for p in (folder / key).glob("shard-*.json"))
     )

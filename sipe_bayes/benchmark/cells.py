@@ -36,6 +36,7 @@ import fnmatch
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from sipe_bayes.datasets.acting import Split
 from sipe_bayes.datasets.demonstrations import default_steps
@@ -197,6 +198,12 @@ def referenced(cells: Iterable[Cell]) -> Iterator[Cell]:
     yield from own
 
 
+def of_setting(tasks: Iterable[str], estimators: Iterable[str], setting: str = "policy") -> Iterator[Cell]:
+    """Cells of a setting, in distribution; with "policy" those in which an agent is trained meanwhile."""
+    for task, seed, estimator in itertools.product(tasks, SIZES.seeds, list(estimators)):
+        yield Cell(task, estimator, setting, seed=seed)
+
+
 def learned(tasks: Iterable[str], estimators: Iterable[str], setting: str = "learned_reward") -> Iterator[Cell]:
     """Cells of those estimators that can learn a reward.
 
@@ -206,8 +213,7 @@ def learned(tasks: Iterable[str], estimators: Iterable[str], setting: str = "lea
         setting: with a policy or without.
     """
     chosen = [name for name in estimators if "reward" in arguments(name)]
-    for task, seed, estimator in itertools.product(tasks, SIZES.seeds, chosen):
-        yield Cell(task, estimator, setting, seed=seed)
+    return of_setting(tasks, chosen, setting)
 
 
 def gradient_steps(tasks: Iterable[str]) -> Iterator[Cell]:
@@ -215,17 +221,6 @@ def gradient_steps(tasks: Iterable[str]) -> Iterator[Cell]:
     chosen = [name for name in ESTIMATORS if "gradient_steps" in arguments(name)]
     for task, seed, estimator, steps in itertools.product(tasks, SIZES.seeds, chosen, SIZES.gradient_steps):
         yield Cell(task, estimator, "gradient_steps", seed=seed, values=(("gradient_steps", steps),))
-
-
-def policy(tasks: Iterable[str], estimators: Iterable[str]) -> Iterator[Cell]:
-    """Cells in which an agent is trained meanwhile.
-
-    Args:
-        tasks: which environments.
-        estimators: which methods.
-    """
-    for task, seed, estimator in itertools.product(tasks, SIZES.seeds, list(estimators)):
-        yield Cell(task, estimator, "policy", seed=seed)
 
 
 def sweep() -> Iterator[Cell]:
@@ -261,7 +256,7 @@ def _paper() -> Iterator[Cell]:
 
 
 def _policy_suite() -> Iterator[Cell]:
-    yield from policy(_WITH_POLICY, ("regression", "bayesopt", "maml", "simopt", "adr"))
+    yield from of_setting(_WITH_POLICY, ("regression", "bayesopt", "maml", "simopt", "adr"))
     yield from learned(_WITH_POLICY, ("simopt", "adr"), "policy_learned_reward")
 
 
@@ -269,7 +264,7 @@ def _all() -> Iterator[Cell]:
     yield from direct(TASKS, (*BASELINES, *ESTIMATORS), VARIANTS)
     yield from learned(TASKS, ESTIMATORS)
     yield from gradient_steps(TASKS)
-    yield from policy(TASKS, ESTIMATORS)
+    yield from of_setting(TASKS, ESTIMATORS)
     yield from learned(TASKS, ESTIMATORS, "policy_learned_reward")
     yield from rollouts()
     yield from sweep()
@@ -299,10 +294,6 @@ SUITES = {
 
 def suite(name: str, suites: Mapping[str, Suite] = SUITES) -> list[Cell]:
     """The cells of a suite.
-
-    Args:
-        name: of the suite.
-        suites: those there are.
 
     Raises:
         ValueError: for an unknown one.
@@ -347,12 +338,7 @@ def matching(cells: list[Cell], patterns: Sequence[str], no_match: Callable[[str
 
 
 def matches(cell_id: str, pattern: str) -> bool:
-    """Whether a cell's id matches a pattern of ``select``.
-
-    Args:
-        cell_id: the id.
-        pattern: the pattern.
-    """
+    """Whether a cell's id matches a pattern of ``select``."""
     plain, wanted = _plain(cell_id), _plain(pattern).rstrip("/")
     return fnmatch.fnmatchcase(plain, wanted) or fnmatch.fnmatchcase(plain, wanted + "/*")
 
@@ -368,15 +354,9 @@ def changed(
         steps: control steps of the trajectory.
         training: control steps of the agent's training.
     """
-    return [
-        replace(
-            cell,
-            budget=cell.budget if budget is None else budget,
-            steps=cell.steps if steps is None else steps,
-            training=cell.training if training is None else training,
-        )
-        for cell in cells
-    ]
+    asked = {"budget": budget, "steps": steps, "training": training}
+    given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+    return [replace(cell, **given) for cell in cells]
 
 
 def _plain(text: str) -> str:

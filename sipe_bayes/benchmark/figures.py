@@ -22,24 +22,10 @@ from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
 from sipe_bayes.benchmark.records import Record
 from sipe_bayes.benchmark.tables import order_estimators, order_tasks
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.report.drawing import (
-    CHAINS,
-    DASHED,
-    DOTTED,
-    MARKERS,
-    MEASURED,
-    POSTERIOR,
-    PRIOR,
-    STYLE,
-    legend_above,
-    line_handle,
-    new_figure,
-    panel_grid,
-    shade_handle,
-    shortened,
-    styled,
-    ticks,
-)
+from sipe_bayes.report.colours import DASHED, DOTTED, MEASURED, POSTERIOR, PRIOR, STYLE
+from sipe_bayes.report.drawing import new_figure, outer_labels, panel_grid, styled, ticks
+from sipe_bayes.report.legends import legend_above, line_handle, look, shade_handle
+from sipe_bayes.report.words import shortened
 
 Points = Mapping[float, Sequence[float]]
 """x -> a score of each seed."""
@@ -51,9 +37,6 @@ def error_per_parameter(records: Sequence[Record]) -> Figure:
     """One row per estimator, one column per parameter of the task: |mean - truth| of each seed, their mean as a bar.
 
     The prior mean's error is drawn as dashed steps; parameters that no log determines stand on grey.
-
-    Args:
-        records: of one task, setting and variant.
 
     Raises:
         ValueError: for others.
@@ -83,9 +66,6 @@ def posterior_against_truth(records: Sequence[Record]) -> Figure:
     """One row per estimator, one column per parameter of the task: mean and sd of each seed's posterior, and the truth.
 
     All in theta; the band is the prior's.
-
-    Args:
-        records: of one task, setting and variant.
 
     Raises:
         ValueError: for others.
@@ -181,9 +161,6 @@ def accuracy_against_rollouts(records: Sequence[Record]) -> Figure:
     Where cells with other budgets were run, a point is a whole run with that budget, else what the estimator knew on
     the way, or at its end alone.
 
-    Args:
-        records: of all estimators.
-
     Raises:
         ValueError: without a finished run.
     """
@@ -267,7 +244,7 @@ def _panels(
         raise ValueError("records: no finished run to draw; run some cells")
     names = order_estimators({name for of_task in curves.values() for name in of_task})
     figure, axes, columns = panel_grid(len(curves), 2.3, 0.3 + 0.2 * -(-len(names) // 6))
-    for k, (ax, (task, of_task)) in enumerate(zip(axes, curves.items(), strict=True)):
+    for ax, (task, of_task) in zip(axes, curves.items(), strict=True):
         for name, points in of_task.items():
             _curve(ax, points, names.index(name))
         for level in levels.values():
@@ -280,10 +257,7 @@ def _panels(
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         ticks(ax.yaxis, 5)
         ax.set_title(task, fontweight="bold")
-        if k % columns == 0:
-            ax.set_ylabel("mean accuracy")
-        if k + columns >= len(curves):
-            ax.set_xlabel(xlabel)
+    outer_labels(axes, columns, xlabel, "mean accuracy")
     across = [line_handle(_ACROSS, name, level.line) for name, level in levels.items()]
     legend_above(figure, [*(_handle(n, k) for k, n in enumerate(names)), *across], 6)
     return figure
@@ -291,7 +265,7 @@ def _panels(
 
 def _curve(ax: Axes, points: Points, index: int) -> None:
     x = np.array(sorted(points))
-    mean, (colour, line, marker) = [np.mean(points[at]) for at in x], _look(index)
+    mean, (colour, line, marker) = [np.mean(points[at]) for at in x], look(index)
     every = max(1, len(x) // 6)
     ax.plot(x, mean, ms=4, lw=STYLE.curve, color=colour, ls=line, marker=marker, markevery=every)
     if any(len(points[at]) > 1 for at in x):
@@ -302,12 +276,6 @@ def _curve(ax: Axes, points: Points, index: int) -> None:
             ax.vlines(x, low, high, color=colour, lw=1)
 
 
-def _look(index: int) -> tuple[str, LineStyleType, str]:
-    """Colour, line and marker of the estimator with this place in the order."""
-    line: LineStyleType = "-" if index // len(CHAINS) % 2 == 0 else (0, (4, 1.5))
-    return CHAINS[index % len(CHAINS)], line, MARKERS[index % len(MARKERS)]
-
-
 def _handle(label: str, index: int) -> Line2D:
-    colour, line, marker = _look(index)
+    colour, line, marker = look(index)
     return line_handle(colour, label, line, lw=STYLE.curve, marker=marker, ms=4)

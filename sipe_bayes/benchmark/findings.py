@@ -34,10 +34,6 @@ from sipe_bayes.inference.registry import arguments
 def facts(records: Sequence[Record], runs: Sequence[Run]) -> list[tuple[str, str]]:
     """What was run, on what, in how much time.
 
-    Args:
-        records: of a folder.
-        runs: that made them.
-
     Returns:
         Labels and texts.
     """

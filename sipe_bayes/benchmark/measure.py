@@ -199,10 +199,6 @@ def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Estimate:
 def netcdf(posterior: Posterior, seed: int) -> bytes:
     """A posterior's netCDF.
 
-    Args:
-        posterior: what is written.
-        seed: of its draws.
-
     Returns:
         The file's bytes, the same for the same posterior.
     """

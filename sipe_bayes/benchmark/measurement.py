@@ -42,12 +42,7 @@ class Measurement(ABC, Generic[R]):
 
     @abstractmethod
     def blank(self, cell: Cell, command: str = "") -> R:
-        """A cell's record before it is measured.
-
-        Args:
-            cell: which.
-            command: that asked for it.
-        """
+        """A cell's record before it is measured."""
 
     @abstractmethod
     def measured(self, cell: Cell, record: R, folder: Path) -> tuple[R, Files, str]:
@@ -106,12 +101,7 @@ class Measurement(ABC, Generic[R]):
 
 
 def entries(cell: Cell, command: str) -> dict[str, object]:
-    """What every record says of its cell.
-
-    Args:
-        cell: which.
-        command: that asked for it.
-    """
+    """What every record says of its cell."""
     return {
         "id": cell.id,
         "task": cell.task,

@@ -153,9 +153,6 @@ class Record:
     def read(cls, path: Path) -> Self:
         """A record of this kind.
 
-        Args:
-            path: its file.
-
         Raises:
             RecordError: for a file that is no such record.
         """
@@ -179,9 +176,6 @@ class Record:
     @classmethod
     def all_in(cls, folder: Path) -> list[Self]:
         """All of this kind in a folder of results, by id.
-
-        Args:
-            folder: of results.
 
         Raises:
             RecordError: where there is none, or one cannot be read.
@@ -305,11 +299,6 @@ def planned(folder: Path) -> list[str]:
 
 
 def plan(folder: Path, cells: Sequence[str]) -> None:
-    """Add cells to those that were asked for.
-
-    Args:
-        folder: of results.
-        cells: their ids.
-    """
+    """Add cells to those that were asked for."""
     every = list(dict.fromkeys([*planned(folder), *cells]))
     write_text(folder / PLAN, to_json({"cells": every}, indent=0) + "\n")

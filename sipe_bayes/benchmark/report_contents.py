@@ -154,9 +154,6 @@ class Contents:
 def contents(folder: Path) -> Contents:
     """Everything a report shows of a folder of results.
 
-    Args:
-        folder: of results.
-
     Raises:
         RecordError: for one without records.
     """

@@ -5,12 +5,10 @@ The script on the page does nothing but sort; without it every number is still t
 
 from __future__ import annotations
 
-import base64
-
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents
 from sipe_bayes.benchmark.tables import Table
-from sipe_bayes.report.drawing import png
+from sipe_bayes.report.drawing import inside_page, png
 from sipe_bayes.report.sipe_plot import two_lines
 from sipe_bayes.report.templates import html_templates
 
@@ -25,7 +23,7 @@ def render(contents: Contents) -> str:
         capitalize_first=lambda text: text[:1].upper() + text[1:],
     )
     pictures = [p for section in contents.sections for p in (*section.pictures, *section.in_depth)]
-    sources = {p.name: f"data:image/png;base64,{base64.b64encode(png(p.figure)).decode()}" for p in pictures}
+    sources = {p.name: inside_page(png(p.figure)) for p in pictures}
     return environment.get_template("report.html.j2").render(contents=contents, sources=sources, baselines=BASELINES)
 
 

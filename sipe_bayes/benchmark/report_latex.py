@@ -62,12 +62,7 @@ def render(contents: Contents) -> str:
 
 
 def parts(table: Table, columns: int = 5) -> Iterator[Table]:
-    """The table in parts that fit on A4.
-
-    Args:
-        table: of all columns.
-        columns: side by side, at most.
-    """
+    """The table in parts that fit on A4."""
     return (table.part(part) for part in equal_parts(range(len(table.columns)), columns))
 
 
@@ -102,10 +97,6 @@ def pdf(picture: Picture) -> bytes:
 
 def write_reports(contents: Contents, out: Path) -> tuple[list[Path], str]:
     """Write ``report.html``, ``report.tex`` with ``figures/``, and ``report.pdf``; all is drawn first.
-
-    Args:
-        contents: what they say.
-        out: the folder.
 
     Returns:
         Their paths, and why there is no PDF, if there is none.

@@ -115,12 +115,7 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def write_runs(folder: Path, runs: Sequence[Run]) -> None:
-    """Keep what each run took.
-
-    Args:
-        folder: of results.
-        runs: all of them.
-    """
+    """Keep what each run took."""
     write_text(folder / RUNS, to_json({"runs": [asdict(run) for run in runs]}, indent=0) + "\n")
 
 

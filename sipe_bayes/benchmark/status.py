@@ -36,12 +36,7 @@ class Summary(Progress):
         return {**asdict(self), "runs": [{**asdict(run), **asdict(Usage.of([run]))} for run in self.runs]}
 
     def lines(self, named: int = 20, latest: int = 3) -> list[str]:
-        """To be read.
-
-        Args:
-            named: missing cells that are listed.
-            latest: runs that are shown.
-        """
+        """To be read."""
         text = [self.headline, *(f"failed: {cell}: {why}" for cell, why in self.failed.items())]
         text += [f"missing: {cell}" for cell in self.missing[:named]]
         if len(self.missing) > named:
@@ -65,9 +60,6 @@ class Summary(Progress):
 
 def summary(folder: Path) -> Summary:
     """Of a folder of results.
-
-    Args:
-        folder: of results.
 
     Raises:
         RecordError: for one in which no run was started.

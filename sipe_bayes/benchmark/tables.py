@@ -212,12 +212,7 @@ class Table:
         return Table(self.measure, tuple(self.columns[c] for c in columns), rows)
 
     def entry(self, row: str, column: str) -> Entry | None:
-        """The entry of an estimator on an environment.
-
-        Args:
-            row: the estimator.
-            column: the environment.
-        """
+        """The entry of an estimator on an environment."""
         return dict(self.rows)[row][self.columns.index(column)]
 
 
@@ -279,12 +274,7 @@ def over_tasks(row: dict[str, dict[int, float]], columns: Sequence[str]) -> tupl
 
 
 def best_of(column: dict[str, tuple[float, ...]], better: int) -> str | None:
-    """The estimator that is the best outside noise, if there is one.
-
-    Args:
-        column: values of the seeds, by estimator.
-        better: as of ``Measure``.
-    """
+    """The estimator that is the best outside noise, if there is one."""
     mine = {e: v for e, v in column.items() if competes(e) and v}
     if better == 0 or len(mine) < 2:
         return None
@@ -301,12 +291,7 @@ def competes(name: str) -> bool:
 
 
 def differ(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Whether two means differ outside noise, by Welch's test; never with one seed on either side.
-
-    Args:
-        a: values of seeds.
-        b: values of seeds.
-    """
+    """Whether two means differ outside noise, by Welch's test; never with one seed on either side."""
     if len(a) < 2 or len(b) < 2:
         return False
     if np.ptp(a) == 0 and np.ptp(b) == 0:  # deterministic
@@ -317,10 +302,6 @@ def differ(a: Sequence[float], b: Sequence[float]) -> bool:
 
 def against(values: Sequence[float], constant: float) -> int:
     """Whether a mean differs from a constant outside noise, by a one-sample t-test.
-
-    Args:
-        values: of the seeds.
-        constant: that they are held against.
 
     Returns:
         1 or -1 where the mean is above or below it, else 0; 0 with one seed.
@@ -376,12 +357,7 @@ def results(records: Sequence[Record]) -> dict[str, dict[str, list[Scores]]]:
 
 
 def renamed(records: Sequence[Record], label: str) -> list[Record]:
-    """The same records with the setting in the estimator's name, so that two settings stand in one table.
-
-    Args:
-        records: of one setting.
-        label: what it is called.
-    """
+    """The same records with the setting in the estimator's name, so that two settings stand in one table."""
     return [replace(r, estimator=f"{r.estimator}, {label}") for r in records if r.estimator not in BASELINES]
 
 

@@ -19,31 +19,13 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Particles
-from sipe_bayes.report.drawing import (
-    CHAINS,
-    DEFAULT,
-    HOLDOUT,
-    MEASURED,
-    POSTERIOR,
-    PRIOR,
-    PRIOR_HANDLE,
-    STYLE,
-    column_of_panels,
-    equal_parts,
-    legend_above,
-    line_handle,
-    new_figure,
-    panel_grid,
-    shade_handle,
-    shortened,
-    styled,
-    ticks,
-    unit_text,
-    with_unit,
-)
+from sipe_bayes.report.colours import CHAINS, DEFAULT, HOLDOUT, MEASURED, POSTERIOR, PRIOR, STYLE
+from sipe_bayes.report.drawing import column_of_panels, equal_parts, new_figure, panel_grid, styled, ticks
+from sipe_bayes.report.legends import PRIOR_HANDLE, legend_above, line_handle, shade_handle
 from sipe_bayes.report.panels import correlation, draws, marginal, pair_grid, scale, view
 from sipe_bayes.report.posterior_plots import MAX_PAIRS
 from sipe_bayes.report.signal_panels import error_panel, signal_panel, worst_stretch
+from sipe_bayes.report.words import shortened, unit_text, with_unit
 
 
 @dataclass(frozen=True)
@@ -127,11 +109,7 @@ def pair_names(calibration: Calibration, theta: FloatArray) -> list[str]:
 
 @styled
 def marginals(calibration: Calibration) -> list[Figure]:
-    """One panel per parameter, nuisance ones last: posterior, prior, 90 % interval, default; the prior range above.
-
-    Args:
-        calibration: what is drawn.
-    """
+    """One panel per parameter, nuisance ones last: posterior, prior, 90 % interval, default; the prior range above."""
     theta = draws(calibration.posterior)
     parts = equal_parts(ordered(calibration.parameters), SIZES.parameters)
     return [_marginal_figure(calibration, part, theta) for part in parts]
@@ -153,10 +131,6 @@ def _marginal_figure(calibration: Calibration, part: Sequence[ParameterSummary],
 @styled
 def pairs(calibration: Calibration, names: Sequence[str] | None = None) -> list[Figure]:
     """Draws of every pair of at most eight parameters, over draws of the prior, with their correlation.
-
-    Args:
-        calibration: what is drawn.
-        names: which parameters; left out, those of ``pair_names``.
 
     Returns:
         One figure; none for fewer than two parameters.
@@ -181,10 +155,6 @@ def signals(calibration: Calibration, log: str) -> list[Figure]:
 
     The simulation starts anew at every tick on the time axis. A long log also gets a close-up of the stretch where the
     posterior mode errs most.
-
-    Args:
-        calibration: what is drawn.
-        log: which log.
 
     Raises:
         ValueError: for a log without signals.
@@ -254,9 +224,6 @@ def residuals(calibration: Calibration) -> list[Figure]:
     """Residuals over time, one row per training log and fitted channel, with their autocorrelation.
 
     That of the whitened residual stays in the band when the noise model holds.
-
-    Args:
-        calibration: what is drawn.
     """
     return [_residual_figure(part) for part in equal_parts(calibration.residuals, SIZES.residuals)]
 
@@ -305,9 +272,6 @@ def _autocorrelation(ax: Axes, row: Residual) -> None:
 @styled
 def chains(calibration: Calibration) -> list[Figure]:
     """Traces of the Markov chains, one row per parameter.
-
-    Args:
-        calibration: what is drawn.
 
     Returns:
         None when the posterior did not come as several chains.

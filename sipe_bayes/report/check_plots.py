@@ -20,24 +20,10 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.coverage import LEVELS, CalibrationCheck, Uniformity
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
-from sipe_bayes.report.drawing import (
-    CHAINS,
-    DEFAULT,
-    MEASURED,
-    POSTERIOR,
-    PRIOR,
-    STYLE,
-    column_of_panels,
-    legend_above,
-    line_handle,
-    new_figure,
-    panel_grid,
-    shade_handle,
-    shortened,
-    styled,
-    ticks,
-    with_unit,
-)
+from sipe_bayes.report.colours import CHAINS, DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
+from sipe_bayes.report.drawing import column_of_panels, new_figure, outer_labels, panel_grid, styled, ticks
+from sipe_bayes.report.legends import legend_above, line_handle, shade_handle
+from sipe_bayes.report.words import shortened, with_unit
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -47,13 +33,10 @@ def rank_check(check: CalibrationCheck) -> Figure:
 
     The band is what a calibrated method leaves in one case of a hundred. The diagonal is the zero line; a prior that is
     returned unchanged would lie on it too.
-
-    Args:
-        check: what is drawn.
     """
     figure, axes, columns = panel_grid(len(check.names), 1.9, 0.5)
     most = max(float(np.abs(np.stack([u.curve - LEVELS, u.low - LEVELS, u.high - LEVELS])).max()) for u in check.ranks)
-    for j, (ax, name, ranks) in enumerate(zip(axes, check.names, check.ranks, strict=True)):
+    for ax, name, ranks in zip(axes, check.names, check.ranks, strict=True):
         _band(ax, ranks, LEVELS)
         ax.plot(LEVELS, ranks.curve - LEVELS, color=POSTERIOR, lw=STYLE.curve)
         ax.axhline(0, color=MEASURED, lw=0.9, ls=":")
@@ -61,10 +44,7 @@ def rank_check(check: CalibrationCheck) -> Figure:
         ax.set_title(f"{shortened(name, 26)}: {check.verdict(name)}", fontweight="bold")
         ticks(ax.xaxis, 5)
         ticks(ax.yaxis, 5)
-        if j % columns == 0:
-            ax.set_ylabel("share below, less\nwhat is expected")
-        if j + columns >= len(check.names):
-            ax.set_xlabel("rank of the truth")
+    outer_labels(axes, columns, "rank of the truth", "share below, less\nwhat is expected")
     legend_above(figure, _check_handles(f"posteriors of {check.truths} truths"), 3)
     return figure
 
@@ -74,9 +54,6 @@ def coverage_curve(check: CalibrationCheck) -> Figure:
     """Left, how often central intervals hold the truth against what they say; right, the same for TARP's regions.
 
     Below the diagonal: too narrow. Above: too wide.
-
-    Args:
-        check: what is drawn, one line per parameter.
     """
     figure = new_figure(4.1, 8.6)
     left, right = figure.subplots(1, 2)

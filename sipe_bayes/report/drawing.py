@@ -1,69 +1,26 @@
-"""What all figures share: colours, sizes, axes, labels, legends, and a figure's bytes.
-
-One colour means one thing everywhere (Okabe and Ito's palette, which colour-blind readers can tell apart):
-measured black, posterior blue, prior grey, the model as given dashed orange, held-out logs green.
-"""
+"""What all figures share: style, axes, panels, and a figure's bytes."""
 
 from __future__ import annotations
 
+import base64
 import functools
 import io
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 
 import matplotlib.style
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import Formatter, LogLocator, MaxNLocator, NullFormatter
-from matplotlib.typing import LineStyleType
+
+from sipe_bayes.report.colours import STYLE
 
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
 
-MEASURED, POSTERIOR, PRIOR, DEFAULT, HOLDOUT = "#000000", "#0072B2", "#999999", "#D55E00", "#00805F"
-CHAINS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-MARKERS = ("o", "s", "^", "D", "v", "P")
-
-
-@dataclass(frozen=True)
-class Style:
-    """Sizes that figures share: of pages in inches, of lines in points, of shades as opacity.
-
-    Args:
-        width: of a page; a report shows it about 960 pixels wide.
-        dpi: dots to an inch of a PNG.
-        prior: opacity of the prior.
-        interval: opacity of the posterior's interval.
-        curve: width of an estimate's line.
-        reference: width of a line that it is held against.
-        truth: width of the truth's line.
-        points: draws of a posterior behind its densities.
-        grid: points at which a density is drawn.
-    """
-
-    width: float = 9.6
-    dpi: int = 130
-    prior: float = 0.35
-    interval: float = 0.3
-    curve: float = 1.4
-    reference: float = 1.2
-    truth: float = 1.6
-    points: int = 8000
-    grid: int = 400
-
-
-STYLE = Style()
-DASHED: LineStyleType = (0, (3, 2))
-DOTTED: LineStyleType = (0, (1, 1.4))
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _RC = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -85,11 +42,7 @@ _RC = {
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Run ``draw`` under this file's style, whatever the user's own; the user's is back afterwards.
-
-    Args:
-        draw: the function that makes a figure.
-    """
+    """Run ``draw`` under this file's style, whatever the user's own; the user's is back afterwards."""
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -103,15 +56,17 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file.
 
-    Args:
-        figure: what is drawn.
-
     Returns:
         The file's bytes, the same for the same figure.
     """
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=STYLE.dpi, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def inside_page(image: bytes) -> str:
+    """A PNG file as the source of an image that the page itself holds."""
+    return "data:image/png;base64," + base64.b64encode(image).decode("ascii")
 
 
 class _Plain(Formatter):
@@ -147,12 +102,7 @@ def _compact(x: float) -> str:
 
 
 def ticks(axis: Axis, count: int) -> None:
-    """At most about ``count`` ticks with plain labels on an axis, linear or logarithmic.
-
-    Args:
-        axis: of a panel.
-        count: how many.
-    """
+    """At most about ``count`` ticks with plain labels on an axis, linear or logarithmic."""
     if axis.get_scale() == "log":
         low, high = np.log10(axis.get_view_interval())
         subs = (1.0,) if high - low > 1.5 else (1.0, 3.0) if high - low > 1 else (1.0, 2.0, 5.0)
@@ -164,37 +114,8 @@ def ticks(axis: Axis, count: int) -> None:
     axis.set_major_formatter(_Plain())
 
 
-def unit_text(unit: str) -> str:
-    """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1"."""
-    return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_RAISED), unit)
-
-
-def with_unit(name: str, unit: str, separator: str = " ") -> str:
-    """``name [unit]``, the name alone where there is no unit.
-
-    Args:
-        name: of a quantity.
-        unit: its unit; empty for none.
-        separator: what stands before the bracket.
-    """
-    text = unit_text(unit)
-    return f"{name}{separator}[{text}]" if text else name
-
-
-def shortened(text: str, length: int) -> str:
-    """``text``, its middle left out when it is longer than ``length``."""
-    if len(text) <= length:
-        return text
-    half = (length - 1) // 2
-    return f"{text[:half]}…{text[-half:]}"
-
-
 def equal_parts(rows: Sequence[T], size: int) -> list[Sequence[T]]:
     """Rows in order, cut into parts.
-
-    Args:
-        rows: what is cut.
-        size: the longest that a part may be.
 
     Returns:
         Parts of nearly equal length; none for no rows.
@@ -243,51 +164,8 @@ def column_of_panels(count: int, row: float, margin: float) -> tuple[Figure, lis
     return figure, list(figure.subplots(count, 1, squeeze=False, sharex=True)[:, 0])
 
 
-def line_handle(
-    colour: str,
-    label: str,
-    ls: LineStyleType = "-",
-    lw: float | None = None,
-    marker: str = "",
-    ms: float | None = None,
-    mew: float | None = None,
-) -> Line2D:
-    """A legend's entry for a line or, without a line style, for its marks.
-
-    Args:
-        colour: of the line.
-        label: its words.
-        ls: line style, "none" for marks alone.
-        lw: line width, points.
-        marker: Matplotlib's letter.
-        ms: size of a mark, points.
-        mew: width of its edge, points.
-    """
-    return Line2D(
-        [], [], color=colour, label=label, linestyle=ls, linewidth=lw, marker=marker, markersize=ms, markeredgewidth=mew
-    )
-
-
-def shade_handle(colour: str, label: str, alpha: float = STYLE.interval) -> Patch:
-    """A legend's entry for a shade.
-
-    Args:
-        colour: of the shade.
-        label: its words.
-        alpha: its opacity.
-    """
-    return Patch(color=colour, alpha=alpha, lw=0, label=label)
-
-
-PRIOR_HANDLE = Patch(facecolor=PRIOR, alpha=STYLE.prior, edgecolor=PRIOR, label="prior")
-
-
-def legend_above(figure: Figure, handles: Sequence[Artist], columns: int) -> None:
-    """The figure's legend, above all panels.
-
-    Args:
-        figure: where it goes.
-        handles: its entries.
-        columns: entries side by side.
-    """
-    figure.legend(handles=list(handles), loc="outside upper center", ncols=columns)
+def outer_labels(axes: Sequence[Axes], columns: int, xlabel: str, ylabel: str = "") -> None:
+    """Label the axes of a grid of panels at its left and at its lower end alone."""
+    for k, ax in enumerate(axes):
+        ax.set_ylabel(ylabel if k % columns == 0 else "")
+        ax.set_xlabel(xlabel if k + columns >= len(axes) else "")

@@ -7,7 +7,6 @@ out.
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 import os
@@ -25,10 +24,10 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
-from sipe_bayes.report.drawing import png, unit_text
+from sipe_bayes.report.drawing import inside_page, png
 from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.verdicts import improvement, parameter_verdict, verdicts
-from sipe_bayes.report.words import error_text, number, significant, times
+from sipe_bayes.report.words import error_text, number, significant, times, unit_text
 
 _GAPS = 4  # that a row of the logs lists
 
@@ -144,7 +143,7 @@ class Picture:
     @property
     def source(self) -> str:
         """It inside a page."""
-        return "data:image/png;base64," + base64.b64encode(self.content).decode("ascii")
+        return inside_page(self.content)
 
 
 def _logs(calibration: Calibration) -> list[tuple[str, str]]:
@@ -210,12 +209,7 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, o
 
 
 def render(calibration: Calibration, images: Sequence[Picture]) -> str:
-    """The page as HTML.
-
-    Args:
-        calibration: what is reported.
-        images: its figures.
-    """
+    """The page as HTML."""
     template = html_templates("sipe_bayes.report").get_template("report.html.j2")
     return template.render(**_context(calibration, images))
 
@@ -224,10 +218,6 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Pa
     """Write ``figures/*.png`` and ``report.html``.
 
     Everything is drawn and rendered before the first file is written, and the report comes last.
-
-    Args:
-        calibration: what is reported.
-        folder: made when missing.
 
     Returns:
         The report's path.

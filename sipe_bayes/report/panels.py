@@ -13,18 +13,10 @@ from matplotlib.patches import Rectangle
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.report.drawing import (
-    DEFAULT,
-    MEASURED,
-    POSTERIOR,
-    PRIOR,
-    STYLE,
-    legend_above,
-    new_figure,
-    shortened,
-    ticks,
-    unit_text,
-)
+from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
+from sipe_bayes.report.drawing import new_figure, ticks
+from sipe_bayes.report.legends import legend_above
+from sipe_bayes.report.words import shortened, unit_text
 
 if TYPE_CHECKING:
     from sipe_bayes.posterior import Posterior
@@ -37,10 +29,6 @@ _POINT = 1e-6  # spread of draws in theta below which rounding is all that is le
 
 def draws(posterior: Posterior, n: int = STYLE.points) -> FloatArray:
     """Draws of a posterior with a fixed seed.
-
-    Args:
-        posterior: over N parameters.
-        n: how many.
 
     Returns:
         theta (n, N), within [0, 1].

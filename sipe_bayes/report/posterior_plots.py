@@ -21,26 +21,11 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
-from sipe_bayes.report.drawing import (
-    CHAINS,
-    DEFAULT,
-    MARKERS,
-    MEASURED,
-    POSTERIOR,
-    PRIOR,
-    PRIOR_HANDLE,
-    STYLE,
-    legend_above,
-    line_handle,
-    new_figure,
-    panel_grid,
-    shade_handle,
-    shortened,
-    styled,
-    ticks,
-    with_unit,
-)
+from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
+from sipe_bayes.report.drawing import new_figure, outer_labels, panel_grid, styled, ticks
+from sipe_bayes.report.legends import PRIOR_HANDLE, legend_above, line_handle, look, shade_handle
 from sipe_bayes.report.panels import Place, draws, marginal, pair_grid, scale, view_with
+from sipe_bayes.report.words import shortened, with_unit
 
 MAX_PAIRS = 8
 _LEVELS = (0.05, 0.95)  # the two ends of a 90 % interval
@@ -140,8 +125,7 @@ def particle_paths(paths: ArrayLike, space: ParameterSpace, truth: ArrayLike | N
     figure, axes, columns = panel_grid(len(space), 2.1, 0.5)
     for j, (ax, parameter) in enumerate(zip(axes, space, strict=True)):
         _paths(ax, parameter, given[:, :, j], picked, before[:, j], known[j])
-        if j + columns >= len(space):
-            ax.set_xlabel("iteration")
+    outer_labels(axes, columns, "iteration")
     shown = [line_handle(POSTERIOR, "mean of the particles"), shade_handle(POSTERIOR, "90 % of them", 0.25)]
     legend_above(figure, [*shown, *_reference(known)], 5)
     return figure
@@ -194,8 +178,7 @@ def learning_curve(
         x, y = np.asarray(rollouts, float), np.atleast_2d(np.asarray(scores, float))
         if y.shape[1:] != x.shape:
             raise ValueError(f"curves[{name!r}]: expected scores (seeds, {len(x)}), got {y.shape}")
-        colour, marker = CHAINS[k % len(CHAINS)], MARKERS[k % len(MARKERS)]
-        line = "-" if k < len(CHAINS) else (0, (4, 1.5))
+        colour, line, marker = look(k)
         ax.plot(x, np.median(y, axis=0), color=colour, marker=marker, ls=line, ms=4.5, lw=1.5, label=name)
         lowest.append(float(np.min(y)))
         if len(y) > 2:

@@ -180,12 +180,7 @@ def results_table(posterior: Posterior, truth: ArrayLike | None = None, draws: i
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG file, whole or not at all.
-
-    Args:
-        figure: what is drawn.
-        path: the file.
-    """
+    """Write a figure as a PNG file, whole or not at all."""
     from sipe_bayes.report.drawing import png
 
     write_bytes(path, png(figure))

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import Signal
-from sipe_bayes.report.drawing import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE, ticks
+from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
+from sipe_bayes.report.drawing import ticks
 
 
 def _restarted(signal: Signal, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -87,9 +88,6 @@ def error_panel(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
 
 def worst_stretch(rows: Sequence[Signal]) -> tuple[float, float]:
     """The part of a log with the largest squared error, relative to each channel's.
-
-    Args:
-        rows: the log's channels.
 
     Returns:
         Its two ends, s: about a tenth of the log, four windows at least.

@@ -40,7 +40,9 @@ from matplotlib.typing import LineStyleType
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.scores import Scores
-from sipe_bayes.report.drawing import DASHED, DOTTED, STYLE, legend_above, line_handle, new_figure, styled
+from sipe_bayes.report.colours import DASHED, DOTTED, STYLE
+from sipe_bayes.report.drawing import new_figure, styled
+from sipe_bayes.report.legends import legend_above, line_handle
 
 Results = Mapping[str, Mapping[str, Sequence[Scores]]]
 Mode = Literal["mean", "min", "max"]
@@ -148,12 +150,7 @@ def environments(results: Results) -> list[str]:
 
 
 def estimators(results: Results, reference: str | None = None) -> list[str]:
-    """What is drawn as a curve of its own: everything but the baselines and the reference.
-
-    Args:
-        results: of the estimators.
-        reference: the one that the others are held against.
-    """
+    """What is drawn as a curve of its own: everything but the baselines and the reference."""
     return [name for name in results if name not in (*BASELINES, reference)]
 
 

@@ -8,11 +8,7 @@ import jinja2
 
 
 def html_templates(package: str) -> jinja2.Environment:
-    """Templates of HTML pages: what is put in is escaped, and a name that is missing is an error.
-
-    Args:
-        package: the package with the folder ``templates``.
-    """
+    """Templates of HTML pages: what is put in is escaped, and a name that is missing is an error."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader(package, "templates"),
         autoescape=True,
@@ -23,12 +19,7 @@ def html_templates(package: str) -> jinja2.Environment:
 
 
 def latex_templates(package: str, escape: Callable[[object], str]) -> jinja2.Environment:
-    """Templates of LaTeX documents, with ``<% %>``, ``<< >>`` and ``<# #>`` in place of braces.
-
-    Args:
-        package: the package with the folder ``templates``.
-        escape: what is done to everything that is put in.
-    """
+    """Templates of LaTeX documents, with ``<% %>``, ``<< >>`` and ``<# #>`` in place of braces."""
     return html_templates(package).overlay(
         autoescape=False,
         finalize=escape,

@@ -46,10 +46,6 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
 
     One that is poorly determined but belongs to a ridge is determined with the others of it. None is good while a
     finding blocks.
-
-    Args:
-        parameter: its summary.
-        findings: of the calibration.
     """
     codes = {item.code for item in findings.about(parameter.name)}
     on_ridge = [r.parameters for r in findings.of(Code.RIDGE_TO_RESOLVE) if parameter.name in r.parameters]
@@ -79,12 +75,7 @@ def improvement(scores: Iterable[ChannelScore]) -> float:
 
 
 def headline(parameters: Sequence[ParameterSummary], findings: Findings) -> Verdict:
-    """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks.
-
-    Args:
-        parameters: a summary of each.
-        findings: of the calibration.
-    """
+    """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks."""
     wanted = [p for p in parameters if not p.nuisance]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")

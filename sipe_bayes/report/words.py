@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 from sipe_bayes.core.thresholds import THRESHOLDS
 
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 
 def significant(value: float, sd: float, scale: float | None = None) -> str:
     """A value to the second significant digit of its sd: 0.69751 with 0.0030 is "0.6975".
@@ -57,3 +59,28 @@ def times(ratio: float) -> str:
 def listed(names: Sequence[str]) -> str:
     """The names as words of a sentence: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
+
+
+def unit_text(unit: str) -> str:
+    """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1"."""
+    return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_RAISED), unit)
+
+
+def with_unit(name: str, unit: str, separator: str = " ") -> str:
+    """``name [unit]``, the name alone where there is no unit.
+
+    Args:
+        name: of a quantity.
+        unit: its unit; empty for none.
+        separator: what stands before the bracket.
+    """
+    text = unit_text(unit)
+    return f"{name}{separator}[{text}]" if text else name
+
+
+def shortened(text: str, length: int) -> str:
+    """``text``, its middle left out when it is longer than ``length``."""
+    if len(text) <= length:
+        return text
+    half = (length - 1) // 2
+    return f"{text[:half]}…{text[-half:]}"

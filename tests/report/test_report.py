@@ -15,7 +15,8 @@ from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report import panels
-from sipe_bayes.report.drawing import POSTERIOR, png
+from sipe_bayes.report.colours import POSTERIOR
+from sipe_bayes.report.drawing import png
 from tests.problems.calibrations import (
     make_calibration,
     ridge,

@@ -18,7 +18,8 @@ from sipe_bayes.benchmark.tables import order_tasks
 from sipe_bayes.benchmark.transfer.rows import WORDS, Row, Target, label, ordered
 from sipe_bayes.benchmark.transfer.study import PRIOR as PRIOR_NAME
 from sipe_bayes.benchmark.transfer.study import TRUTH, Point, TransferRecord
-from sipe_bayes.report.drawing import CHAINS, DASHED, DEFAULT, MEASURED, PRIOR, STYLE, new_figure, styled
+from sipe_bayes.report.colours import CHAINS, DASHED, DEFAULT, MEASURED, PRIOR, STYLE
+from sipe_bayes.report.drawing import new_figure, styled
 
 _COLOURS = {"truth": MEASURED, "prior": PRIOR, "default": DEFAULT}
 
@@ -28,9 +29,6 @@ def bars(given: Sequence[Row]) -> Figure:
     """The paper's Figure 6: a group of bars for each task and variant, means over seeds in percent of the mean oracle.
 
     The seeds are dots; the oracle is the line at 100 % with its seeds as a shade, the uniform prior a dashed line.
-
-    Args:
-        given: rows of all targets.
     """
     groups = list(dict.fromkeys(row.group for row in given if row.percent is not None))
     most = max((len(_shown(given, group)) for group in groups), default=1)
@@ -131,12 +129,7 @@ def _curve(axes: Axes, mine: Sequence[Sequence[Point]], look: Look) -> Line2D:
 
 
 def look_of(name: str, names: Sequence[str]) -> Look:
-    """Of one of the randomisations: colours go round once with full lines, then with dashes, so that no two look alike.
-
-    Args:
-        name: of the randomisation.
-        names: of all that are drawn.
-    """
+    """Of a randomisation: colours go round once with full lines, then with dashes, so that no two look alike."""
     if name in _COLOURS:
         return Look(_COLOURS[name], "-" if name == TRUTH else DASHED)
     others, palette = [n for n in names if n not in _COLOURS], [c for c in CHAINS if c != DEFAULT]

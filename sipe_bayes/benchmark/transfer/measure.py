@@ -41,10 +41,6 @@ _DIGITS = 12  # of a mean, whose last ones depend on the number of threads
 def randomization(cell: Cell, folder: Path) -> Randomization:
     """What the episodes of a cell's training draw.
 
-    Args:
-        cell: which.
-        folder: of the results, with its estimate.
-
     Raises:
         ValueError: where the estimate is not there, failed, or is over other parameters than the environment's.
     """

@@ -131,12 +131,7 @@ def relative(mine: FloatArray, oracle: FloatArray, zero: float) -> Percent:
 
 
 def rows(records: Sequence[TransferRecord], crps: Mapping[str, float] | None = None) -> list[Row]:
-    """Of all finished records, by task, variant and randomisation, the references first.
-
-    Args:
-        records: of the agents.
-        crps: by record, as far as it is known.
-    """
+    """Of all finished records, by task, variant and randomisation, the references first."""
     done = [r for r in records if r.done]
     made = []
     for task in order_tasks({r.task for r in done}):
@@ -261,9 +256,6 @@ def by_quality(given: Sequence[Row]) -> tuple[dict[Target, float], float] | None
     """Spearman's rank correlation of percent of the oracle with -CRPS over a target's randomisations.
 
     The oracle, of the best CRPS by definition, and variations, which share a posterior, do not count.
-
-    Args:
-        given: of all targets.
 
     Returns:
         Correlations by target with four randomisations at least, and the p-value of their mean by permutations within

@@ -35,12 +35,7 @@ class Sources:
 
     @classmethod
     def of(cls, records: Sequence[TransferRecord], folder: Path) -> Sources:
-        """Of the agents of a folder.
-
-        Args:
-            records: of the agents.
-            folder: of results.
-        """
+        """Of the agents of a folder."""
         sources = cls({}, {})
         for record in (r for r in records if r.done):
             cell = cell_of(record)
@@ -95,9 +90,6 @@ class Summary(Progress):
 
 def summary(folder: Path) -> Summary:
     """Of a folder of results.
-
-    Args:
-        folder: of results.
 
     Raises:
         RecordError: for one without a transfer.
