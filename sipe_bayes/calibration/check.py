@@ -11,7 +11,6 @@ A truth whose simulation diverges is drawn anew: the check is of the prior restr
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 import zipfile
@@ -22,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sipe_bayes.calibration.output import claim
 from sipe_bayes.calibration.study import Study
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing, to_json, write_bytes, write_text
@@ -126,13 +126,12 @@ class CheckResult:
         return f"{held}: {self._fault()}; {remedy}{lost}"
 
     def _fault(self) -> str:
-        wrong = {name: self.check.verdict(name) for name in self.check.names}
-        wrong = {name: verdict for name, verdict in wrong.items() if verdict != "calibrated"}
+        verdicts = [self.check.verdict(name) for name in self.check.names]
+        wrong = sorted(set(verdicts) - {"calibrated"})
         if not wrong:
             return "the parameters are not right jointly (TARP)"
-        verdicts = list(wrong.values())
-        most = max(sorted(set(verdicts)), key=verdicts.count)
-        named = [name for name, verdict in wrong.items() if verdict == most]
+        most = max(wrong, key=verdicts.count)
+        named = [name for name, verdict in zip(self.check.names, verdicts, strict=True) if verdict == most]
         return most if len(named) == len(self.check.names) else f"{most} ({', '.join(named)})"
 
     def to_dict(self) -> dict[str, object]:
@@ -166,7 +165,8 @@ def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done,
         ValueError: where the folder holds another check, or fewer than 20 logs could be fitted.
     """
     whole("truths", truths, FEWEST)
-    _claim(study, folder)
+    identity = study.identity()
+    claim(folder, identity, IDENTITY, sorted(identity), "check")
     worker = _Worker(study, folder, tell)
     fits = []
     for number in range(truths):
@@ -178,20 +178,14 @@ def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done,
             fit.save(path)
         fits.append(fit)
     result = compare(study, fits)
-    _write(result, folder)
+    write_bytes(folder / "ranks.png", png(rank_check(result.check)))
+    write_bytes(folder / "coverage.png", png(coverage_curve(result.check)))
+    write_text(folder / RESULT, to_json(result.to_dict(), indent=2))
     return result
 
 
 def compare(study: Study, fits: list[Fit]) -> CheckResult:
-    """What the fits say together.
-
-    Args:
-        study: what is checked.
-        fits: of its logs.
-
-    Raises:
-        ValueError: where fewer than 20 gave a posterior.
-    """
+    """What the fits of a study's logs say together; raises ValueError where fewer than 20 gave a posterior."""
     good = [fit for fit in fits if not fit.error]
     if len(good) < FEWEST:
         why = next((fit.error for fit in fits if fit.error), "")
@@ -273,25 +267,3 @@ class _Worker:
 
     def _generator(self, *what: int) -> torch.Generator:
         return torch_generator([self.study.seed, *what])
-
-
-def _claim(study: Study, folder: Path) -> None:
-    record, mine = folder / IDENTITY, study.identity()
-    if record.is_file():
-        present = json.loads(record.read_text(encoding="utf-8"))
-        differing = sorted(key for key in mine if present.get(key) != mine[key])
-        if differing:
-            raise ValueError(
-                f"--out {folder}: holds another check (it differs in {', '.join(differing)}); choose another folder or "
-                "delete it"
-            )
-        return
-    if folder.is_dir() and any(folder.iterdir()):
-        raise ValueError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
-    write_text(record, json.dumps(mine, indent=2))
-
-
-def _write(result: CheckResult, folder: Path) -> None:
-    write_bytes(folder / "ranks.png", png(rank_check(result.check)))
-    write_bytes(folder / "coverage.png", png(coverage_curve(result.check)))
-    write_text(folder / RESULT, to_json(result.to_dict(), indent=2))

@@ -112,24 +112,16 @@ class Config(Table):
             if log.window is not None and log.use == "train":
                 raise problem(needless, "logs", i, "window")
         if "model" in self.noise.model_fields_set and self.noise.model != "white":
-            raise problem(
-                f"expected 'white' with likelihood = 'state_space', got {self.noise.model!r}; drop it or use "
-                "likelihood = 'segments'",
-                "noise",
-                "model",
-            )
+            expected = f"expected 'white' with likelihood = 'state_space', got {self.noise.model!r}"
+            raise problem(f"{expected}; drop it or use likelihood = 'segments'", "noise", "model")
 
     def _check_targets(self) -> None:
         owner: dict[str, str] = {}
         for i, parameter in enumerate(self.parameters):
             for target in parameter.targets:
                 if target in owner:
-                    raise problem(
-                        f"{target!r} is already driven by parameter {owner[target]!r}; drop it from one",
-                        "parameters",
-                        i,
-                        "targets",
-                    )
+                    message = f"{target!r} is already driven by parameter {owner[target]!r}; drop it from one"
+                    raise problem(message, "parameters", i, "targets")
                 owner[target] = parameter.name
 
     def _check_holdout(self) -> None:
@@ -137,23 +129,15 @@ class Config(Table):
         for i, held in enumerate(self.logs):
             for train in self.logs_for("train") if held.use == "holdout" else ():
                 if held.file == train.file and overlap(held.span, train.span):
-                    raise problem(
-                        f"held out, but its samples also train as log {train.name!r}; give spans apart",
-                        "logs",
-                        i,
-                        "use",
-                    )
+                    message = f"held out, but its samples also train as log {train.name!r}; give spans apart"
+                    raise problem(message, "logs", i, "use")
 
 
 def _check_unique(table: str, key: str, words: Sequence[str]) -> None:
     for i, word in enumerate(words):
         if word in words[:i]:
-            raise problem(
-                f"expected different values, got {word!r} also at {table}[{words.index(word)}]; change one",
-                table,
-                i,
-                key,
-            )
+            message = f"expected different values, got {word!r} also at {table}[{words.index(word)}]; change one"
+            raise problem(message, table, i, key)
 
 
 def check_dimensions(config: Config, dimensions: Mapping[str, str]) -> None:
@@ -167,12 +151,8 @@ def check_dimensions(config: Config, dimensions: Mapping[str, str]) -> None:
     Raises:
         ConfigError: for such a unit.
     """
-    tables: tuple[tuple[str, Sequence[Command | Measurement]], ...] = (
-        ("commands", config.commands),
-        ("measurements", config.measurements),
-    )
-    for table, entries in tables:
-        for i, entry in enumerate(entries):
+    for table in ("commands", "measurements"):
+        for i, entry in enumerate(getattr(config, table)):
             try:
                 find_unit(entry.unit, dimensions.get(entry.target))
             except ValueError as error:
@@ -181,14 +161,7 @@ def check_dimensions(config: Config, dimensions: Mapping[str, str]) -> None:
 
 
 def load_config(path: str | Path) -> Config:
-    """Read and check a configuration.
-
-    Args:
-        path: of the TOML file.
-
-    Raises:
-        ConfigError: for one that cannot be used.
-    """
+    """Read and check a configuration, a TOML file; raises ConfigError for one that cannot be used."""
     path = Path(path)
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))

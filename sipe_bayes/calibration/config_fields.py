@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -59,18 +59,16 @@ def _resolved(value: Any, info: ValidationInfo) -> Any:
     return Path(folder, value)
 
 
-def _unit_word(word: str) -> str:
-    try:
-        return find_unit(word).word
-    except ValueError as error:
-        raise problem(str(error)) from None
+def _read_by(read: Callable[[str], str]) -> AfterValidator:
+    """The check that ``read`` makes; what it says of a wrong word is the error."""
 
+    def check(word: str) -> str:
+        try:
+            return read(word)
+        except ValueError as error:
+            raise problem(str(error)) from None
 
-def _time_word(word: str) -> str:
-    try:
-        return find_unit(word, "time").word
-    except ValueError as error:
-        raise problem(str(error)) from None
+    return AfterValidator(check)
 
 
 def _estimator(name: str) -> str:
@@ -132,12 +130,9 @@ def parse_measurement_target(target: str) -> MeasurementTarget:
     )
 
 
-def _checked_target(target: str) -> str:
-    try:
-        parse_measurement_target(target)
-    except ValueError as error:
-        raise problem(str(error)) from None
-    return target
+def _target(word: str) -> str:
+    parse_measurement_target(word)
+    return word
 
 
 Text = Annotated[str, Field(min_length=1), Strict()]
@@ -145,11 +140,11 @@ Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
 Pair = tuple[Number, Number]
 Location = Annotated[Path, BeforeValidator(_resolved)]
-UnitWord = Annotated[str, Strict(), AfterValidator(_unit_word)]
-TimeWord = Annotated[str, Strict(), AfterValidator(_time_word)]
+UnitWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word).word)]
+TimeWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word, "time").word)]
 Sign = Annotated[int, BeforeValidator(_checked_sign)]
 EstimatorName = Annotated[str, Strict(), AfterValidator(_estimator)]
-TargetWord = Annotated[str, Strict(), AfterValidator(_checked_target)]
+TargetWord = Annotated[str, Strict(), _read_by(_target)]
 Window = Annotated[float | Literal["log"] | None, BeforeValidator(lambda v: None if v is None else _window(v))]
 """Seconds, or "log" for whole logs."""
 

@@ -145,6 +145,11 @@ class ParameterEntry(Table):
             raise problem(f"expected one string, got {data['target']!r}; for several use `targets`", "target")
         return {**{k: v for k, v in data.items() if k != "target"}, "targets": [data["target"]]}
 
+    @property
+    def range(self) -> Pair:
+        """The bounds, or the factors of the model's value."""
+        return self.bounds or self.factor or (0.0, 1.0)
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         self._check_bounds()
@@ -159,26 +164,17 @@ class ParameterEntry(Table):
             came = "neither" if self.bounds is None else "both"
             raise problem(f"expected either `bounds` or `factor`, got {came}; give one of them", "bounds")
         key = "factor" if self.bounds is None else "bounds"
-        pair = self.factor if self.bounds is None else self.bounds
-        if pair is None:
-            return
-        check_ordered(pair, key, "[low, high]")
-        if self.scale == "log" and pair[0] <= 0:
-            raise problem(
-                f"a log scale needs bounds above zero, got [{pair[0]:g}, {pair[1]:g}]; "
-                "raise the lower one or use scale = 'linear'",
-                key,
-            )
+        low, high = self.range
+        check_ordered(self.range, key, "[low, high]")
+        if self.scale == "log" and low <= 0:
+            expected = f"a log scale needs bounds above zero, got [{low:g}, {high:g}]"
+            raise problem(f"{expected}; raise the lower one or use scale = 'linear'", key)
 
     def _check_prior(self, prior: NormalPrior) -> None:
-        pair = self.factor if self.bounds is None else self.bounds
-        if pair is not None and not pair[0] <= prior.mean <= pair[1]:
-            low, high = pair
-            raise problem(
-                f"expected a mean within the bounds [{low:g}, {high:g}], got {prior.mean:g}; widen them",
-                "prior",
-                "mean",
-            )
+        low, high = self.range
+        if not low <= prior.mean <= high:
+            expected = f"expected a mean within the bounds [{low:g}, {high:g}]"
+            raise problem(f"{expected}, got {prior.mean:g}; widen them", "prior", "mean")
         if self.scale == "log" and prior.mean <= 0:
             raise problem(f"expected a mean above zero on a log scale, got {prior.mean:g}", "prior", "mean")
 

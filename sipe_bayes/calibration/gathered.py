@@ -42,14 +42,7 @@ class Marginals:
 
     @classmethod
     def of(cls, posterior: Posterior, prior: Posterior, space: ParameterSpace, seed: int) -> Marginals:
-        """Those of a posterior.
-
-        Args:
-            posterior: of the parameters.
-            prior: that it started from.
-            space: of the parameters.
-            seed: of the draws.
-        """
+        """Those of a posterior, which started from a prior."""
         sd = posterior.stddev.numpy()
         contraction = 1 - sd / np.maximum(prior.stddev.numpy(), 1e-300)
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
@@ -59,23 +52,13 @@ class Marginals:
         """One for each parameter."""
         mode = self.space.values(self.theta)
         quantiles = np.quantile(self.draws, [0.05, 0.5, 0.95], axis=0)
-        return [
-            ParameterSummary(
-                name=p.name,
-                unit=p.unit,
-                targets=p.targets,
-                mean=float(self.draws[:, j].mean()),
-                sd=float(self.draws[:, j].std()),
-                q05=float(quantiles[0, j]),
-                q50=float(quantiles[1, j]),
-                q95=float(quantiles[2, j]),
-                mode=float(mode[j]),
-                default=p.default,
-                contraction=float(self.contraction[j]),
-                nuisance=p.log is not None,
-            )
-            for j, p in enumerate(self.space)
-        ]
+        summaries = []
+        for j, p in enumerate(self.space):
+            drawn, determined = self.draws[:, j], float(self.contraction[j])
+            mean, sd, q05, q50, q95, best = (float(x) for x in (drawn.mean(), drawn.std(), *quantiles[:, j], mode[j]))
+            marginal = (mean, sd, q05, q50, q95, best, p.default, determined, p.log is not None)
+            summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal))
+        return summaries
 
     def findings(self, dead: dict[str, list[tuple[float, float]]], ridges: Sequence[Ridge]) -> list[Finding]:
         """Of each parameter whether it does anything, is determined, and lies at a bound.

@@ -12,7 +12,7 @@ from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.grid import Grid, Recording, gaps
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
@@ -32,15 +32,7 @@ _SATURATION = Saturation()
 
 
 def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, trajectory: Trajectory) -> LogReport:
-    """What a log held and what was done to it.
-
-    Args:
-        config: the configuration.
-        log: which of its logs.
-        raw: as it was read.
-        grid: that it was put on.
-        trajectory: what came out.
-    """
+    """What a log held, as it was read, and what was done to it on the grid; ``trajectory`` is what came out."""
     finite = np.isfinite(trajectory.observations)
     names = [*config.channels, *(c.target for c in config.commands)]
     signals = [*raw.measurements, *raw.commands]
@@ -64,23 +56,18 @@ def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, traject
         missing=missing,
         clipped=clipped,
         findings=(
-            _clock(log, raw, grid, jitter),
+            note(
+                Code.LOG_CLOCK if grid.regular else Code.LOG_RESAMPLED,
+                samples=len(raw.time),
+                rate=f"{1 / grid.dt:.4g} Hz",
+                own_rate=f"{1 / float(np.median(np.diff(raw.time))):.4g} Hz",
+                jitter_ms=1e3 * jitter,
+            ),
             *(note(Code.LOG_GAP, start=start, stop=stop) for start, stop in holes),
             *(note(Code.LOG_MISSING, channel=c, missing=n, samples=grid.samples) for c, n in missing.items() if n),
             *(note(Code.LOG_BLANK_COMMANDS, channel=c, blank=n) for c, n in blank.items() if n),
             *(note(Code.LOG_CLIPPED, channel=c, clipped=n) for c, n in saturated.items()),
         ),
-    )
-
-
-def _clock(log: LogEntry, raw: Recording, grid: Grid, jitter: float) -> Finding:
-    return finding(
-        Code.LOG_CLOCK if grid.regular else Code.LOG_RESAMPLED,
-        log=log.name,
-        samples=len(raw.time),
-        rate=f"{1 / grid.dt:.4g} Hz",
-        own_rate=f"{1 / float(np.median(np.diff(raw.time))):.4g} Hz",
-        jitter_ms=1e3 * jitter,
     )
 
 

@@ -56,12 +56,19 @@ def load_log(
         ConfigError: for a unit of the wrong kind.
     """
     check_dimensions(config, dimensions or {})
+    try:
+        return _loaded(config, log)
+    except LogError as error:
+        raise LogError(f"log {log.name!r}: {error}") from None
+
+
+def _loaded(config: Config, log: LogEntry) -> tuple[Trajectory, LogReport]:
     raw = _read_log(config, log)
     grid = control_grid(raw.time, config.resample.rate)
     _check_length(config, log, grid, raw.time)
     observed = [sampled(raw.time, y, grid, config.resample.max_gap) for y in raw.measurements]
     for measurement, before, after in zip(config.measurements, raw.measurements, observed, strict=True):
-        _check_any(log, measurement.column, before, after)
+        _check_any(measurement.column, before, after)
     commands = [held(y, grid) for y in raw.commands]
     actions = np.stack(commands, -1) if commands else np.zeros((grid.samples - 1, 0))
     trajectory = Trajectory(np.stack(observed, -1), actions, grid.dt, name=log.name, channels=config.channels)
@@ -69,46 +76,40 @@ def load_log(
 
 
 def _read_log(config: Config, log: LogEntry) -> Recording:
-    try:
-        table = read_table(log.file)
-    except LogError as error:
-        raise LogError(f"log {log.name!r}: {error}") from None
-    clock = config.columns.time
+    table, clock = read_table(log.file), config.columns.time
     time = _column(log, table, clock.column)
-    _check_clock(log, clock.column, time)
+    _check_clock(clock.column, time)
     time = convert(time, clock.unit, "time")
     time = time - time[0]
     if "unit" not in clock.model_fields_set and np.median(np.diff(time)) >= _SLOW:
         raise LogError(
-            f"log {log.name!r}: read in seconds, {clock.column!r} is {np.median(np.diff(time)):g} s from row to row; "
+            f"read in seconds, {clock.column!r} is {np.median(np.diff(time)):g} s from row to row; "
             'name its unit, such as `columns.time.unit = "ms"`, or "s" if that is right'
         )
     part = _span(log, time)
 
     def signal(entry: Command | Measurement) -> FloatArray:
-        values = _fitted(log, entry.column, _column(log, table, entry.column), len(time))[part]
+        values = _fitted(entry.column, _column(log, table, entry.column), len(time))[part]
         return entry.sign * convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
 
     commands = [signal(c) for c in config.commands]
     measurements = [signal(m) for m in config.measurements]
     time = time[part]
     for command, values in zip(config.commands, commands, strict=True):
-        _check_first_command(log, command.column, time, values)
+        _check_first_command(command.column, time, values)
     return Recording(time - time[0], commands, measurements)
 
 
 def _column(log: LogEntry, table: Columns, name: str) -> FloatArray:
     """One column as numbers (n,)."""
     if name not in table:
-        raise LogError(f"log {log.name!r}: no column {name!r} in {log.file.name}; {nearest(name, table)}")
+        raise LogError(f"no column {name!r} in {log.file.name}; {nearest(name, table)}")
     try:
         return np.asarray(table[name], dtype=np.float64)
     except (TypeError, ValueError):
         row, cell = next((i, value) for i, value in enumerate(table[name], 1) if not _is_cell(value))
-        raise LogError(
-            f"log {log.name!r}: column {name!r} holds {cell!r} in row {row}, expected numbers; "
-            "correct it or leave it blank"
-        ) from None
+        where = f"column {name!r} holds {cell!r} in row {row}"
+        raise LogError(f"{where}, expected numbers; correct it or leave it blank") from None
 
 
 def _is_cell(value: object) -> bool:
@@ -119,30 +120,28 @@ def _is_cell(value: object) -> bool:
     return True
 
 
-def _fitted(log: LogEntry, name: str, values: FloatArray, samples: int) -> FloatArray:
+def _fitted(name: str, values: FloatArray, samples: int) -> FloatArray:
     """``values`` as long as the clock; T values beside T+1 times, as npz actions come, end with a NaN."""
     if len(values) == samples - 1:
         return np.append(values, np.nan)
     if len(values) != samples:
-        raise LogError(
-            f"log {log.name!r}: column {name!r} has {len(values)} samples, the time {samples}; "
-            "they must be equal, or one fewer"
-        )
+        lengths = f"column {name!r} has {len(values)} samples, the time {samples}"
+        raise LogError(f"{lengths}; they must be equal, or one fewer")
     return values
 
 
-def _check_clock(log: LogEntry, name: str, time: FloatArray) -> None:
+def _check_clock(name: str, time: FloatArray) -> None:
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
-        raise LogError(f"log {log.name!r}: {name!r} has no time in row {bad[0] + 1}; drop that row")
+        raise LogError(f"{name!r} has no time in row {bad[0] + 1}; drop that row")
     if len(time) < 2:
-        raise LogError(f"log {log.name!r}: expected at least 2 samples, got {len(time)}; record a longer log")
+        raise LogError(f"expected at least 2 samples, got {len(time)}; record a longer log")
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
         i = back[0]
         remedy = "drop duplicate rows" if time[i + 1] == time[i] else "sort the rows"
         raise LogError(
-            f"log {log.name!r}: {name!r} must increase strictly, got {time[i + 1]!s} in row {i + 2} "
+            f"{name!r} must increase strictly, got {time[i + 1]!s} in row {i + 2} "
             f"after {time[i]!s} in row {i + 1}; {remedy}"
         )
 
@@ -155,20 +154,18 @@ def _span(log: LogEntry, time: FloatArray) -> slice:
     start = int(np.searchsorted(time, log.span[0] - slack))
     stop = int(np.searchsorted(time, log.span[1] + slack))
     if stop - start < 2:
-        raise LogError(
-            f"log {log.name!r}: span {list(log.span)} holds {stop - start} samples of the {time[-1]:g} s; "
-            "choose a span inside it"
-        )
+        held = f"{stop - start} samples of the {time[-1]:g} s"
+        raise LogError(f"span {list(log.span)} holds {held}; choose a span inside it")
     return slice(start, stop)
 
 
-def _check_first_command(log: LogEntry, name: str, time: FloatArray, values: FloatArray) -> None:
+def _check_first_command(name: str, time: FloatArray, values: FloatArray) -> None:
     known = np.flatnonzero(np.isfinite(values))
     if not known.size:
-        raise LogError(f"log {log.name!r}: command column {name!r} holds no number; choose another column")
+        raise LogError(f"command column {name!r} holds no number; choose another column")
     if known[0] > 0:
         raise LogError(
-            f"log {log.name!r}: command column {name!r} holds no number before {time[known[0]]:g} s, "
+            f"command column {name!r} holds no number before {time[known[0]]:g} s, "
             "so what drove the actuator is unknown; start `span` there"
         )
 
@@ -176,25 +173,21 @@ def _check_first_command(log: LogEntry, name: str, time: FloatArray, values: Flo
 def _check_length(config: Config, log: LogEntry, grid: Grid, time: FloatArray) -> None:
     duration = (grid.samples - 1) * grid.dt
     if grid.samples < 2:
-        raise LogError(
-            f"log {log.name!r}: lasts {time[-1]:g} s, shorter than one control step of {grid.dt:g} s; "
-            "raise `resample.rate` or use a longer log"
-        )
+        step = f"lasts {time[-1]:g} s, shorter than one control step of {grid.dt:g} s"
+        raise LogError(f"{step}; raise `resample.rate` or use a longer log")
     if grid.samples > _EMPTY * len(time):
         raise LogError(
-            f"log {log.name!r}: {len(time)} samples in {duration:g} s leave a {1 / grid.dt:g} Hz grid empty; "
+            f"{len(time)} samples in {duration:g} s leave a {1 / grid.dt:g} Hz grid empty; "
             "choose a `span` without the pause, or correct the time unit"
         )
     window = config.window_of(log)
     if window is not None and duration < window - grid.dt / 2:
-        raise LogError(
-            f"log {log.name!r}: lasts {duration:g} s, shorter than a window of {window:g} s; "
-            "lower `window` or use a longer log"
-        )
+        short = f"lasts {duration:g} s, shorter than a window of {window:g} s"
+        raise LogError(f"{short}; lower `window` or use a longer log")
 
 
-def _check_any(log: LogEntry, name: str, before: FloatArray, after: FloatArray) -> None:
+def _check_any(name: str, before: FloatArray, after: FloatArray) -> None:
     if not np.isfinite(before).any():
-        raise LogError(f"log {log.name!r}: measured column {name!r} holds no number; drop the measurement")
+        raise LogError(f"measured column {name!r} holds no number; drop the measurement")
     if not np.isfinite(after).any():
-        raise LogError(f"log {log.name!r}: no sample of measured column {name!r} survives; raise `resample.max_gap`")
+        raise LogError(f"no sample of measured column {name!r} survives; raise `resample.max_gap`")

@@ -6,7 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,35 +73,38 @@ def release(folder: Path) -> None:
         folder.rmdir()
 
 
-def claim(folder: Path, run: Mapping[str, object]) -> None:
+def claim(
+    folder: Path, own: Mapping[str, object], file: str = RUN, keys: Sequence[str] = _IDENTITY, what: str = "run"
+) -> None:
     """Make ``folder`` this run's own; the same run may come back to it.
 
     Args:
         folder: of the results.
-        run: as of ``describe_run``.
+        own: the run's record.
+        file: of the record, in the folder.
+        keys: of the record, by which a run differs from others.
+        what: the run is called.
 
     Raises:
         OutputError: when it holds another run.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
-    record = folder / RUN
+    record, content = folder / file, to_json(own, indent=2)
     if record.is_file():
         try:
             present = json.loads(record.read_text(encoding="utf-8"))
         except (OSError, json.JSONDecodeError) as error:
-            raise OutputError(f"--out {folder}: its {RUN} cannot be read ({error}); choose another folder") from None
-        differing = [key for key in _IDENTITY if present.get(key) != run[key]]
+            raise OutputError(f"--out {folder}: its {file} cannot be read ({error}); choose another folder") from None
+        mine = json.loads(content)
+        differing = ", ".join(key.removesuffix("_sha256") for key in keys if present.get(key) != mine[key])
         if differing:
-            what = ", ".join(key.removesuffix("_sha256") for key in differing)
-            raise OutputError(
-                f"--out {folder}: holds another run (it differs in {what}); choose another folder or delete it"
-            )
+            other = f"another {what} (it differs in {differing})"
+            raise OutputError(f"--out {folder}: holds {other}; choose another folder or delete it")
         return
     if folder.is_dir() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
         raise OutputError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(record, to_json({**run, "status": "started"}, indent=2))
+    write_text(record, content)
 
 
 def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calibration:
@@ -137,31 +140,15 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, object]:
     """What a policy trainer samples from: each parameter's normal in its unit, its bounds, and the covariance.
 
-    ``sipe_bayes.rl.randomization.load_randomization`` reads it.
-
-    Args:
-        calibration: the result.
-        problem: that it is of.
-
-    Returns:
-        As JSON has it. ``targets`` says what the value is multiplied by for each target that it is written to,
-        ``posterior`` which saved posterior beside the file the normal stands for.
+    ``sipe_bayes.rl.randomization.load_randomization`` reads it. ``targets`` says what the value is multiplied by for
+    each target that it is written to, ``posterior`` which saved posterior beside the file the normal stands for.
     """
     space = problem.environment.space
     draws = calibration.posterior.values(_COVARIANCE_DRAWS, generator=_generator())
     rows = [
-        {
-            "name": p.name,
-            "targets": problem.environment.multipliers(s),
-            "unit": p.unit,
-            "mean": p.mean,
-            "sd": p.sd,
-            "q05": p.q05,
-            "q95": p.q95,
-            "low": s.low,
-            "high": s.high,
-            "log": s.log,
-        }
+        {"name": p.name, "targets": problem.environment.multipliers(s)}
+        | {key: getattr(p, key) for key in ("unit", "mean", "sd", "q05", "q95")}
+        | {key: getattr(s, key) for key in ("low", "high", "log")}
         for p, s in zip(calibration.parameters, space, strict=True)
     ]
     covariance = np.atleast_2d(np.cov(draws.T))

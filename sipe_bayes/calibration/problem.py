@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from sipe_bayes.calibration.config_tables import LogEntry, overlap
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.channels import Channel
@@ -102,29 +102,34 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
     dimensions = {m.target: _dimension(u) for m, u in zip(config.measurements, environment.channel_units, strict=True)}
     dimensions = {target: d for target, d in dimensions.items() if d}
     check_dimensions(config, dimensions)
-    read = [load_log(config, log, dimensions) for log in (*train_logs, *held_logs)]
-    trajectories = [t for t, _ in read]
-    held = trajectories[len(train_logs) :]
-    reports = tuple(report for _, report in read)
-    for held_log, copy in zip(held_logs, reports[len(train_logs) :], strict=True):
-        for log, report in zip(train_logs, reports[: len(train_logs)], strict=True):
+    train, train_reports = _read(config, train_logs, dimensions)
+    held, held_reports = _read(config, held_logs, dimensions)
+    for held_log, copy in zip(held_logs, held_reports, strict=True):
+        for log, report in zip(train_logs, train_reports, strict=True):
             if copy.sha256 == report.sha256 and overlap(held_log.span, log.span):
                 raise ConfigError(
                     f"{config.path}: log {held_log.name!r} is held out, but {held_log.file} is a copy of {log.file}, "
                     "which trains; hold out another log"
                 )
-    prior, remarks = _prior(config, environment.space, reports[: len(train_logs)])
+    prior, remarks = _prior(config, environment.space, train_reports)
     return Problem(
         config,
         environment,
         Simulator(environment, num_threads),
         _likelihood(config),
         prior,
-        Trajectories.stack(trajectories[: len(train_logs)]),
+        Trajectories.stack(train),
         Trajectories.stack(held) if held else None,
-        reports,
+        (*train_reports, *held_reports),
         remarks,
     )
+
+
+def _read(
+    config: Config, logs: Sequence[LogEntry], dimensions: Mapping[str, str]
+) -> tuple[list[Trajectory], list[LogReport]]:
+    read = [load_log(config, log, dimensions) for log in logs]
+    return [trajectory for trajectory, _ in read], [report for _, report in read]
 
 
 def _dimension(unit: str) -> str:
@@ -136,17 +141,17 @@ def _dimension(unit: str) -> str:
 
 def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
     parameters: list[Parameter] = []
+    # the unit of a command offset is the command's; other units are the model's own (empty here)
+    units = {f"{c.target}.offset": to_si(c.unit)[1] for c in config.commands}
     for i, entry in enumerate(config.parameters):
-        low, high = entry.bounds or entry.factor or (0.0, 1.0)
         try:
             one = Parameter(
                 entry.name,
-                low,
-                high,
+                *entry.range,
                 scale=entry.scale,
                 targets=entry.targets,
                 relative=entry.factor is not None,
-                unit=_command_unit(config, entry.targets[0]),
+                unit=units.get(entry.targets[0], ""),
                 prior_mean=entry.prior.mean if entry.prior else None,
                 prior_sd=entry.prior.sd if entry.prior else None,
                 description=entry.description,
@@ -164,20 +169,13 @@ def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
         raise ConfigError(f"{config.path}: {error}") from None
 
 
-def _command_unit(config: Config, target: str) -> str:
-    """The unit of a command offset is the command's; other units are the model's own (empty here)."""
-    units = {f"{c.target}.offset": to_si(c.unit)[1] for c in config.commands}
-    return units.get(target, "")
-
-
 def _likelihood(config: Config) -> Segments | StateSpace:
     fit = tuple(m.name for m in config.measurements if m.fit)
     noise_sd = tuple(m.noise_sd for m in config.measurements)
     if config.likelihood == "state_space":
         return StateSpace(fit, noise_sd)
-    window = None if config.window == "log" else config.window
     return Segments(
-        window=window,
+        window=None if config.window == "log" else config.window,
         noise=config.noise.model,
         fit=fit,
         noise_sd=noise_sd,

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.gathered import Marginals, not_better, of_logs, uneven_targets
 from sipe_bayes.calibration.output import CHECKPOINT, claim, describe_run, release, write_all
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
@@ -21,6 +20,7 @@ from sipe_bayes.diagnostics.evaluate import (
     channel_scores,
     compare_errors,
     fitted_residuals,
+    fitted_units,
     signals,
     white_noise,
 )
@@ -97,8 +97,10 @@ def calibrate(
         *of_logs(problem.reports),
         *_left_out(problem, method),
     )
+    noise_rows = zip(noise.sd.tolist(), noise.tau.tolist(), fitted_units(fitted), strict=True)
+    measured = method.diagnostics.get("mixing")
     return Calibration(
-        name=run_name(problem.config),
+        name=run_name(problem.config.path),
         estimator=method.name,
         posterior=posterior,
         prior=problem.prior,
@@ -112,8 +114,8 @@ def calibrate(
         comparison=predictions.comparison,
         misfit=lacks,
         outside=outside,
-        noise=_by_channel(fitted, noise),
-        mixing=_mixing(method),
+        noise={channel: ChannelNoise(*row) for channel, row in zip(fitted.fitted, noise_rows, strict=True)},
+        mixing=Mixing.of(measured, method.space.names) if measured else None,
         logs=list(problem.reports),
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
@@ -216,22 +218,9 @@ def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
     return white_noise(windows, theta)
 
 
-def _by_channel(windows: Windows, noise: Noise) -> dict[str, ChannelNoise]:
-    environment = windows.simulator.environment
-    units = dict(zip(environment.channels, getattr(environment, "channel_units", ()), strict=False))
-    rows = zip(windows.fitted, noise.sd.tolist(), noise.tau.tolist(), strict=True)
-    return {name: ChannelNoise(sd, tau, units.get(name, "")) for name, sd, tau in rows}
-
-
-def _mixing(method: Estimator) -> Mixing | None:
-    measured = method.diagnostics.get("mixing")
-    return Mixing.of(measured, method.space.names) if measured else None
-
-
-def run_name(config: Config) -> str:
+def run_name(config: Path) -> str:
     """What a run is called: as the configuration's file, or its folder where the file's name says nothing."""
-    stem = config.path.stem
-    return config.path.resolve().parent.name if stem in ("calibrate", "config") else stem
+    return config.resolve().parent.name if config.stem in ("calibrate", "config") else config.stem
 
 
 def run(
@@ -267,9 +256,9 @@ def run(
         _every_channel(problem, problem.holdout)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
-    folder = Path("runs") / f"{run_name(problem.config)}-{name}" if out is None else out
+    folder = Path("runs") / f"{run_name(problem.config.path)}-{name}" if out is None else out
     record = describe_run(problem, name, chosen_seed, chosen_budget)
-    claim(folder, record)
+    claim(folder, {**record, "status": "started"})
     try:
         calibration = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
     except ValueError:

@@ -68,16 +68,14 @@ class Study:
     def identity(self) -> dict[str, object]:
         """What tells a check from others, as plain data."""
         process = [] if self.process is None else self.process.tolist()
-        noise = {"sd": self.noise.sd.tolist(), "tau": self.noise.tau.tolist(), "process": process}
-        settings = json.loads(json.dumps(self.estimator.settings(), default=str))
         return {
             "version": _VERSION,
             "model": self.name,
             "method": self.method,
             "seed": self.seed,
             "log": digest(self.trajectories),
-            "noise": noise,
-            "settings": settings,
+            "noise": {"sd": self.noise.sd.tolist(), "tau": self.noise.tau.tolist(), "process": process},
+            "settings": json.loads(json.dumps(self.estimator.settings(), default=str)),
         }
 
 

@@ -194,22 +194,20 @@ def print_calibration(calibration: Calibration) -> None:
         # brackets of a name are not markup
         table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     console.print(table)
+    lines = []
     for title, scores in (("held out", calibration.holdout), ("train", calibration.train)):
         for s in scores:
             ratio = s.rmse_default / s.rmse if s.rmse else float("inf")
-            console.print(
+            lines.append(
                 f"{title} {s.log}, {s.channel}: RMSE {s.rmse:.3g} {s.unit}; model as given {s.rmse_default:.3g} "
-                f"({ratio:.1f} times that of the estimate)",
-                highlight=False,
-                markup=False,
+                f"({ratio:.1f} times that of the estimate)"
             )
-    for sentence in calibration.left_out:
-        console.print(f"left out: {sentence}", highlight=False, markup=False)
-    for warning in calibration.warnings:
-        console.print(f"warning: {warning}", highlight=False, markup=False)
-    console.print(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s", highlight=False)
-    if calibration.out:
-        console.print(f"report: {Path(calibration.out) / 'report.html'}", highlight=False, markup=False)
+    lines += [f"left out: {sentence}" for sentence in calibration.left_out]
+    lines += [f"warning: {warning}" for warning in calibration.warnings]
+    lines.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s")
+    lines += [f"report: {Path(calibration.out) / 'report.html'}"] * bool(calibration.out)
+    for line in lines:
+        console.print(line, highlight=False, markup=False)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from sipe_bayes.cli.studies import (
     Retry,
     Where,
     add_status_and_cells,
+    chosen,
     executor_of,
     measure,
-    named_suite,
     say,
 )
 
@@ -74,13 +74,10 @@ def run(
 ) -> None:
     """Measure the cells of a suite that have no record yet; exit code 1 if one failed."""
     with exit_on_error("; the same command goes on"):
-        from sipe_bayes.benchmark.cells import changed
-
         check_least(1, budget=budget, steps=steps, training=training, jobs=jobs)
         study = _study()
-        cells = changed(study.select(named_suite(suite), select or ()), budget, steps, training)
-        end = measure(study, cells, out, executor_of(executor, jobs, address), retry_failed)
-    end()
+        cells = chosen(study, suite, select, budget, steps, training)
+        measure(study, cells, out, executor_of(executor, jobs, address), retry_failed)
 
 
 def simulate(
@@ -109,9 +106,9 @@ def simulate(
 
         check_least(1, budget=budget, steps=steps, jobs=jobs)
         check_one_of("variant", variant, VARIANTS)
-        (chosen,) = (v for v in VARIANTS if v == variant)
-        horizon = Cell(environment, "prior", variant=chosen, seed=seed, steps=steps).horizon
-        which = bank.Bank(environment, chosen, seed, horizon)
+        (replayed,) = (v for v in VARIANTS if v == variant)
+        horizon = Cell(environment, "prior", variant=replayed, seed=seed, steps=steps).horizon
+        which = bank.Bank(environment, replayed, seed, horizon)
         if not verify:
             order = runs.Order(out, executor_of(executor, jobs, address), command_line(), report=say)
             runs.simulate(which, budget, order)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -34,29 +35,24 @@ def check(
     """
     with exit_on_error("; the same command goes on"):
         from sipe_bayes.calibration import check as checks
-        from sipe_bayes.calibration import study as studies
+        from sipe_bayes.calibration.run import run_name
+        from sipe_bayes.calibration.study import study_of_config, study_of_task
         from sipe_bayes.core.files import to_json
         from sipe_bayes.diagnostics.coverage import FEWEST
 
-        for option, value, least in (
-            ("--truths", truths, FEWEST),
-            ("--steps", steps, 1),
-            ("--refits", refits, 0),
-            ("--seed", seed, 0),
-        ):
-            whole(option, value, least)
+        whole("--truths", truths, FEWEST)
+        whole("--steps", steps)
+        whole("--refits", refits, 0)
+        whole("--seed", seed, 0)
         at_least("--noise", noise, 0)
-        if target.endswith(".toml"):
-            study = studies.study_of_config(
-                Path(target), estimator, budget=budget, refits=refits, seed=seed, threads=threads
-            )
-        else:
-            study = studies.study_of_task(
-                target, estimator, steps=steps, noise=noise, budget=budget, refits=refits, seed=seed, threads=threads
-            )
         path = Path(target)
-        stem = path.resolve().parent.name if path.stem in ("calibrate", "config") else path.stem
-        folder = out or Path("checks") / f"{stem}-{estimator}{f'-recalibrated{refits}' if refits else ''}"
+        make = (
+            partial(study_of_config, path)
+            if path.suffix == ".toml"
+            else partial(study_of_task, target, steps=steps, noise=noise)
+        )
+        study = make(estimator, budget=budget, refits=refits, seed=seed, threads=threads)
+        folder = out or Path("checks") / f"{run_name(path)}-{estimator}{f'-recalibrated{refits}' if refits else ''}"
         once, each = study.cost
         trained = f"one training of {once} rollouts, then " * bool(once)
         of = f" of at most {each} rollouts each" * bool(each)

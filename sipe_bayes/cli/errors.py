@@ -32,9 +32,11 @@ def exit_on_error(then: str = "") -> Iterator[None]:
     """
     try:
         yield
+    except (NotImplementedError, RecursionError, typer.Exit):
+        raise  # no input is at fault
     except (ValueError, ImportError, OSError, RuntimeError) as error:
-        if type(error).__name__.endswith("LinAlgError") or isinstance(error, NotImplementedError | RecursionError):
-            raise  # no input is at fault
+        if type(error).__name__.endswith("LinAlgError"):
+            raise
         print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
     except KeyboardInterrupt:
@@ -50,15 +52,7 @@ def _text(error: Exception) -> str:
 
 
 def check_least(least: int, **options: float | None) -> None:
-    """See that options are large enough; one that is left out is.
-
-    Args:
-        least: that they may be.
-        **options: by name, with ``_`` for ``-``.
-
-    Raises:
-        ValueError: which names the option.
-    """
+    """See that options, named with ``_`` for ``-``, are large enough; one that is left out is."""
     for name, value in options.items():
         if value is not None and value < least:
             option = name.replace("_", "-")
@@ -66,16 +60,7 @@ def check_least(least: int, **options: float | None) -> None:
 
 
 def check_one_of(option: str, value: str, known: tuple[str, ...]) -> None:
-    """See that an option is one of the legal words.
-
-    Args:
-        option: its name, without ``--``.
-        value: that was given.
-        known: the legal words.
-
-    Raises:
-        ValueError: which lists them.
-    """
+    """See that an option is one of the legal words; raises ValueError which lists them."""
     if value not in known:
         raise ValueError(f"--{option} {value}: expected one of {', '.join(known)}")
 

@@ -30,13 +30,7 @@ Address = Annotated[str | None, typer.Option(help="HOST:PORT of a Ray cluster; d
 
 
 def add_status_and_cells(app: typer.Typer, load: Callable[[], Study], about_status: str) -> None:
-    """Give a study its commands ``status`` and ``cells``.
-
-    Args:
-        app: of the study.
-        load: imports it.
-        about_status: help of ``status``.
-    """
+    """Give a study, which ``load`` imports, its commands ``status`` and ``cells``."""
 
     @app.command(help=about_status)
     def status(folder: Folder = Path("results"), as_json: AsJson = False) -> None:
@@ -60,56 +54,38 @@ def add_status_and_cells(app: typer.Typer, load: Callable[[], Study], about_stat
         print("\n".join(lines))
 
 
-def named_suite(suite: str | None) -> str:
-    """The suite; raises ValueError where none is named, as most take hours."""
+def chosen(
+    study: Study,
+    suite: str | None,
+    select: Sequence[str] | None,
+    budget: int | None,
+    steps: int | None,
+    training: int | None,
+) -> Sequence[Cell]:
+    """The cells of a suite that the options ask for; raises ValueError where none is named, as most take hours."""
+    from sipe_bayes.benchmark.cells import changed
+
     if suite is None:
         raise ValueError("--suite: expected the name of one, such as --suite quick; the cells command lists them")
-    return suite
+    return changed(study.select(suite, select or ()), budget, steps, training)
 
 
-def measure(
-    study: Study, cells: Sequence[Cell], out: Path, start: Callable[[], Executor], retry_failed: bool
-) -> Callable[[], None]:
-    """Measure cells.
-
-    Args:
-        study: whose they are.
-        cells: which.
-        out: folder of results.
-        start: makes the executor.
-        retry_failed: measure failed ones again.
-
-    Returns:
-        What ends the command: with exit code 1 where cells failed.
-    """
+def measure(study: Study, cells: Sequence[Cell], out: Path, start: Callable[[], Executor], retry_failed: bool) -> None:
+    """Measure a study's cells by the executor that ``start`` makes; exit code 1 where cells failed."""
     from sipe_bayes.benchmark.run import Order, run
 
-    order = Order(out, start, command_line(), retry_failed, say)
-    failed = run(cells, order, study.kind)
-
-    def end() -> None:
-        if failed:
-            print(
-                f"sipe: {failed} {study.unit}{'s' * (failed > 1)} failed; `sipe {study.name} status {out}` shows why; "
-                "the same command with --retry-failed tries again, and other settings go into a new --out",
-                file=sys.stderr,
-            )
-            raise typer.Exit(1)
-
-    return end
+    failed = run(cells, Order(out, start, command_line(), retry_failed, say), study.kind)
+    if failed:
+        print(
+            f"sipe: {failed} {study.unit}{'s' * (failed > 1)} failed; `sipe {study.name} status {out}` shows why; "
+            "the same command with --retry-failed tries again, and other settings go into a new --out",
+            file=sys.stderr,
+        )
+        raise typer.Exit(1)
 
 
 def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[], Executor]:
-    """What makes the executor.
-
-    Args:
-        name: pool, ray or inline.
-        jobs: processes of a pool.
-        address: of a cluster.
-
-    Raises:
-        ValueError: for options that do not go together.
-    """
+    """What makes the executor of a name; raises ValueError for options that do not go together."""
     from sipe_bayes.core.validation import cores
 
     if address is not None and name != "ray":

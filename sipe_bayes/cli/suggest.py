@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from sipe_bayes.cli.errors import exit_on_error
@@ -45,8 +46,6 @@ def suggest(
 ) -> None:
     """Which experiment next: command sequences ranked by the expected contraction of the parameters' sds."""
     with exit_on_error():
-        import numpy as np
-
         from sipe_bayes.calibration.problem import prepare
         from sipe_bayes.core.files import to_json
         from sipe_bayes.diagnostics import suggest as suggestions
@@ -56,11 +55,8 @@ def suggest(
         whole("--draws", draws)
         positive("--duration", duration)
         problem = prepare(config, threads)
-        used = {
-            path.resolve()
-            for path in (config, problem.config.model, *(log.file for log in problem.config.logs), *(given or []))
-        }
-        if out.resolve() in used:
+        read = (config, problem.config.model, *(log.file for log in problem.config.logs), *(given or []))
+        if out.resolve() in (path.resolve() for path in read):
             raise ValueError(f"--out {out}: is what {config} reads, and would be lost; choose another name")
         dt = float(problem.train.dt[0])
         bounds = suggestions.limits(problem.simulator, np.concatenate([log.actions for log in problem.train]))
@@ -69,17 +65,9 @@ def suggest(
         plans += [_read(problem, file, dt) for file in given or []]
         if not plans:
             raise ValueError("--candidates: expected at least 1, or --given; got none")
-        known = _known(problem, posterior)
-        found = suggestions.rank(
-            problem.simulator,
-            problem.segments,
-            plans,
-            _noise(problem, posterior),
-            known,
-            parameter or (),
-            draws=draws,
-            seed=seed,
-        )
+        known, noise = _known(problem, posterior), _noise(problem, posterior)
+        model = problem.simulator, problem.segments
+        found = suggestions.rank(*model, plans, noise, known, parameter or (), draws=draws, seed=seed)
         _write(problem, found[0].plan, out)
     if as_json:
         print(to_json({**suggestions.to_dict(found, problem.simulator, parameter or ()), "out": str(out)}))
@@ -109,8 +97,6 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
     """Of the fitted channels: as the run beside the posterior found it, else by a fit."""
     import json
 
-    import numpy as np
-
     from sipe_bayes.inference.log_noise import fitted_noise
     from sipe_bayes.likelihood.noise import Noise
 
@@ -128,8 +114,6 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
 
 def _read(problem: Problem, file: Path, dt: float) -> Plan:
     """Commands of a table, in the configuration's columns and units, on the logs' grid."""
-    import numpy as np
-
     from sipe_bayes.calibration.tables import read_table
     from sipe_bayes.core.units import to_si
     from sipe_bayes.diagnostics.expected import Plan
@@ -160,8 +144,6 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
 
 
 def _numbers(file: Path, name: str, column: Any) -> Any:
-    import numpy as np
-
     try:
         values = np.asarray(column, float)
     except (TypeError, ValueError):
@@ -172,7 +154,6 @@ def _numbers(file: Path, name: str, column: Any) -> Any:
 
 
 def _write(problem: Problem, plan: Plan, out: Path) -> None:
-    import numpy as np
     import pandas as pd
 
     from sipe_bayes.core.files import write_text

@@ -15,9 +15,9 @@ from sipe_bayes.cli.studies import (
     Retry,
     Where,
     add_status_and_cells,
+    chosen,
     executor_of,
     measure,
-    named_suite,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def run(
 ) -> None:
     """Measure a suite's cells that have no record yet, after the estimates they need; exit code 1 if one failed."""
     with exit_on_error("; the same command goes on"):
-        from sipe_bayes.benchmark.cells import changed
         from sipe_bayes.benchmark.transfer.study import varied
 
         check_least(1, training=training, budget=budget, steps=steps, jobs=jobs)
@@ -77,13 +76,12 @@ def run(
         if observation_noise is not None and not 0 < observation_noise < float("inf"):
             raise ValueError(f"--observation-noise {observation_noise}: expected an sd above 0; leave it out for none")
         study = _study()
-        cells = changed(study.select(named_suite(suite), select or ()), budget, steps, training)
+        cells = chosen(study, suite, select, budget, steps, training)
         if point and particles is not None:
             raise ValueError(f"--particles {particles}: does not go with --point; leave one of them out")
         cells = varied(cells, point="mean" if point else None, particles=particles)
         cells = varied(cells, wider=wider, observation_noise=observation_noise, action_delay=action_delay)
-        end = measure(study, cells, out, executor_of(executor, jobs, address), retry_failed)
-    end()
+        measure(study, cells, out, executor_of(executor, jobs, address), retry_failed)
 
 
 @app.command()

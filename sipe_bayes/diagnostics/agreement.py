@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
@@ -124,12 +125,7 @@ def compare_logs(
 
 
 def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
-    """The disagreement of two or more logs, or None; only parameters shared by all logs are compared.
-
-    Args:
-        space: of the N parameters.
-        logs: each by itself.
-    """
+    """The disagreement of two or more logs, or None; only parameters shared by all logs are compared."""
     shared = [j for j, p in enumerate(space) if p.log is None]
     if len(logs) < 2 or not shared:
         return None
@@ -186,17 +182,10 @@ class _Scatter:
 
 def _scatter(roots: list[FloatArray], sought: list[FloatArray], own: int | None = None) -> _Scatter:
     """With all parameters common, but ``own``."""
-    n, k = roots[0].shape[1], len(roots)
-    common = [j for j in range(n) if j != own]
-    mine = k if own is not None else 0
-    rows = np.zeros((sum(map(len, roots)), len(common) + mine))
-    at = 0
-    for i, root in enumerate(roots):
-        rows[at : at + len(root), : len(common)] = root[:, common]
-        if own is not None:
-            rows[at : at + len(root), len(common) + i] = root[:, own]
-        at += len(root)
-    target = np.concatenate(sought)
+    common = [j for j in range(roots[0].shape[1]) if j != own]
+    rows, target = np.take(np.concatenate(roots), common, axis=1), np.concatenate(sought)
+    if own is not None:
+        rows = np.hstack([rows, scipy.linalg.block_diag(*(root[:, [own]] for root in roots))])
     eigenvalues, axes = np.linalg.eigh(rows.T @ rows)
     weak = eigenvalues <= UNIFORM_PRECISION
     low = np.where(weak, np.minimum(axes, 0).sum(0), -np.inf)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TypedDict
 
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.diagnostics.identifiability import GRID
-from sipe_bayes.diagnostics.sensitivity import Sensitivity, sensitivity
+from sipe_bayes.diagnostics.sensitivity import sensitivity
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Task
 from sipe_bayes.simulation.simulator import Simulator
@@ -62,21 +64,14 @@ def to_json_row(description: TaskDescription) -> dict[str, object]:
 
 
 def describe(name: str) -> TaskDescription:
-    """One task with its parameters, variants and measured sensitivities.
-
-    Args:
-        name: of the task.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
+    """One task with its parameters, variants and measured sensitivities; raises ValueError for an unknown name."""
     task = make_task(name)
     measured = sensitivity(Simulator(task))
     return {
         "task": _row(task),
         "observation": list(task.channels),
         "sensitivity_at_theta": list(GRID),
-        "parameters": [_parameter(task, j, measured) for j in range(len(task.space))],
+        "parameters": [_parameter(p, moved) for p, moved in zip(task.space, measured.moved.T, strict=True)],
         "variants": {v: task.theta(v).round(6).tolist() for v in VARIANTS},
         "changes_nothing": measured.dead,
         "changes_nothing_at_theta": measured.dead_ranges,
@@ -98,8 +93,7 @@ def _row(task: Task) -> TaskRow:
     }
 
 
-def _parameter(task: Task, index: int, measured: Sensitivity) -> ParameterRow:
-    parameter = task.space[index]
+def _parameter(parameter: Parameter, moved: FloatArray) -> ParameterRow:
     return {
         "name": parameter.name,
         "unit": parameter.unit,
@@ -108,5 +102,5 @@ def _parameter(task: Task, index: int, measured: Sensitivity) -> ParameterRow:
         "high": parameter.high,
         "writes": list(parameter.targets),
         "description": parameter.description,
-        "sensitivity": [float(f"{x:.3g}") for x in measured.moved[:, index]],
+        "sensitivity": [float(f"{x:.3g}") for x in moved],
     }

@@ -127,9 +127,8 @@ class CalibrationCheck:
     @property
     def calibrated(self) -> bool:
         """Whether no check gives cause for alarm."""
-        return self.tarp.p >= THRESHOLDS.miscalibrated and all(
-            self.verdict(name) == "calibrated" for name in self.names
-        )
+        each = all(self.verdict(name) == "calibrated" for name in self.names)
+        return each and self.tarp.p >= THRESHOLDS.miscalibrated
 
     def _ranks_sentence(self) -> str:
         wrong = [(name, u) for name, u in zip(self.names, self.ranks, strict=True) if u.p < self._alarm]
@@ -150,7 +149,7 @@ class CalibrationCheck:
         if not wrong:
             return f"coverage: {held}: as they should (smallest p = {min(u.p for u in self.intervals):.2g})"
         name, worst = min(wrong, key=lambda pair: (pair[1].p, -abs(_lean(pair[1]))))
-        share = float(np.mean(worst.values <= THRESHOLDS.shown_interval))
+        share = float(np.mean(worst.values <= level))
         return f"coverage: {held}: {self.verdict(name)}, worst {name} with {_percent(share)} (p = {worst.p:.1g})"
 
     def _tarp_sentence(self) -> str:
@@ -194,25 +193,17 @@ def check_calibration(
     Raises:
         ValueError: for fewer than 20 pairs or other shapes.
     """
-    names, generator = _names(posteriors), torch.Generator().manual_seed(seed)
+    names, generator = {posterior.space.names for posterior in posteriors}, torch.Generator().manual_seed(seed)
+    if len(names) > 1:
+        raise ValueError(f"posteriors: expected the same parameters in all, got {sorted(names)}")
     points = [posterior.sample((draws,), generator=generator).numpy() for posterior in posteriors]
-    return check_draws(names, points, truths, seed=seed)
+    return check_draws(names.pop() if names else (), points, truths, seed=seed)
 
 
 def check_draws(
     names: tuple[str, ...], draws: Sequence[FloatArray], truths: ArrayLike, *, seed: int = 0
 ) -> CalibrationCheck:
-    """As ``check_calibration``, of draws.
-
-    Args:
-        names: of the N parameters.
-        draws: R of (M, N), of the posteriors in theta.
-        truths: (R, N) in theta.
-        seed: the same one gives the same answer.
-
-    Raises:
-        ValueError: for fewer than 20 pairs or other shapes.
-    """
+    """As ``check_calibration``, of R draws (M, N) of the posteriors of N named parameters in theta."""
     theta = np.asarray(truths, float)
     if len(draws) < FEWEST:
         raise ValueError(f"posteriors: expected at least {FEWEST} of as many truths, got {len(draws)}")
@@ -243,12 +234,11 @@ def tarp_values(
     Returns:
         (R,).
     """
-    return np.array(
-        [
-            _mass(np.linalg.norm(d - r, axis=1, keepdims=True), np.linalg.norm(t - r, axis=0, keepdims=True), rng)[0]
-            for d, t, r in zip(draws, truths, references, strict=True)
-        ]
-    )
+    masses = [
+        _mass(np.linalg.norm(d - r, axis=1, keepdims=True), np.linalg.norm(t - r, axis=0, keepdims=True), rng)
+        for d, t, r in zip(draws, truths, references, strict=True)
+    ]
+    return np.concatenate(masses)
 
 
 def uniformity(values: FloatArray) -> Uniformity:
@@ -300,10 +290,3 @@ def _percent(share: float) -> str:
 def _tails(seen: Uniformity) -> str:
     outer = float(np.mean(np.abs(seen.values - 0.5) > 0.45))
     return f"and {_percent(outer)} instead of 10 % of the values are in the outer tenth"
-
-
-def _names(posteriors: Sequence[Posterior]) -> tuple[str, ...]:
-    names = {posterior.space.names for posterior in posteriors}
-    if len(names) > 1:
-        raise ValueError(f"posteriors: expected the same parameters in all, got {sorted(names)}")
-    return names.pop() if names else ()

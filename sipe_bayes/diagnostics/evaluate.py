@@ -31,15 +31,14 @@ def measured_starts(windows: Windows, theta: FloatArray) -> FloatArray:
     """Starts (B, W, D) of theta (B, N): what was measured there, less the sensor bias that theta claims."""
     simulator, model = windows.simulator, windows.simulator.model
     starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
-    tangent = _tangents(model)
-    columns = [tangent.get(column) for column in simulator.environment.state_columns(model) if column is not None]
-    channels = [c for c, column in enumerate(simulator.environment.state_columns(model)) if column is not None]
+    states, tangent = simulator.environment.state_columns(model), _tangents(model)
+    columns = {channel: tangent[column] for channel, column in enumerate(states) if column in tangent}
     for b, values in enumerate(simulator.space.values(theta)):
         for name in set(windows.names):
             bias = simulator.environment.bias(values, name)
             mine = [w for w, log in enumerate(windows.names) if log == name]
-            for channel, column in zip(channels, columns, strict=True):
-                if column is not None and bias[channel]:
+            for channel, column in columns.items():
+                if bias[channel]:
                     starts[b, mine, column] = -bias[channel]
     return starts
 
@@ -116,11 +115,15 @@ def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
 
 def _best_squares(windows: Windows, theta: FloatArray) -> FloatArray:
     """As ``_squares`` of one theta (N,), from the starts that fit best: (W, L, C)."""
-    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
-    noise = Noise(np.maximum(0.05 * np.nan_to_num(spread), windows.rounding), np.zeros(len(spread)))
-    starts = best_starts(windows, theta, noise)
-    residual, valid = windows.residuals(theta[None], starts[None])
-    return np.where(windows.observed, residual[0] ** 2 if valid[0] else np.inf, 0.0)
+    residual, valid = _best_residuals(windows, theta)
+    return np.where(windows.observed, residual**2 if valid else np.inf, 0.0)
+
+
+def _best_residuals(windows: Windows, theta: FloatArray) -> tuple[FloatArray, bool]:
+    """Residuals (W, L, C) of theta (N,) from the starts that fit best, and whether the simulation is valid."""
+    noise = Noise(np.maximum(0.05 * np.nan_to_num(windows.spread), windows.rounding), np.zeros(len(windows.fitted)))
+    residual, valid = windows.residuals(theta[None], best_starts(windows, theta, noise)[None])
+    return residual[0], bool(valid[0])
 
 
 def _share_of_starts(windows: Windows, square: FloatArray, fitted: FloatArray) -> float:
@@ -130,8 +133,7 @@ def _share_of_starts(windows: Windows, square: FloatArray, fitted: FloatArray) -
     """
     if not (np.isfinite(square).all() and np.isfinite(fitted).all()):
         return 0.0
-    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
-    weight = np.where(spread > 0, 1 / np.maximum(spread, 1e-300) ** 2, 0.0)
+    weight = np.where(windows.spread > 0, 1 / np.maximum(windows.spread, 1e-300) ** 2, 0.0)
     before = float((square * weight).sum())
     return 1 - float((fitted * weight).sum()) / before if before > 0 else 0.0
 
@@ -157,18 +159,19 @@ def _jackknifed(parts: list[FloatArray]) -> Comparison:
     return Comparison(float(np.exp(mean)), float(np.exp(mean - margin)), float(np.exp(mean + margin)), p, pieces)
 
 
-def _unit(windows: Windows, channel: int) -> str:
+def fitted_units(windows: Windows) -> list[str]:
+    """The units of the fitted channels, empty where the environment tells none."""
     units = getattr(windows.simulator.environment, "channel_units", None)
-    return "" if units is None else units[windows.channels[channel]]
+    return ["" if units is None else units[c] for c in windows.channels]
 
 
 def channel_scores(windows: Windows, theta: FloatArray) -> list[ChannelScore]:
     """One row for each log and channel, theta (N,) beside the model as given."""
     rmse = errors(windows, np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)]))
     return [
-        ChannelScore(log, name, _unit(windows, c), float(rmse[0, k, c]), float(rmse[1, k, c]))
+        ChannelScore(log, *channel, float(rmse[0, k, c]), float(rmse[1, k, c]))
         for k, log in enumerate(windows.trajectories.names)
-        for c, name in enumerate(windows.fitted)
+        for c, channel in enumerate(zip(windows.fitted, fitted_units(windows), strict=True))
         if not np.isnan(rmse[0, k, c])
     ]
 
@@ -200,34 +203,19 @@ def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior,
             warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
             low, high = np.nanquantile(lines[2:], [0.05, 0.95], axis=0)
         begins = windows.start[windows.log == k] * trajectory.dt
-        for c, name in enumerate(windows.fitted):
+        for c, channel in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
             measured = trajectory.observations[:, windows.channels[c]]
-            out.append(
-                Signal(
-                    trajectory.name,
-                    use,
-                    name,
-                    _unit(windows, c),
-                    trajectory.time,
-                    measured,
-                    lines[0, :, c],
-                    low[:, c],
-                    high[:, c],
-                    lines[1, :, c],
-                    begins,
-                )
-            )
+            mode, q05, q95, default = (x[:, c] for x in (lines[0], low, high, lines[1]))
+            line = Signal(trajectory.name, use, *channel, trajectory.time, measured, mode, q05, q95, default, begins)
+            out.append(line)
     return out
 
 
 def white_noise(windows: Windows, theta: FloatArray) -> Noise:
     """White noise of the size of the residuals at theta (N,), with the windows' starts at their best."""
-    spread = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
-    none = np.zeros(len(spread))
-    starts = best_starts(windows, theta, Noise(np.maximum(0.05 * spread, windows.rounding), none))
-    residual = windows.residuals(theta[None], starts[None])[0][0]
-    size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(windows.observed.sum(axis=(0, 1)), 1))
-    return Noise(np.maximum(size, windows.rounding), none)
+    squares = (_best_residuals(windows, theta)[0] ** 2).sum(axis=(0, 1))
+    size = np.sqrt(squares / np.maximum(windows.observed.sum(axis=(0, 1)), 1))
+    return Noise(np.maximum(size, windows.rounding), np.zeros(len(size)))
 
 
 def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray) -> list[Residual]:
@@ -240,7 +228,7 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
         starts: (W, D) of the windows.
     """
     residual = windows.residuals(theta[None], starts[None])[0][0]
-    white = np.full((*residual.shape[:2], residual.shape[2]), np.nan)
+    white = np.full(residual.shape, np.nan)
     for c, s in enumerate(windows.sequences):
         flat = white[:, :, c].reshape(-1)
         flat[s.index] = whiten(residual[:, :, c].reshape(-1), s, float(noise.sd[c]), float(noise.tau[c]))
@@ -248,10 +236,9 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
     shown = np.where(windows.observed, residual, np.nan)
     out = []
     for k, trajectory in enumerate(windows.trajectories):
-        lines = (_stitched(windows, x[None], k)[0] for x in (shown, white))
-        raw, whitened = lines
-        for c, name in enumerate(windows.fitted):
-            out.append(Residual(trajectory.name, name, _unit(windows, c), trajectory.time, raw[:, c], whitened[:, c]))
+        raw, whitened = (_stitched(windows, x[None], k)[0] for x in (shown, white))
+        for c, channel in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
+            out.append(Residual(trajectory.name, *channel, trajectory.time, raw[:, c], whitened[:, c]))
     return out
 
 

@@ -33,13 +33,11 @@ def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[flo
         is not called dead.
     """
     space = windows.simulator.space
-    points = np.tile(theta, (len(space) * len(GRID), 1))
-    for j in range(len(space)):
-        points[j * len(GRID) : (j + 1) * len(GRID), j] = GRID
     dead: dict[str, list[tuple[float, float]]] = {}
-    scale = np.maximum(np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1)), 1e-12)
+    scale = np.maximum(windows.spread, 1e-12)
     for j, name in enumerate(space.names):
-        batch = points[j * len(GRID) : (j + 1) * len(GRID)]
+        batch = np.tile(theta, (len(GRID), 1))
+        batch[:, j] = GRID
         predicted, valid = windows.predict(batch, np.tile(windows.no_starts(), (len(GRID), 1, 1)))
         for k in range(len(GRID) - 1):
             if valid[k] and valid[k + 1]:
@@ -149,8 +147,8 @@ def _product(names: Sequence[str], weights: FloatArray) -> str:
     def factor(name: str, power: float) -> str:
         return name if abs(power - 1) < 0.05 else f"{name}^{power:.2g}"
 
-    above = [factor(n, w) for n, w in zip(names, weights, strict=True) if w > 0 and n]
-    below = [factor(n, -w) for n, w in zip(names, weights, strict=True) if w < 0 and n]
+    rows = [(n, w) for n, w in zip(names, weights, strict=True) if n]
+    above, below = [factor(n, w) for n, w in rows if w > 0], [factor(n, -w) for n, w in rows if w < 0]
     text = " * ".join(above) or "1"
     return f"{text} / {below[0] if len(below) == 1 else '(' + ' * '.join(below) + ')'}" if below else text
 

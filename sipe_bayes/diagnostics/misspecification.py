@@ -192,28 +192,22 @@ class _Residuals:
         rows = np.concatenate(parts, axis=-1)
         whole = Moments(np.zeros(rows.shape[:3]), rows, count + many, self.windows.sequences)
         starts = count + many + np.arange(2 * self.windows.num_start)
-        return [
-            (
-                _chosen(whole, np.concatenate([np.arange(n), starts, [count + s]]), n),
-                _chosen(whole, np.concatenate([np.arange(count), starts, [count + s]]), count),
-            )
-            for s in range(many)
-        ]
+
+        def of(s: int, first: int) -> Moments:
+            return _chosen(whole, np.concatenate([np.arange(first), starts, [count + s]]), first)
+
+        return [(of(s, n), of(s, count)) for s in range(many)]
 
     def _estimated(self, moments: Moments) -> Noise:
         """The noise that a fit would have found in a draw of it."""
-        n = moments.num_theta
-        none = self.windows.no_starts()
-        pulls = Pulls(self.inner, np.zeros(n), self.windows.start_precision, none, self.free)
-        windows, shortest = self.windows, float(self.windows.dt.min())
-        return estimate_noise(
-            moments, self.noise, pulls, windows.fixed_sd, self.coloured, shortest, windows.trajectories.longest
-        )
+        windows = self.windows
+        pulls = Pulls(self.inner, np.zeros(moments.num_theta), windows.start_precision, windows.no_starts(), self.free)
+        span = float(windows.dt.min()), windows.trajectories.longest
+        return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span)
 
     def _arrow(self, moments: Moments, noise: Noise) -> Eliminated:
-        return eliminate_starts(
-            moments.normal(noise), self.count, self.windows.start_precision, self.windows.no_starts()
-        )
+        windows = self.windows
+        return eliminate_starts(moments.normal(noise), self.count, windows.start_precision, windows.no_starts())
 
     def solved(self, residual: FloatArray, moments: Moments, noise: Noise, pull: FloatArray | None = None) -> _Solved:
         """Statistics of a residual, with what they are made of.
@@ -240,7 +234,7 @@ class _Residuals:
         # what theta and starts leave, whitened by channel
         base = np.concatenate([base, np.zeros(self.count - n)])
         left = self._left(residual, base, arrow.blocks(base))
-        white = [self._white(left, c, noise) for c in range(len(noise.sd))]
+        white = self._white(left, noise)
         whiteness = [_autocorrelation(z) for z in white]
         pieces = [
             max((float((p**2).mean()) for p in np.array_split(z, MISFIT.pieces) if len(p)), default=0.0) for z in white
@@ -254,19 +248,18 @@ class _Residuals:
         turned = np.einsum("wlcd,wd->wlc", self.jacobian[..., self.count :], starts)
         return np.where(self.windows.observed, residual - moved - turned, 0.0)
 
-    def _white(self, residual: FloatArray, c: int, noise: Noise) -> FloatArray:
-        flat = residual[:, :, c].reshape(-1)
-        return whiten(flat, self.windows.sequences[c], float(noise.sd[c]), float(noise.tau[c]))
+    def _white(self, residual: FloatArray, noise: Noise) -> list[FloatArray]:
+        """Each channel of a residual (W, L, C), whitened."""
+        rows = zip(np.moveaxis(residual, -1, 0), self.windows.sequences, noise.sd, noise.tau, strict=True)
+        return [whiten(channel.reshape(-1), s, float(sd), float(tau)) for channel, s, sd, tau in rows]
 
     def _probe_named(self, p: float, probe: int, seen: _Solved, sd: FloatArray | None) -> Misfit:
         n, names = self.windows.num_theta, self.windows.simulator.space.names
         amplitude = seen.score[probe] / seen.information[probe]
         step = seen.step + amplitude * np.concatenate([-seen.answer[:, probe], np.eye(len(self.probes))[probe]])
         explained = self._left(self.residual, step, seen.arrow.blocks(step))
-        gains = [
-            self._white(seen.left, c, self.noise) ** 2 - self._white(explained, c, self.noise) ** 2
-            for c in range(len(self.noise.sd))
-        ]
+        whitened = zip(self._white(seen.left, self.noise), self._white(explained, self.noise), strict=True)
+        gains = [plain**2 - probed**2 for plain, probed in whitened]
         before, after = ((x**2).sum((0, 1)) for x in (seen.left, explained))
         share = np.clip(1 - after / np.maximum(before, 1e-300), 0, 1)
         sd = np.sqrt(seen.variance) if sd is None else sd
@@ -276,8 +269,7 @@ class _Residuals:
 
     def _colour_named(self, p: float, statistic: int, seen: _Solved) -> Misfit:
         """statistic: of 2 C, autocorrelations first."""
-        channels = len(self.noise.sd)
-        white = [self._white(seen.left, c, self.noise) for c in range(channels)]
+        channels, white = len(self.noise.sd), self._white(seen.left, self.noise)
         share, gains = np.zeros(channels), [np.zeros(len(z)) for z in white]
         c = statistic % channels
         if statistic < channels:
@@ -295,13 +287,7 @@ class _Residuals:
         return self._placed(p, cause, remedy, gains, np.maximum(share, 0.0), {})
 
     def _placed(
-        self,
-        p: float,
-        cause: str,
-        remedy: str,
-        gains: list[FloatArray],
-        share: FloatArray,
-        shift: dict[str, float],
+        self, p: float, cause: str, remedy: str, gains: list[FloatArray], share: FloatArray, shift: dict[str, float]
     ) -> Misfit:
         """gains: per channel what each sample contributes."""
         windows, channel = self.windows, int(np.argmax([g.sum() for g in gains]))
@@ -332,7 +318,7 @@ def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
 
 def _foretold(z: FloatArray) -> FloatArray:
     """What least squares on the samples before, at ``MISFIT.lags``, says of z (n,)."""
-    lags = [lag for lag in MISFIT.lags if lag < len(z) // 4]
+    lags = _lags(z)
     if not lags:
         return np.zeros_like(z)
     before = np.stack([np.concatenate([np.zeros(lag), z[:-lag]]) for lag in lags], axis=1)
@@ -342,5 +328,8 @@ def _foretold(z: FloatArray) -> FloatArray:
 def _autocorrelation(z: FloatArray) -> float:
     z = z - z.mean()
     square = max(float(z @ z), 1e-300)
-    lags = [lag for lag in MISFIT.lags if lag < len(z) // 4]
-    return float(len(z) * sum((z[lag:] @ z[:-lag] / square) ** 2 for lag in lags))
+    return float(len(z) * sum((z[lag:] @ z[:-lag] / square) ** 2 for lag in _lags(z)))
+
+
+def _lags(z: FloatArray) -> list[int]:
+    return [lag for lag in MISFIT.lags if lag < len(z) // 4]

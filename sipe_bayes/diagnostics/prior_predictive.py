@@ -87,10 +87,8 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
     """
     logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
     if len(made) < _OPTIONS.simulations // 2:
-        raise ValueError(
-            f"prior: {len(made)} of {_OPTIONS.simulations} simulations did not diverge, half are needed; narrow the "
-            "bounds"
-        )
+        share = f"{len(made)} of {_OPTIONS.simulations}"
+        raise ValueError(f"prior: {share} simulations did not diverge, half are needed; narrow the bounds")
     far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
     farthest = np.zeros((len(logs), len(windows.channels)))
     for k, log in enumerate(logs):
@@ -118,9 +116,8 @@ def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: 
     replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
     thetas = prior.sample((_OPTIONS.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()
     batches = np.array_split(thetas, max(1, _OPTIONS.simulations // _OPTIONS.batch))
-    return [
-        one.observations for batch in batches for one in replicas.many(batch, rng, estimated=True) if one is not None
-    ]
+    made = (one for batch in batches for one in replicas.many(batch, rng, estimated=True))
+    return [one.observations for one in made if one is not None]
 
 
 def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:

@@ -129,18 +129,17 @@ def score(posterior: Posterior, truth: Numbers, prior: Posterior | None = None) 
     if before.space.names != posterior.space.names:
         raise ValueError(f"prior: expected parameters {list(posterior.space.names)}, got {list(before.space.names)}")
     error = crps(posterior, theta)
-    distance = np.maximum(np.maximum(-theta, theta - 1), 0.0)
     return Scores(
         names=posterior.space.names,
-        accuracy=_floats(1 - np.abs(posterior.mean.numpy() - theta)),
-        crps=_floats(error),
+        accuracy=tuple((1 - np.abs(posterior.mean.numpy() - theta)).tolist()),
+        crps=tuple(error.tolist()),
         energy=energy_score(posterior, theta),
         nats=nats(posterior, theta, before),
         covered={str(level): _covered(posterior, theta, level) for level in LEVELS},
-        contraction=_floats(1 - posterior.stddev.numpy() / before.stddev.numpy()),
+        contraction=tuple((1 - posterior.stddev.numpy() / before.stddev.numpy()).tolist()),
         skill_over_prior_mean=_skill(error, crps(Dirac(before.mean, posterior.space), theta)),
         skill_over_prior=_skill(error, crps(before, theta)),
-        distance=_floats(distance),
+        distance=tuple(np.maximum(np.maximum(-theta, theta - 1), 0.0).tolist()),
         noticed=_noticed(posterior, theta),
     )
 
@@ -244,9 +243,8 @@ def c2st(posterior: Posterior, reference: Numbers, seed: int = 0) -> float:
         own = stored[torch.randperm(len(stored), generator=generator)[: len(given)]]
     else:
         own = posterior.sample((len(given),), generator=generator)
-    return float(
-        import_sbi("utils.metrics").c2st(torch.from_numpy(given)[: len(own)].float(), own.float(), seed=seed + 1)
-    )
+    other = torch.from_numpy(given)[: len(own)].float()
+    return float(import_sbi("utils.metrics").c2st(other, own.float(), seed=seed + 1))
 
 
 def _stored(posterior: Posterior) -> torch.Tensor | None:
@@ -283,7 +281,7 @@ def _warn_if_far(posterior: Posterior, theta: FloatArray) -> None:
 
 def _covered(posterior: Posterior, theta: FloatArray, level: float) -> tuple[bool, ...]:
     low, high = posterior.quantile([(1 - level) / 2, (1 + level) / 2]).numpy()
-    return tuple(bool(x) for x in (low <= theta) & (theta <= high))
+    return tuple(((low <= theta) & (theta <= high)).tolist())
 
 
 def _skill(error: FloatArray, reference: FloatArray) -> float | None:
@@ -296,7 +294,3 @@ def _noticed(posterior: Posterior, theta: FloatArray) -> tuple[bool | None, ...]
     to_bound = np.where(theta < 0, median, 1 - median)
     outside = (theta < 0) | (theta > 1)
     return tuple(bool(d < THRESHOLDS.at_bound) if out else None for d, out in zip(to_bound, outside, strict=True))
-
-
-def _floats(array: FloatArray) -> tuple[float, ...]:
-    return tuple(float(x) for x in array)

@@ -50,22 +50,15 @@ class Sensitivity:
     @property
     def dead(self) -> list[str]:
         """Parameters that change nothing, in words."""
-        return [
-            name
-            for name, column in zip(self.names, self.moved.T, strict=True)
-            if (column < THRESHOLDS.sensitivity).all()
-        ]
+        columns = zip(self.names, THRESHOLDS.sensitivity > self.moved.T, strict=True)
+        return [name for name, idle in columns if idle.all()]
 
     @property
     def dead_ranges(self) -> dict[str, list[float]]:
         """For parameters that matter elsewhere: the levels of theta at which they change nothing."""
-        dead = {}
-        for name, column in zip(self.names, self.moved.T, strict=True):
-            if (column < THRESHOLDS.sensitivity).any() and not (column < THRESHOLDS.sensitivity).all():
-                dead[name] = [
-                    level for level, moved in zip(GRID, column, strict=True) if moved < THRESHOLDS.sensitivity
-                ]
-        return dead
+        columns = zip(self.names, THRESHOLDS.sensitivity > self.moved.T, strict=True)
+        levels = np.array(GRID)
+        return {name: levels[idle].tolist() for name, idle in columns if idle.any() and not idle.all()}
 
 
 def sensitivity(simulator: Simulator, seed: int = 0) -> Sensitivity:

@@ -144,9 +144,8 @@ def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArr
         elif recorded is not None:
             ranges[j] = recorded[:, j].min(), recorded[:, j].max()
     if not (ranges[:, 0] < ranges[:, 1]).all():
-        raise ValueError(
-            "limits: the model states no control range and in no log the command changes; give the actuators ctrlrange"
-        )
+        missing = "the model states no control range and in no log the command changes"
+        raise ValueError(f"limits: {missing}; give the actuators ctrlrange")
     return ranges
 
 
