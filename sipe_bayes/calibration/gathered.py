@@ -12,7 +12,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, Severity, finding
-from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge
 from sipe_bayes.diagnostics.result import ParameterSummary
@@ -83,18 +83,14 @@ class Marginals:
                 contraction = float(self.contraction[j])
                 noticed.append(about(Code.NOT_DETERMINED, severity=severity, contraction=contraction))
             elif self._at_bound(j):
-                noticed.append(about(Code.MODE_AT_BOUND, bound=_nearer_bound(p, float(self.theta[j]))))
+                value = float(p.value(float(self.theta[j])))
+                bound = p.low if value - p.low < p.high - value else p.high
+                noticed.append(about(Code.MODE_AT_BOUND, bound=bound))
         return noticed
 
     def _at_bound(self, j: int) -> bool:
         near = THRESHOLDS.at_bound * min(1.0, THRESHOLDS.bound_sds * self.sd[j])
         return bool(min(self.theta[j], 1 - self.theta[j]) < near)
-
-
-def _nearer_bound(parameter: Parameter, theta: float) -> float:
-    """The bound, in units, that the value of a theta is nearer to."""
-    value = float(parameter.value(theta))
-    return parameter.low if value - parameter.low < parameter.high - value else parameter.high
 
 
 def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:

@@ -29,14 +29,7 @@ _PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emc
 
 
 def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, object]:
-    """Configuration, versions, seed and checksums of the inputs, as JSON has them.
-
-    Args:
-        problem: the configuration read and bound.
-        estimator: its name.
-        seed: of the fit.
-        budget: rollouts of the fit, if limited.
-    """
+    """Configuration, versions, seed and checksums of the inputs of a fit, as JSON has them."""
     config = problem.config
     return {
         "config": str(config.path),
@@ -108,12 +101,7 @@ def claim(
 
 
 def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calibration:
-    """Fill the folder of a finished run; its ``run.json`` comes last and says so.
-
-    Args:
-        calibration: the result.
-        problem: that it is of.
-        folder: claimed by this run.
+    """Fill the folder of a finished run, which claimed it; its ``run.json`` comes last and says so.
 
     Returns:
         The result with what was noticed on the way.
@@ -127,7 +115,7 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
     except ExportError as error:
         noticed = [finding(Code.NOT_EXPORTED, reason=error)]
     calibration = replace(calibration, findings=(*calibration.findings, *noticed))
-    draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=_generator())
+    draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=torch.Generator().manual_seed(0))
     write_randomization(problem.environment, draws, folder / RANDOMIZATION)
     randomization = domain_randomization(calibration, problem)
     write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
@@ -144,7 +132,7 @@ def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str
     each target that it is written to, ``posterior`` which saved posterior beside the file the normal stands for.
     """
     space = problem.environment.space
-    draws = calibration.posterior.values(_COVARIANCE_DRAWS, generator=_generator())
+    draws = calibration.posterior.values(_COVARIANCE_DRAWS, generator=torch.Generator().manual_seed(0))
     rows = [
         {"name": p.name, "targets": problem.environment.multipliers(s)}
         | {key: getattr(p, key) for key in ("unit", "mean", "sd", "q05", "q95")}
@@ -153,7 +141,3 @@ def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str
     ]
     covariance = np.atleast_2d(np.cov(draws.T))
     return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "posterior": "posterior"}
-
-
-def _generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)

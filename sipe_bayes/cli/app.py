@@ -40,7 +40,6 @@ app.command()(suggest_commands.suggest)
 app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 
-_ABORTED = 1
 # what the parser says of options and arguments, whose name typer keeps private
 _REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
@@ -52,7 +51,7 @@ def main() -> None:
     try:
         code = app(standalone_mode=False)
     except typer.Abort:
-        code = _ABORTED
+        code = 1
     except _REFUSED as error:
         message = error.format_message()
         if not message or "\n" in message:  # the help, where a command was given nothing

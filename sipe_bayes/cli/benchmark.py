@@ -48,7 +48,7 @@ def report(
         from sipe_bayes.benchmark.report_latex import write_reports
         from sipe_bayes.benchmark.run import not_a_file
 
-        target = folder if out is None else out
+        target = out or folder
         not_a_file(target)
         written, note = write_reports(contents(folder), target)
     for path in written:

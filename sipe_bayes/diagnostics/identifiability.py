@@ -43,18 +43,11 @@ def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[flo
             if valid[k] and valid[k + 1]:
                 change = np.abs(predicted[k + 1] - predicted[k]) / scale
                 if np.where(windows.observed, change, 0.0).max() < THRESHOLDS.no_effect:
-                    dead.setdefault(name, []).append((GRID[k], GRID[k + 1]))
-    return {name: _joined(pieces) for name, pieces in dead.items()}
-
-
-def _joined(pieces: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    out: list[tuple[float, float]] = []
-    for low, high in pieces:
-        if out and out[-1][1] == low:
-            out[-1] = (out[-1][0], high)
-        else:
-            out.append((low, high))
-    return out
+                    pieces = dead.setdefault(name, [])
+                    goes_on = pieces and pieces[-1][1] == GRID[k]
+                    low = pieces.pop()[0] if goes_on else GRID[k]
+                    pieces.append((low, GRID[k + 1]))
+    return dead
 
 
 def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float]) -> list[Ridge]:
@@ -109,8 +102,8 @@ def _describe(
     spaces = [("sum", chosen)]
     if (np.abs(np.sign(chosen).sum(0)) == len(chosen)).all():  # nobody changes sign: products have logarithms
         spaces.insert(0, ("product", np.log(np.abs(chosen))))
-    best = min(((*_narrowest(x), kind, x) for kind, x in spaces), key=lambda one: one[0])
-    eigenvalue, weights, loadings, kind, x = best[0], np.array(best[1]), np.array(best[2]), best[3], best[4]
+    every = ((*_narrowest(x), kind, x) for kind, x in spaces)
+    eigenvalue, weights, loadings, kind, x = min(every, key=lambda one: one[0])
     if eigenvalue > THRESHOLDS.ridge:
         return None
     kept = _members(loadings)
@@ -132,13 +125,13 @@ def _describe(
     return Ridge(tuple(names), text, float(value), float(width), unit, tuple(unknown))
 
 
-def _narrowest(x: FloatArray) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
+def _narrowest(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Smallest eigenvalue of the correlation of x (n, m), its direction in x's units and its loadings."""
     sd = np.maximum(x.std(0), 1e-300)
     eigenvalues, vectors = np.linalg.eigh(np.corrcoef((x / sd).T))
     weights = vectors[:, 0] / sd
-    weights = weights / weights[int(np.argmax(np.abs(vectors[:, 0])))]
-    return float(eigenvalues[0]), tuple(weights), tuple(np.abs(vectors[:, 0]))
+    loadings = np.abs(vectors[:, 0])
+    return float(eigenvalues[0]), weights / weights[int(np.argmax(loadings))], loadings
 
 
 def _product(names: Sequence[str], weights: FloatArray) -> str:
