@@ -258,7 +258,7 @@ def test_killed_run_resumes_to_the_same_posterior(tmp_path: Path, log: pd.DataFr
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
         with safe_open(tmp_path / "broken" / "checkpoint.safetensors", framework="numpy") as file:
-            assert not json.loads(file.metadata()["plain"])["done"]
+            assert not json.loads(file.metadata()["plain"])["state"]["done"]
         assert not (tmp_path / "broken" / "posterior.safetensors").exists()
         resumed = sipe_command(tmp_path, *broken, "--threads", 2)
         assert resumed.returncode == 0, resumed.stderr
