@@ -79,13 +79,7 @@ class Behaviour:
 
 
 def agent(task: Task, policy: Policy, type: Agent) -> Behaviour:
-    """A deterministic policy's, one observation at a time: the bits do not depend on how many trajectories there are.
-
-    Args:
-        task: which.
-        policy: actions (B, A) of observations (B, O).
-        type: of the agent.
-    """
+    """A deterministic policy's, one observation at a time: the bits do not depend on the number of trajectories."""
     low, high, size = task.action_low, task.action_high, task.num_actions
     noise = action_noise(task)
     return Behaviour(
@@ -104,12 +98,7 @@ def random(task: Task) -> Behaviour:
 
 
 def excitation(task: Task, dt: float) -> Behaviour:
-    """The excitation policy's.
-
-    Args:
-        task: which.
-        dt: of a control step, s.
-    """
+    """The excitation policy's, with control steps of ``dt`` seconds."""
 
     def respond(seen: FloatArray, planned: FloatArray, rng: np.random.Generator) -> FloatArray:
         chosen = task.excitation(seen, rng)
@@ -120,14 +109,7 @@ def excitation(task: Task, dt: float) -> Behaviour:
 
 
 def smooth_actions(task: Task, dt: float, steps: int, rng: np.random.Generator) -> FloatArray:
-    """The open-loop excitation's actions (T, A), within the task's bounds.
-
-    Args:
-        task: which.
-        dt: of a control step, s.
-        steps: T.
-        rng: of frequencies, phases and shares.
-    """
+    """The open-loop excitation's actions (T, A) at control steps of ``dt`` seconds, within the task's bounds."""
     of = EXCITATION
     shape = (task.num_actions, of.sines)
     frequency = np.exp(rng.uniform(np.log(of.slowest), np.log(of.fastest), shape))

@@ -115,28 +115,12 @@ def demonstrations(
 
 
 def default_steps(task: Task, longest: int = 250) -> int:
-    """Control steps of a trajectory where none are asked for.
-
-    Args:
-        task: which.
-        longest: of a task whose episodes are longer.
-    """
+    """Control steps of a trajectory where none are asked for, ``longest`` of a task whose episodes are longer."""
     return min(task.episode_steps, longest)
 
 
 def behaviour_of(task: Task, type: Agent) -> Behaviour | None:
-    """How an agent acts.
-
-    Args:
-        task: which.
-        type: of the agent.
-
-    Returns:
-        None where it is not installed.
-
-    Raises:
-        PolicyError: for a file that is no such policy.
-    """
+    """How an agent acts, None where it is not installed; raises PolicyError for a file that is no such policy."""
     if type == "random":
         return acting.random(task)
     file = agent_file(task.name, type)
@@ -155,12 +139,7 @@ def behaviour_of(task: Task, type: Agent) -> Behaviour | None:
 
 
 def agent_file(task: str, type: str) -> Path | None:
-    """The file of a task's agent, or None where it is not installed.
-
-    Args:
-        task: its name.
-        type: of the agent.
-    """
+    """The file of a task's agent, or None where it is not installed."""
     path = AGENT_FILES / f"{_ROBOTS.get(task, task)}-{type}.safetensors"
     return path if path.is_file() else None
 
@@ -252,7 +231,9 @@ def simulator_of(env: Environment) -> tuple[Simulator, FloatArray]:
         )
     rows = np.atleast_2d(theta)
     if (rows != rows[0]).any():
-        raise ValueError("env: its lanes differ in their parameters; give them one theta, or take sipe.make(...)")
+        raise ValueError(
+            "env: its parameters differ between sub-environments; give them one theta, or take sipe.make(...)"
+        )
     return simulator, rows[0]
 
 

@@ -57,8 +57,8 @@ COUNT = 5
 """Trajectories of a set."""
 _SHARED = {
     "HalfCheetahJoints": "HalfCheetahLinks",
-    "HalfCheetahAllJoints": "HalfCheetahLinks",
-}  # in the default variant
+    "HalfCheetahAllJoints": "HalfCheetahLinks",  # in the default variant
+}
 _REMEDY = "reinstall the package, or remake it with `sipe data generate`"
 
 
@@ -127,24 +127,13 @@ def names(
     splits: Sequence[Split] = SPLITS,
     types: Sequence[Agent] = AGENTS,
 ) -> Iterator[SetName]:
-    """All sets of these, each file once.
-
-    Args:
-        tasks: which.
-        variants: of each.
-        splits: of each.
-        types: of agents.
-    """
+    """All sets of these, each file once."""
     every = (SetName(task, v, s, t) for task in tasks for v in variants for s in splits for t in types)
     return iter(dict.fromkeys(every))
 
 
 def manifest(folder: Path) -> dict[str, Entry]:
-    """What a folder's manifest says of each file; nothing where there is none.
-
-    Raises:
-        TrajectorySetError: for one that cannot be read.
-    """
+    """What a folder's manifest says of each file, nothing without one; raises TrajectorySetError for a damaged one."""
     path = folder / MANIFEST
     if not path.is_file():
         return {}
@@ -160,16 +149,7 @@ def manifest(folder: Path) -> dict[str, Entry]:
 
 
 def entry_of(folder: Path, name: SetName, simulator: Simulator) -> Entry | None:
-    """The manifest's entry of a set that was made with a task's parameter values.
-
-    Args:
-        folder: of sets.
-        name: of the set.
-        simulator: of the task.
-
-    Returns:
-        None where there is no such set.
-    """
+    """The manifest's entry of a set that was made with a task's parameter values; None where there is no such set."""
     entry, task = manifest(folder).get(name.file), simulator.environment
     assert isinstance(task, Task)
     shared = name.task != task.name  # the values are another task's
@@ -177,13 +157,7 @@ def entry_of(folder: Path, name: SetName, simulator: Simulator) -> Entry | None:
 
 
 def fits(entry: Entry, simulator: Simulator, variant: Variant) -> bool:
-    """Whether a set was made with the values that a variant has today.
-
-    Args:
-        entry: of the set.
-        simulator: of the task.
-        variant: of the task.
-    """
+    """Whether a set was made with the values that a variant has today."""
     return list(entry.values) == _values(simulator, variant)
 
 

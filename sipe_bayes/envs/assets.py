@@ -10,15 +10,7 @@ import mujoco
 
 
 def package_file(package: str, file: str) -> Path:
-    """A file of an installed package.
-
-    Args:
-        package: the name that it is imported by.
-        file: path inside it.
-
-    Raises:
-        ModuleNotFoundError: where the package is missing.
-    """
+    """A file inside an installed package; raises ModuleNotFoundError where that is missing."""
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:
         name = package.replace("_", "-")

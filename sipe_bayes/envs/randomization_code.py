@@ -184,21 +184,11 @@ def sources(environment: MjcfEnvironment, draws: FloatArray) -> dict[str, str]:
 
 
 def write_randomization(environment: MjcfEnvironment, draws: FloatArray, folder: Path) -> list[Path]:
-    """Write the three files of ``sources``.
-
-    Args:
-        environment: whose parameters.
-        draws: of the posterior, (M, N) in units.
-        folder: where they go.
-
-    Returns:
-        Their paths.
-    """
-    paths = []
-    for file, text in sources(environment, draws).items():
-        write_text(folder / file, text)
-        paths.append(folder / file)
-    return paths
+    """Write the three files of ``sources`` and return their paths."""
+    texts = {folder / file: text for file, text in sources(environment, draws).items()}
+    for path, text in texts.items():
+        write_text(path, text)
+    return list(texts)
 
 
 def _table(

@@ -22,8 +22,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.validation import nearest_name
 
 Writer = Callable[[mujoco.MjModel, float], None]
-Maker = Callable[[mujoco.MjModel, str, int, str], "Target"]
-Index = int | tuple[int, int]
+Maker = Callable[[mujoco.MjModel, str, int], "Target"]
+Check = Callable[[mujoco.MjModel, str, int], None]
 
 _PATTERN = re.compile(r"^(?:(body|joint|actuator|geom):(.+)|(option))\.([a-z0-9_]+)$")
 _OBJECTS = {
@@ -100,37 +100,39 @@ def bind(model: mujoco.MjModel, spec: str) -> Target:
         hint = nearest_name(attribute, legal) or f"; known: {', '.join(sorted(legal))}"
         raise TargetError(f"target {spec!r}: {article} {kind} has no attribute {attribute!r}{hint}")
     index = 0 if kind == "option" else named(model, kind, name, f"target {spec!r}")
-    return legal[attribute](model, spec, index, attribute)
+    return legal[attribute](model, spec, index)
 
 
-def _array_target(
-    spec: str,
-    unit: str,
+def _entry(
     field: str,
-    index: Index,
-    model: mujoco.MjModel,
+    unit: str,
+    slot: int | None = None,
+    check: Check | None = None,
     constants: bool = False,
     minimum: float = -np.inf,
     order: int = 0,
-) -> Target:
-    def write(other: mujoco.MjModel, value: float) -> None:
-        getattr(other, field)[index] = value
+) -> Maker:
+    """Of an array of the model, at the object's index and perhaps a slot."""
 
-    return Target(spec, unit, float(getattr(model, field)[index]), write, order, constants, minimum)
+    def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
+        if check is not None:
+            check(model, spec, index)
+        at = index if slot is None else (index, slot)
+
+        def write(other: mujoco.MjModel, value: float) -> None:
+            getattr(other, field)[at] = value
+
+        return Target(spec, unit, float(getattr(model, field)[at]), write, order, constants, minimum)
+
+    return make
 
 
 def _hinge(model: mujoco.MjModel, joint: int) -> bool:
     return int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 
 
-def _scalar_joint(model: mujoco.MjModel, joint: int, spec: str) -> int:
-    if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-        raise TargetError(f"target {spec!r}: only hinge and slide joints have this attribute")
-    return int(model.jnt_dofadr[joint])
-
-
 def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) -> Maker:
-    def make(model: mujoco.MjModel, spec: str, joint: int, attribute: str) -> Target:
+    def make(model: mujoco.MjModel, spec: str, joint: int) -> Target:
         start = int(model.jnt_dofadr[joint])
         size = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(
             int(model.jnt_type[joint]), 1
@@ -146,40 +148,33 @@ def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) 
     return make
 
 
-def _joint_stiffness(model: mujoco.MjModel, spec: str, joint: int, attribute: str) -> Target:
+def _joint_stiffness(model: mujoco.MjModel, spec: str, joint: int) -> Target:
     unit = "N m/rad" if _hinge(model, joint) else "N/m"
-    return _array_target(spec, unit, "jnt_stiffness", joint, model, minimum=0.0)
+    return _entry("jnt_stiffness", unit, minimum=0.0)(model, spec, joint)
 
 
-def _joint_springref(model: mujoco.MjModel, spec: str, joint: int, attribute: str) -> Target:
-    _scalar_joint(model, joint, spec)
+def _joint_springref(model: mujoco.MjModel, spec: str, joint: int) -> Target:
+    kind = int(model.jnt_type[joint])
+    if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        raise TargetError(f"target {spec!r}: only hinge and slide joints have this attribute")
     unit = "rad" if _hinge(model, joint) else "m"
-    return _array_target(spec, unit, "qpos_spring", int(model.jnt_qposadr[joint]), model)
+    return _entry("qpos_spring", unit)(model, spec, int(model.jnt_qposadr[joint]))
 
 
-def _actuator_gear(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
-    return _array_target(spec, "1", "actuator_gear", (actuator, 0), model, constants=True)
-
-
-def _fixed_gain(model: mujoco.MjModel, actuator: int, spec: str) -> None:
+def _fixed_gain(model: mujoco.MjModel, spec: str, actuator: int) -> None:
     if int(model.actuator_gaintype[actuator]) != int(mujoco.mjtGain.mjGAIN_FIXED):
         raise TargetError(f"target {spec!r}: needs an actuator with a fixed gain (motor, position, velocity, general)")
 
 
-def _affine_bias(model: mujoco.MjModel, actuator: int, spec: str) -> None:
+def _affine_bias(model: mujoco.MjModel, spec: str, actuator: int) -> None:
     legal = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
     if int(model.actuator_biastype[actuator]) not in legal:
         raise TargetError(f"target {spec!r}: needs an actuator whose bias is none or affine")
 
 
-def _actuator_gain(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
-    _fixed_gain(model, actuator, spec)
-    return _array_target(spec, "force/command", "actuator_gainprm", (actuator, 0), model)
-
-
 def _actuator_bias(slot: int, unit: str) -> Maker:
-    def make(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
-        _affine_bias(model, actuator, spec)
+    def make(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+        _affine_bias(model, spec, actuator)
 
         def write(other: mujoco.MjModel, value: float) -> None:
             other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
@@ -190,9 +185,9 @@ def _actuator_bias(slot: int, unit: str) -> Maker:
     return make
 
 
-def _actuator_kp(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
-    _fixed_gain(model, actuator, spec)
-    _affine_bias(model, actuator, spec)
+def _actuator_kp(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+    _fixed_gain(model, spec, actuator)
+    _affine_bias(model, spec, actuator)
     gain, position = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_biasprm[actuator, 1])
     if gain != -position:
         raise TargetError(
@@ -208,8 +203,8 @@ def _actuator_kp(model: mujoco.MjModel, spec: str, actuator: int, attribute: str
     return Target(spec, "force/position", gain, write, minimum=0.0)
 
 
-def _actuator_kv(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
-    _affine_bias(model, actuator, spec)
+def _actuator_kv(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+    _affine_bias(model, spec, actuator)
 
     def write(other: mujoco.MjModel, value: float) -> None:
         other.actuator_biastype[actuator] = mujoco.mjtBias.mjBIAS_AFFINE
@@ -218,10 +213,10 @@ def _actuator_kv(model: mujoco.MjModel, spec: str, actuator: int, attribute: str
     return Target(spec, "force/velocity", -float(model.actuator_biasprm[actuator, 2]), write, minimum=0.0)
 
 
-def _actuator_offset(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_offset(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     """A constant added to the command behind its limits and dynamics: gain * offset joins the model's bias force."""
-    _fixed_gain(model, actuator, spec)
-    _affine_bias(model, actuator, spec)
+    _fixed_gain(model, spec, actuator)
+    _affine_bias(model, spec, actuator)
     base = float(model.actuator_biasprm[actuator, 0])
 
     def write(other: mujoco.MjModel, value: float) -> None:
@@ -231,7 +226,7 @@ def _actuator_offset(model: mujoco.MjModel, spec: str, actuator: int, attribute:
     return Target(spec, "command", 0.0, write, order=2, physical=False)
 
 
-def _actuator_delay(model: mujoco.MjModel, spec: str, actuator: int, attribute: str) -> Target:
+def _actuator_delay(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     """MuJoCo reads a delayed command before it stores the present one.
 
     Any delay above zero up to one physics step acts as one physics step, and zero as none; beyond one step it is
@@ -245,14 +240,7 @@ def _actuator_delay(model: mujoco.MjModel, spec: str, actuator: int, attribute: 
     return Target(spec, "s", present, write, minimum=0.0, physical=False, step=step)
 
 
-def _geom_friction(slot: int, unit: str) -> Maker:
-    def make(model: mujoco.MjModel, spec: str, geom: int, attribute: str) -> Target:
-        return _array_target(spec, unit, "geom_friction", (geom, slot), model, minimum=0.0)
-
-    return make
-
-
-def _body_mass(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> Target:
+def _body_mass(model: mujoco.MjModel, spec: str, body: int) -> Target:
     mass, inertia = float(model.body_mass[body]), model.body_inertia[body].copy()
     axes = model.body_iquat[body].copy()
     if mass <= 0:
@@ -265,27 +253,16 @@ def _body_mass(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> T
     return Target(spec, "kg", mass, write, constants=True, minimum=0.0)
 
 
-def _body_com(axis: int) -> Maker:
-    def make(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> Target:
-        return _array_target(spec, "m", "body_ipos", (body, axis), model, order=1, constants=True)
-
-    return make
-
-
-def _rotation(quaternion: FloatArray) -> FloatArray:
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
-
-
 def body_frame_inertia(model: mujoco.MjModel, body: int) -> FloatArray:
     """Inertia (3, 3) in kg m^2 about the centre of mass, in the axes of the body's frame."""
-    rotation = _rotation(model.body_iquat[body])
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, model.body_iquat[body])
+    rotation = matrix.reshape(3, 3)
     return rotation @ np.diag(model.body_inertia[body]) @ rotation.T
 
 
 def _body_inertia(row: int, column: int) -> Maker:
-    def make(model: mujoco.MjModel, spec: str, body: int, attribute: str) -> Target:
+    def make(model: mujoco.MjModel, spec: str, body: int) -> Target:
         def write(other: mujoco.MjModel, value: float) -> None:
             matrix = body_frame_inertia(other, body)
             matrix[row, column] = matrix[column, row] = value
@@ -303,10 +280,8 @@ def _body_inertia(row: int, column: int) -> Maker:
 
 def restore_inertia(model: mujoco.MjModel, original: mujoco.MjModel, bodies: list[int]) -> None:
     """Give the bodies the inertia that they have in the model ``original``."""
-    model.body_inertia[bodies], model.body_iquat[bodies] = (
-        original.body_inertia[bodies],
-        original.body_iquat[bodies],
-    )
+    model.body_inertia[bodies] = original.body_inertia[bodies]
+    model.body_iquat[bodies] = original.body_iquat[bodies]
 
 
 def check_inertia(model: mujoco.MjModel, bodies: list[int]) -> bool:
@@ -316,7 +291,7 @@ def check_inertia(model: mujoco.MjModel, bodies: list[int]) -> bool:
 
 
 def _option(field: str, slot: int | None, unit: str) -> Maker:
-    def make(model: mujoco.MjModel, spec: str, index: int, attribute: str) -> Target:
+    def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
         def write(other: mujoco.MjModel, value: float) -> None:
             if slot is None:
                 setattr(other.opt, field, value)
@@ -332,7 +307,7 @@ def _option(field: str, slot: int | None, unit: str) -> Maker:
 ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds it
     "body": {
         "mass": _body_mass,
-        **{f"com_{a}": _body_com(i) for i, a in enumerate(_AXES)},
+        **{f"com_{a}": _entry("body_ipos", "m", i, order=1, constants=True) for i, a in enumerate(_AXES)},
         **{f"inertia_{_AXES[i]}{_AXES[j]}": _body_inertia(i, j) for i in range(3) for j in range(i, 3)},
     },
     "joint": {
@@ -343,8 +318,8 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         "springref": _joint_springref,
     },
     "actuator": {
-        "gear": _actuator_gear,
-        "gain": _actuator_gain,
+        "gear": _entry("actuator_gear", "1", 0, constants=True),
+        "gain": _entry("actuator_gainprm", "force/command", 0, _fixed_gain),
         "kp": _actuator_kp,
         "kv": _actuator_kv,
         "bias_force": _actuator_bias(0, "force"),
@@ -354,9 +329,9 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         "delay": _actuator_delay,
     },
     "geom": {
-        "friction": _geom_friction(0, "1"),
-        "friction_torsional": _geom_friction(1, "m"),
-        "friction_rolling": _geom_friction(2, "m"),
+        "friction": _entry("geom_friction", "1", 0, minimum=0.0),
+        "friction_torsional": _entry("geom_friction", "m", 1, minimum=0.0),
+        "friction_rolling": _entry("geom_friction", "m", 2, minimum=0.0),
     },
     "option": {
         **{f"gravity_{a}": _option("gravity", i, "m/s^2") for i, a in enumerate(_AXES)},

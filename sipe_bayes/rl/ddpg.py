@@ -203,7 +203,7 @@ class Agent:
         self.actor.initialise(rng)
         self.critic.initialise(rng)
         self.target_actor, self.target_critic = self.actor.copy(), self.critic.copy()
-        self._actor_optimiser, self._critic_optimiser = _Adam(self.actor, settings), _Adam(self.critic, settings)
+        self._actor_optimiser, self._critic_optimiser = _adam(self.actor, settings), _adam(self.critic, settings)
         self.normaliser = Normaliser(observation_size, _OBSERVATION_CLIP) if settings.normalise else None
         self.updates = 0
 
@@ -234,12 +234,7 @@ class Agent:
         self.updates += 1
 
     def policy(self, task: str, goal_size: int = 0) -> Policy:
-        """What has been learnt so far.
-
-        Args:
-            task: its name.
-            goal_size: of the desired goal at the end of an observation.
-        """
+        """What has been learnt so far."""
         layers = tuple((w.cpu().numpy().copy(), b.cpu().numpy().copy()) for w, b in self.actor.layers)
         low, high = self.action_low, self.action_high
         if self.normaliser is None:
@@ -264,7 +259,8 @@ class Agent:
         networks = ("actor", "critic", "target_actor", "target_critic")
         tensors = {name: getattr(self, name).parameters for name in networks}
         for name, optimiser in (("actor", self._actor_optimiser), ("critic", self._critic_optimiser)):
-            tensors |= {f"{name}.{k}": v for k, v in optimiser.moments().items()}
+            moments = optimiser.state[tensors[name]]
+            tensors |= {f"{name}.{k}": moments[k] for k in ("exp_avg", "exp_avg_sq", "step")}
         return tensors
 
     def _normalised(self, observations: Float32Array) -> Float32Array:
@@ -301,20 +297,10 @@ class Agent:
         self._actor_optimiser.step()
 
 
-class _Adam:
-    """torch's fused Adam on a network's flat vector."""
-
-    def __init__(self, network: Network, settings: Settings) -> None:
-        network.parameters.grad = network.gradients
-        self._network = network
-        self._adam = torch.optim.Adam([network.parameters], settings.learning_rate, fused=True)
-        self._adam.step()  # makes the moments; a step along gradients of zero moves nothing
-        self._adam.state[network.parameters]["step"].zero_()
-
-    def step(self) -> None:
-        self._adam.step()
-
-    def moments(self) -> dict[str, Tensor]:
-        """The moments (P,) and the number of steps."""
-        state = self._adam.state[self._network.parameters]
-        return {name: state[name] for name in ("exp_avg", "exp_avg_sq", "step")}
+def _adam(network: Network, settings: Settings) -> torch.optim.Adam:
+    """The fused Adam of torch on a network's flat vector."""
+    network.parameters.grad = network.gradients
+    adam = torch.optim.Adam([network.parameters], settings.learning_rate, fused=True)
+    adam.step()  # makes the moments; a step along gradients of zero moves nothing
+    adam.state[network.parameters]["step"].zero_()
+    return adam

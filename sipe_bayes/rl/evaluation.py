@@ -135,7 +135,7 @@ def evaluate(
         seed=seed,
         mean=float(returns.mean()),
         sd=spread,
-        standard_error=float(returns.std(ddof=min(1, episodes - 1)) / math.sqrt(episodes)),
+        standard_error=float(spread / math.sqrt(episodes)),
         success_rate=rate,
         success_error=None if rate is None else math.sqrt(rate * (1 - rate) / episodes),
         diverged=int(diverged.sum()),
@@ -149,12 +149,7 @@ def idle(task: Task) -> Controller:
 
 
 def random(task: Task, seed: int = 0) -> Controller:
-    """Uniformly random actions.
-
-    Args:
-        task: whose actions.
-        seed: of the actions.
-    """
+    """Uniformly random actions of a generator of one's own."""
     rng = np.random.default_rng(seed)
     return lambda observations: rng.uniform(task.action_low, task.action_high, (len(observations), task.num_actions))
 
@@ -163,12 +158,7 @@ _REFERENCES: dict[str, Callable[[Task], Controller]] = {"idle": idle, "random": 
 
 
 def references(task: Task, episodes: int = STARTS.episodes) -> dict[str, Evaluation]:
-    """What a policy that does nothing and one that acts at random earn: ``idle`` and ``random`` of a card.
-
-    Args:
-        task: in which.
-        episodes: of each.
-    """
+    """What a policy that does nothing and one that acts at random earn: ``idle`` and ``random`` of a card."""
     return {name: evaluate(make(task), task, episodes, action_noise=0.0) for name, make in _REFERENCES.items()}
 
 
@@ -204,14 +194,7 @@ def write_card(
 
 
 def read_card(path: Path) -> Evaluation:
-    """The evaluation on an agent's card.
-
-    Args:
-        path: the agent's file.
-
-    Raises:
-        ValueError: for a card that is missing or damaged.
-    """
+    """The evaluation on the card beside an agent's file; raises ValueError for one that is missing or damaged."""
     try:
         card = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
         return TypeAdapter(Evaluation).validate_python(card["evaluation"])
@@ -275,10 +258,6 @@ class CardCheck:
 
 def check_agents(folder: Path = AGENT_FILES, episodes: int = STARTS.episodes) -> Iterator[CardCheck]:
     """Evaluate each agent in a folder anew.
-
-    Args:
-        folder: of agents with their cards.
-        episodes: of each evaluation.
 
     Raises:
         FileNotFoundError: for a folder without agents.

@@ -89,9 +89,8 @@ class Plan:
 
     def horizon(self, task: Task) -> int:
         """Control steps of a trajectory; raises ValueError where no episode can begin in an update."""
-        steps = (
-            default_steps(task) if self.trajectory_steps is None else whole("trajectory_steps", self.trajectory_steps)
-        )
+        asked = self.trajectory_steps
+        steps = default_steps(task) if asked is None else whole("trajectory_steps", asked)
         if steps > task.episode_steps:
             raise ValueError(f"trajectory_steps: expected at most an episode's {task.episode_steps}, got {steps}")
         least = (task.episode_steps + steps + 1) * self.settings.lanes
@@ -142,16 +141,16 @@ class _Recorder:
         self.episodes: deque[_Begun] = deque(maxlen=count)
 
     def advance(self) -> None:
-        lanes, replay = self._trainer.episodes, self._trainer.replay
-        for lane in np.flatnonzero(lanes.elapsed == 0).tolist():
-            goal = None if lanes.goals is None else lanes.goals[lane].copy()
-            self._running[lane] = _Begun(lanes.states[lane].copy(), goal)
+        at, replay = self._trainer.episodes, self._trainer.replay
+        for env in np.flatnonzero(at.elapsed == 0).tolist():
+            goal = None if at.goals is None else at.goals[env].copy()
+            self._running[env] = _Begun(at.states[env].copy(), goal)
         self._trainer.advance()
         row = (replay.head - 1) % replay.rows
-        for lane, begun in list(self._running.items()):
-            begun.actions.append(replay.actions[row, lane].astype(float))
-            if len(begun.actions) == self._steps or replay.ends[row, lane] >= 0:
-                self.episodes.append(self._running.pop(lane))
+        for env, begun in list(self._running.items()):
+            begun.actions.append(replay.actions[row, env].astype(float))
+            if len(begun.actions) == self._steps or replay.ends[row, env] >= 0:
+                self.episodes.append(self._running.pop(env))
 
 
 class LoopRun:
@@ -307,13 +306,7 @@ class LoopRun:
 
 
 def solves(task: Task, mean_return: float, success_rate: float | None) -> bool:
-    """Whether a policy solves a task.
-
-    Args:
-        task: which.
-        mean_return: that it earns.
-        success_rate: None where only the return counts.
-    """
+    """Whether a policy solves a task."""
     measured = mean_return if task.solved.measure == "return" else success_rate
     return measured is not None and measured >= task.solved.threshold
 

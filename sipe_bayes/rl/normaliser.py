@@ -34,19 +34,16 @@ class Normaliser:
 
     def __init__(self, size: int, clip: float) -> None:
         self.clip = clip
-        self._count, self._mean, self._squares = 0.0, np.zeros(size), np.zeros(size)
-        self._refresh()
+        self.restore(Moments(np.zeros(1), np.zeros(size), np.zeros(size)))
 
     def update(self, observations: FloatArray) -> None:
         """Count observations (B, O) in."""
         if not len(observations):
             return
-        count, mean = self._count + len(observations), observations.mean(0)
-        apart = mean - self._mean
-        self._squares += ((observations - mean) ** 2).sum(0) + apart**2 * self._count * len(observations) / count
-        self._mean += apart * len(observations) / count
-        self._count = count
-        self._refresh()
+        before, number, mean = self._moments, len(observations), observations.mean(0)
+        count, apart = before.count + number, mean - before.mean
+        squares = before.squares + (((observations - mean) ** 2).sum(0) + apart**2 * before.count * number / count)
+        self.restore(Moments(count, before.mean + apart * number / count, squares))
 
     def apply(self, observations: Float32Array) -> Float32Array:
         """Observations (B, O), shifted, scaled and clipped."""
@@ -54,15 +51,11 @@ class Normaliser:
 
     def state(self) -> Moments:
         """From which ``restore`` goes on."""
-        return Moments(np.array([self._count]), self._mean.copy(), self._squares.copy())
+        return self._moments
 
     def restore(self, moments: Moments) -> None:
         """Go on from what ``state`` gave."""
-        self._count = float(moments.count[0])
-        self._mean, self._squares = moments.mean.copy(), moments.squares.copy()
-        self._refresh()
-
-    def _refresh(self) -> None:
-        spread = np.sqrt(self._squares / self._count) if self._count else np.ones_like(self._mean)
-        self.mean = self._mean.astype(np.float32)
+        self._moments = moments
+        spread = np.sqrt(moments.squares / moments.count) if moments.count[0] else np.ones_like(moments.mean)
+        self.mean = moments.mean.astype(np.float32)
         self.scale = np.maximum(spread, _LEAST).astype(np.float32)

@@ -233,12 +233,7 @@ def plan(
 
 
 def demonstrator(task: Adroit, plan: Plan) -> Demonstrator:
-    """The plan with noise.
-
-    Args:
-        task: that it is for.
-        plan: of its actions.
-    """
+    """The plan with noise."""
     actions, noise = Synergies(task, task.episode_steps).actions(plan.knots), OUTLINES[task.name].search.noise
 
     def act(observations: FloatArray, step: int, rngs: Sequence[np.random.Generator]) -> FloatArray:

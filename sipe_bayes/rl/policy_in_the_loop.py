@@ -41,10 +41,8 @@ Deviations:
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -59,7 +57,7 @@ from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import LoopResult, LoopRun, Plan, Update
 from sipe_bayes.rl.settings import Settings
 from sipe_bayes.rl.train import CHECKPOINT as CHECKPOINT
-from sipe_bayes.rl.train import Report
+from sipe_bayes.rl.train import Report, write_table
 from sipe_bayes.rl.trainer import TrainerState
 
 S = TypeVar("S", bound=SearchState)
@@ -177,7 +175,7 @@ class _Folder:
         for path in self._kept.iterdir():  # also what an interruption left
             if path.name != Path(CHECKPOINT).name and not path.stem.endswith(f"-{number}"):
                 path.unlink()
-        write_text(self._folder / "history.csv", _table(run.history, run.task.space.names))
+        _write_history(self._folder / "history.csv", run.history, run.task.space.names)
 
     def finish(self, run: LoopRun, result: LoopResult) -> None:
         result.policy.save(self._folder / "policy.safetensors")
@@ -212,12 +210,8 @@ class _Folder:
         run.estimator.findings = Findings(state.findings)
 
 
-def _table(history: Sequence[Update], names: Sequence[str]) -> str:
-    """The history as CSV, with a column for each parameter's mean and sd."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    rows = [asdict(update) for update in history]
-    plain = [key for key in rows[0] if key not in ("mean", "sd")]
-    writer.writerow([*plain, *(f"{kind}_{name}" for kind in ("mean", "sd") for name in names)])
-    writer.writerows([*(row[key] for key in plain), *row["mean"], *row["sd"]] for row in rows)
-    return text.getvalue()
+def _write_history(path: Path, history: Sequence[Update], names: Sequence[str]) -> None:
+    """With a column for each parameter's mean and sd."""
+    *plain, _, _ = (field.name for field in fields(Update))
+    header = [*plain, *(f"{kind}_{name}" for kind in ("mean", "sd") for name in names)]
+    write_table(path, header, ([*(getattr(row, key) for key in plain), *row.mean, *row.sd] for row in history))

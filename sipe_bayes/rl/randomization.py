@@ -93,12 +93,12 @@ class Randomization:
         return bool(np.any(np.asarray(self.observation_noise, float))) or self.action_delay > 0
 
     def disturbances(
-        self, lanes: int, channels: int, goal_size: int, middle: FloatArray, generator: np.random.Generator
+        self, num_envs: int, channels: int, goal_size: int, middle: FloatArray, generator: np.random.Generator
     ) -> Disturbances:
         """Noise and delay of episodes side by side.
 
         Args:
-            lanes: how many.
+            num_envs: how many.
             channels: O.
             goal_size: of the desired goal, the last channels.
             middle: the idle action (A,).
@@ -114,7 +114,7 @@ class Randomization:
             raise ValueError(
                 f"observation_noise: expected one number or {channels}, one for each channel, got {len(noise)}"
             )
-        return Disturbances(noise, int(self.action_delay), lanes, middle, generator)
+        return Disturbances(noise, int(self.action_delay), num_envs, middle, generator)
 
 
 def randomization(given: Posterior | Randomization) -> Randomization:
@@ -128,9 +128,6 @@ def load_randomization(path: str | os.PathLike[str]) -> Randomization:
     Its ``posterior`` names the saved posterior in the same folder, which is read. A file without that entry stands for
     its normal: ``mean`` and ``covariance`` in the parameters' units, cut off at ``low`` and ``high``.
     ``observation_noise`` and ``action_delay`` may be added to the file.
-
-    Args:
-        path: of the file.
 
     Raises:
         FileNotFoundError: where there is none.
@@ -159,16 +156,7 @@ def _normal(plain: dict[str, Any]) -> GaussianMixture:
 
 
 def check_names(posterior: Posterior, space: ParameterSpace, whose: str) -> None:
-    """See that a posterior is over the parameters of a space, in their units.
-
-    Args:
-        posterior: that episodes are to be drawn from.
-        space: of the environment.
-        whose: what the environment is called.
-
-    Raises:
-        ValueError: which names what differs.
-    """
+    """Raises ValueError, which names what differs, for a posterior over other parameters or units than a space's."""
     mine, theirs = posterior.space.names, space.names
     missing, unknown = [n for n in theirs if n not in mine], [n for n in mine if n not in theirs]
     if missing or unknown:
@@ -271,29 +259,29 @@ class Disturbances:
     Args:
         noise: greatest sd (O,).
         delay: greatest, in control steps.
-        lanes: L.
+        num_envs: L.
         middle: the idle action (A,).
         generator: of what is drawn.
     """
 
     noise: FloatArray
     delay: int
-    lanes: int
+    num_envs: int
     middle: FloatArray
     generator: np.random.Generator
     observations: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.observations = np.zeros((self.lanes, len(self.noise)))
-        self._share, self._delays = np.zeros(self.lanes), np.zeros(self.lanes, int)
-        self._queue = np.tile(np.asarray(self.middle, float), (self.lanes, self.delay + 1, 1))
+        self.observations = np.zeros((self.num_envs, len(self.noise)))
+        self._share, self._delays = np.zeros(self.num_envs), np.zeros(self.num_envs, int)
+        self._queue = np.tile(np.asarray(self.middle, float), (self.num_envs, self.delay + 1, 1))
 
-    def begin(self, lanes: BoolArray) -> None:
-        """Draw anew for the marked lanes (L,)."""
-        count = int(lanes.sum())
-        self._share[lanes] = self.generator.random(count)
-        self._delays[lanes] = self.generator.integers(0, self.delay + 1, count)
-        self._queue[lanes] = self.middle
+    def begin(self, fresh: BoolArray) -> None:
+        """Draw anew for the marked episodes (L,)."""
+        count = int(fresh.sum())
+        self._share[fresh] = self.generator.random(count)
+        self._delays[fresh] = self.generator.integers(0, self.delay + 1, count)
+        self._queue[fresh] = self.middle
 
     def noisy(self, observations: FloatArray) -> FloatArray:
         """What is seen of observations (L, O)."""
@@ -306,11 +294,11 @@ class Disturbances:
 
         Args:
             actions: (L, A).
-            ignored: lanes (L,) whose actions are none.
+            ignored: episodes (L,) whose actions are none.
         """
         self._queue = np.roll(self._queue, 1, axis=1)
         self._queue[:, 0] = np.where(ignored[:, None], self.middle, actions)
-        return self._queue[np.arange(self.lanes), self._delays]
+        return self._queue[np.arange(self.num_envs), self._delays]
 
     def state(self) -> DisturbancesState:
         """From which ``restore`` goes on bit for bit."""

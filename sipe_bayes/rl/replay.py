@@ -1,7 +1,8 @@
-"""Replay buffer with hindsight, for lanes that are stepped together.
+"""Replay buffer with hindsight, for environments that are stepped together.
 
-A ring of rows, one for each control step, with a column for each lane; an observation is stored once, as the next row
-holds what followed. The row of an episode's last observation holds no transition and is passed over when sampling.
+A ring of rows, one for each control step, with a column for each environment; an observation is stored once, as the
+next row holds what followed. The row of an episode's last observation holds no transition and is passed over when
+sampling.
 
 Hindsight, strategy "future" with k = 4 (Andrychowicz et al., "Hindsight Experience Replay", 2017,
 https://arxiv.org/abs/1707.01495): k of every k + 1 transitions sampled get the goal that was reached at a later,
@@ -65,8 +66,8 @@ class Replay:
     Args:
         observation_size: O.
         action_size: A.
-        capacity: steps, of all lanes together.
-        lanes: L.
+        capacity: steps, of all environments together.
+        num_envs: L.
         discount: of a reward one step later.
         n_step: steps that a return sums.
         goal_size: G; the desired goal is the observation's last numbers.
@@ -82,20 +83,20 @@ class Replay:
         observation_size: int,
         action_size: int,
         capacity: int,
-        lanes: int = 1,
+        num_envs: int = 1,
         discount: float = 0.99,
         n_step: int = 1,
         goal_size: int = 0,
         hindsight: int = 0,
         goal_reward: GoalReward | None = None,
     ) -> None:
-        if capacity < 2 * lanes:
-            raise ValueError(f"capacity: expected at least 2 steps for each of {lanes} lanes, got {capacity}")
+        if capacity < 2 * num_envs:
+            raise ValueError(f"capacity: expected at least 2 steps for each of {num_envs} environments, got {capacity}")
         if hindsight and (goal_reward is None or not goal_size):
             raise ValueError(f"hindsight: expected 0 for a task without goals, got {hindsight}")
-        self.rows, self.lanes, self.goal_size = capacity // lanes, lanes, goal_size
+        self.rows, self.num_envs, self.goal_size = capacity // num_envs, num_envs, goal_size
         self.discount, self.n_step, self.hindsight, self._goal_reward = discount, n_step, hindsight, goal_reward
-        shape = (self.rows, lanes)
+        shape = (self.rows, num_envs)
         self.observations = np.zeros((*shape, observation_size), np.float32)
         self.actions = np.zeros((*shape, action_size), np.float32)
         self.rewards = np.zeros(shape, np.float32)
@@ -103,20 +104,20 @@ class Replay:
         self.terminated, self.transition = np.zeros(shape, bool), np.zeros(shape, bool)
         self.ends = np.full(shape, -1)  # the step of the episode's last observation; -1 while it runs
         self.head = 0  # the step of the newest observation, of which nothing followed yet
-        self._starts, self._over = np.zeros(lanes, int), np.zeros(lanes, bool)
+        self._starts, self._over = np.zeros(num_envs, int), np.zeros(num_envs, bool)
 
     def __len__(self) -> int:
         """Transitions that may be sampled."""
         return int(self.transition.sum())
 
     def begin(self, step: Step) -> None:
-        """The first observations of all lanes; what was stored is forgotten."""
+        """The first observations of all environments; what was stored is forgotten."""
         self.head, self._starts[:], self._over[:] = 0, 0, False
         self.transition[:] = False
         self._observe(step.observations, step.achieved_goals)
 
     def add(self, actions: FloatArray, step: Step) -> None:
-        """What actions led to; lanes whose episode was over have begun a new one instead.
+        """What actions led to; environments whose episode was over have begun a new one instead.
 
         Args:
             actions: (L, A).
@@ -126,15 +127,15 @@ class Replay:
         self.actions[row], self.rewards[row] = actions, step.rewards
         self.terminated[row], self.transition[row] = step.terminated, step.valid & ~self._over
         ended = (step.terminated | step.truncated) & ~self._over
-        for lane in np.flatnonzero(ended):
-            self._end(int(lane), self.head + bool(step.valid[lane]))
+        for env in np.flatnonzero(ended):
+            self._end(int(env), self.head + bool(step.valid[env]))
         self._starts[self._over] = self.head + 1
         self._over = ended
         self.head += 1
         self._observe(step.observations, step.achieved_goals)
 
     def add_trajectories(self, trajectories: Trajectories, achieved: FloatArray | None = None) -> None:
-        """Fill an empty buffer, one lane for each trajectory; one that is not valid to its end counts as far as it is.
+        """Fill an empty buffer, one column for each trajectory, as far as that is valid.
 
         Args:
             trajectories: B of them, with rewards.
@@ -144,19 +145,17 @@ class Replay:
             ValueError: for trajectories without rewards, or for which there is no room.
         """
         batch, horizon = trajectories.actions.shape[:2]
-        if batch != self.lanes or horizon >= self.rows:
+        if batch != self.num_envs or horizon >= self.rows:
             raise ValueError(
-                f"capacity: expected {batch} lanes of more than {horizon} rows, got {self.lanes} of {self.rows}"
+                f"capacity: expected {batch} columns of more than {horizon} rows, got {self.num_envs} of {self.rows}"
             )
         if trajectories.rewards is None:
             raise ValueError("trajectories: expected rewards, got none; record them from a task")
         count = trajectories.valid.sum(1) - 1
         steps = np.arange(horizon)[:, None]
         self.observations[: horizon + 1] = np.nan_to_num(trajectories.observations.swapaxes(0, 1))
-        self.actions[:horizon], self.rewards[:horizon] = (
-            trajectories.actions.swapaxes(0, 1),
-            trajectories.rewards.swapaxes(0, 1),
-        )
+        self.actions[:horizon] = trajectories.actions.swapaxes(0, 1)
+        self.rewards[:horizon] = trajectories.rewards.swapaxes(0, 1)
         if self.goal_size:
             self.achieved[: horizon + 1] = np.nan_to_num(np.asarray(achieved).swapaxes(0, 1))
         self.transition[:horizon] = steps < count
@@ -174,31 +173,29 @@ class Replay:
             ValueError: where there are none.
         """
         # which transitions, and where their episodes end
-        steps, lanes = self._draw(rng, count)
+        steps, envs = self._draw(rng, count)
         rows = steps % self.rows
-        ends = self.ends[rows, lanes]
+        ends = self.ends[rows, envs]
         ends = np.where(ends < 0, self.head, ends)
         last = np.minimum(steps + self.n_step, ends)  # the step at which the value of what follows is asked for
-        observations, following = self.observations[rows, lanes], self.observations[last % self.rows, lanes]
+        observations, following = self.observations[rows, envs], self.observations[last % self.rows, envs]
         goals = None
         if self.hindsight:
-            goals = self._relabel(rng, steps, lanes, ends, observations, following)
+            goals = self._relabel(rng, steps, envs, ends, observations, following)
         # sum the rewards up to there, those of other goals where hindsight has exchanged them
         returns, factor = np.zeros(count), np.ones(count)
         for ahead in range(self.n_step):
             at = steps + ahead
             inside = at < ends
             here = at % self.rows
-            rewards: FloatArray | Float32Array = self.rewards[here, lanes]
+            rewards: FloatArray | Float32Array = self.rewards[here, envs]
             if goals is not None and self._goal_reward is not None:
-                reached = self.achieved[(at + 1) % self.rows, lanes]
-                rewards = self._goal_reward(
-                    cast(FloatArray, reached), cast(FloatArray, goals)
-                )  # single precision will do
+                reached = self.achieved[(at + 1) % self.rows, envs]
+                rewards = self._goal_reward(cast(FloatArray, reached), cast(FloatArray, goals))  # single precision
             returns += np.where(inside, factor * rewards, 0.0)
             factor = np.where(inside, factor * self.discount, factor)
-        factor *= ~self.terminated[(last - 1) % self.rows, lanes]
-        actions = self.actions[rows, lanes]
+        factor *= ~self.terminated[(last - 1) % self.rows, envs]
+        actions = self.actions[rows, envs]
         return Batch(observations, actions, returns.astype(np.float32), factor.astype(np.float32), following)
 
     def save(self, path: Path) -> None:
@@ -236,29 +233,29 @@ class Replay:
         if self.goal_size:
             self.achieved[row] = achieved
 
-    def _end(self, lane: int, end: int) -> None:
-        steps = np.arange(max(self._starts[lane], self.head - self.rows + 1), self.head + 1)
-        self.ends[steps % self.rows, lane] = end
+    def _end(self, env: int, end: int) -> None:
+        steps = np.arange(max(self._starts[env], self.head - self.rows + 1), self.head + 1)
+        self.ends[steps % self.rows, env] = end
 
     def _draw(self, rng: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
-        """Steps and lanes (count,) of transitions: places are drawn anew until enough of them hold one."""
+        """Steps and columns (count,) of transitions: places are drawn anew until enough of them hold one."""
         oldest = max(0, self.head - self.rows + 1)
-        held = (self.head - oldest) * self.lanes
+        held = (self.head - oldest) * self.num_envs
         drawn = np.empty(0, int)
         for _ in range(_DRAWS):
             places = rng.integers(held, size=count) if held else drawn
-            rows, lanes = (oldest + places // self.lanes) % self.rows, places % self.lanes
-            drawn = np.concatenate([drawn, places[self.transition[rows, lanes]]])
+            rows, envs = (oldest + places // self.num_envs) % self.rows, places % self.num_envs
+            drawn = np.concatenate([drawn, places[self.transition[rows, envs]]])
             if len(drawn) >= count:
                 drawn = drawn[:count]
-                return oldest + drawn // self.lanes, drawn % self.lanes
+                return oldest + drawn // self.num_envs, drawn % self.num_envs
         raise ValueError("replay: holds no transitions to sample; add some first")
 
     def _relabel(
         self,
         rng: np.random.Generator,
         steps: IntArray,
-        lanes: IntArray,
+        envs: IntArray,
         ends: IntArray,
         observations: Float32Array,
         following: Float32Array,
@@ -266,7 +263,7 @@ class Replay:
         """Goals (B, G), most of them reached later, also written into the observations."""
         later = steps + 1 + (rng.random(len(steps)) * (ends - steps)).astype(int)
         chosen = rng.random(len(steps)) < self.hindsight / (self.hindsight + 1)
-        reached = self.achieved[later % self.rows, lanes]
+        reached = self.achieved[later % self.rows, envs]
         goals: Float32Array = np.where(chosen[:, None], reached, observations[:, -self.goal_size :])
         observations[:, -self.goal_size :] = following[:, -self.goal_size :] = goals
         return goals

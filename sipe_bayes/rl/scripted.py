@@ -17,7 +17,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.envs.task import Task
 
 Demonstrator = Callable[[FloatArray, int, Sequence[np.random.Generator]], FloatArray]
-"""Actions (B, A) of observations (B, O), the control step and the lanes' B generators."""
+"""Actions (B, A) of observations (B, O), the control step and B generators."""
 
 _GAIN = 10.0  # action per metre that the gripper is off
 _BRAKING = 2 * 0.1 * 9.81 * 0.04**2  # a puck goes v^2 / (2 friction gravity); v in metres a step of 0.04 s

@@ -8,7 +8,7 @@ agent does anywhere else.
 
 The folder holds ``curve.csv``, a TensorBoard log, ``policies/``, at the end ``counts.json`` (steps, updates, theta
 drawn anew because no model can have them, diverged simulations, and which run this was), and ``checkpoint/``: networks,
-targets, optimisers, normaliser, every random generator and the lanes' states in one safetensors file, with the replay
+targets, optimisers, normaliser, random generators and the episodes' states in one safetensors file, with the replay
 buffer beside it. The checkpoint names its buffer, and both are written before the previous ones go, so an interruption
 leaves a whole pair.
 """
@@ -21,7 +21,7 @@ import io
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 
@@ -284,11 +284,15 @@ class _Log:
         return self._folder / "policies" / f"{step}.safetensors"
 
     def _write_curve(self) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(field.name for field in fields(CurvePoint))
-        writer.writerows(astuple(point) for point in self._curve)
-        write_text(self._folder / "curve.csv", text.getvalue())
+        names = [field.name for field in fields(CurvePoint)]
+        write_table(self._folder / "curve.csv", names, map(astuple, self._curve))
+
+
+def write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a CSV file whose columns have names."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([names, *rows])
+    write_text(path, text.getvalue())
 
 
 def _finished(folder: Path, fingerprint: str, steps: int) -> bool:
@@ -301,15 +305,7 @@ def _finished(folder: Path, fingerprint: str, steps: int) -> bool:
 
 
 def choose(curve: Sequence[CurvePoint], steps: int) -> dict[str, int]:
-    """The steps of the two agents.
-
-    Args:
-        curve: of the run.
-        steps: of the whole run.
-
-    Returns:
-        Those of "suboptimal" and "expert".
-    """
+    """The steps of the agents "suboptimal" and "expert", of a run of ``steps``."""
     second = [point for point in curve if 2 * point.step >= steps]
     best = max(second[1:] or second, key=lambda point: point.return_mean)
     return {"suboptimal": second[0].step, "expert": best.step}

@@ -1,6 +1,6 @@
-"""An agent at work: lanes of a task that act, remember and learn, in small steps that can be stopped and gone on with.
+"""An agent at work: copies of a task that act, remember and learn, in small steps that can be stopped and gone on with.
 
-The lanes are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta,
+They are stepped together, and the updates of the steps taken follow. Each episode may run under its own theta,
 noise and delay (``sipe_bayes.rl.randomization``).
 """
 
@@ -25,8 +25,8 @@ from sipe_bayes.simulation.simulator import Simulator
 
 
 @dataclass(frozen=True)
-class Lanes:
-    """Where L lanes are: the arrays of ``Episodes``, None for what the task does not have."""
+class EpisodesState:
+    """Where L episodes are: the arrays of ``Episodes``, None for what the task does not have."""
 
     theta: FloatArray
     states: FloatArray
@@ -43,8 +43,7 @@ class TrainerState:
 
     Args:
         agent: networks and optimisers.
-        lanes: where they are.
-        over: lanes whose episode has ended (L,).
+        episodes: where they are.
         steps: control steps taken.
         owed: updates that are due.
         diverged: simulations so far.
@@ -54,8 +53,7 @@ class TrainerState:
     """
 
     agent: AgentState
-    lanes: Lanes
-    over: BoolArray
+    episodes: EpisodesState
     steps: int
     owed: float
     diverged: int
@@ -65,7 +63,7 @@ class TrainerState:
 
 
 class Trainer:
-    """An agent, its replay buffer and the lanes that it acts in. ``steps`` counts control steps, of all lanes together.
+    """An agent, its replay buffer and the environments that it acts in. ``steps`` counts their control steps together.
 
     Args:
         task: what it learns.
@@ -99,14 +97,13 @@ class Trainer:
             raise ValueError(f"end_hopeless: expected a task that knows when it is lost, got {task.name}; leave it out")
         self.task, self.settings = task, settings
         streams = np.random.SeedSequence(seed).spawn(5 + settings.lanes)
-        initial, self._noise, self._picks, self._draws, *lanes, last = (np.random.default_rng(s) for s in streams)
+        initial, self._noise, self._picks, self._draws, *starts, last = (np.random.default_rng(s) for s in streams)
         size = len(task.channels)
         self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial, device)
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
-        ending = {"allow_outside": True, "end_hopeless": settings.end_hopeless}
         self.simulator = Simulator(task, threads)
-        self.episodes = Episodes(self.simulator, task.theta("default"), lanes, **ending)
+        self.episodes = Episodes(self.simulator, task.theta("default"), starts, True, settings.end_hopeless)
         self.draws = None if randomization is None else Draws(self.simulator, randomization.posterior)
         self._disturbances = None
         if randomization is not None and randomization.disturbs:
@@ -117,12 +114,11 @@ class Trainer:
             self._redraw(every)
             self.episodes.begin(every)
         self.replay.begin(self._observed(self.episodes.first()))
-        self._over = np.zeros(settings.lanes, bool)
         self.steps, self._owed = 0, 0.0
 
     def advance(self) -> None:
-        """One control step of every lane and the updates that go with it."""
-        settings, fresh = self.settings, self._over
+        """One control step of every environment and the updates that go with it."""
+        settings, fresh = self.settings, self.episodes.over.copy()
         actions = self._actions()
         self._redraw(fresh)
         sent = actions if self._disturbances is None else self._disturbances.delayed(actions, fresh)
@@ -130,7 +126,6 @@ class Trainer:
         self.replay.add(actions, step)
         if self.agent.normaliser is not None:
             self.agent.normaliser.update(step.observations)
-        self._over = step.terminated | step.truncated
         taken = int((~fresh).sum())
         self.steps += taken
         if self.steps >= settings.start_steps:
@@ -147,8 +142,7 @@ class Trainer:
         """Everything but the replay buffer, from which ``restore`` goes on bit for bit."""
         return TrainerState(
             agent=self.agent.state(),
-            lanes=copy.deepcopy(self._lanes()),
-            over=self._over.copy(),
+            episodes=copy.deepcopy(self._episodes_state()),
             steps=self.steps,
             owed=self._owed,
             diverged=self.simulator.diverged,
@@ -160,13 +154,13 @@ class Trainer:
     def restore(self, state: TrainerState) -> None:
         """Go on from what ``state`` gave."""
         self.agent.restore(state.agent)
-        self.episodes.set_theta(np.arange(self.settings.lanes), state.lanes.theta)
-        for name, array in vars(self._lanes()).items():
+        self.episodes.set_theta(np.arange(self.settings.lanes), state.episodes.theta)
+        for name, array in vars(self._episodes_state()).items():
             if array is not None:
-                array[...] = getattr(state.lanes, name)
+                array[...] = getattr(state.episodes, name)
         for generator, kept in zip(self._generators(), state.generators, strict=True):
             generator.bit_generator.state = json.loads(kept)
-        self.steps, self._owed, self._over = state.steps, state.owed, state.over.copy()
+        self.steps, self._owed = state.steps, state.owed
         self.simulator.diverged = state.diverged
         if self.draws is not None:
             self.draws.redrawn = state.redrawn
@@ -176,31 +170,31 @@ class Trainer:
     def _generators(self) -> list[np.random.Generator]:
         return [self._noise, self._picks, self._draws, *self.episodes.generators]
 
-    def _lanes(self) -> Lanes:
+    def _episodes_state(self) -> EpisodesState:
         """The arrays themselves."""
         at = self.episodes
-        return Lanes(at.theta, at.states, at.goals, at.observations, at.elapsed, at.derived, at.over)
+        return EpisodesState(at.theta, at.states, at.goals, at.observations, at.elapsed, at.derived, at.over)
 
     def _actions(self) -> FloatArray:
         """(L, A): random ones at first, then the actor's with noise."""
-        settings, task, lanes = self.settings, self.task, self.settings.lanes
-        size = (lanes, task.num_actions)
+        settings, task = self.settings, self.task
+        size = (settings.lanes, task.num_actions)
         if self.steps < settings.start_steps:
             return self._noise.uniform(task.action_low, task.action_high, size)
         half = (task.action_high - task.action_low) / 2
         actions = self.agent.act((self._disturbances or self.episodes).observations)
         actions += settings.exploration * half * self._noise.standard_normal(size)
         if settings.random_share:
-            chosen = self._noise.random(lanes) < settings.random_share
+            chosen = self._noise.random(size[0]) < settings.random_share
             actions[chosen] = self._noise.uniform(task.action_low, task.action_high, (int(chosen.sum()), size[1]))
         return np.clip(actions, task.action_low, task.action_high)
 
-    def _redraw(self, lanes: BoolArray) -> None:
-        chosen = np.flatnonzero(lanes)
+    def _redraw(self, fresh: BoolArray) -> None:
+        chosen = np.flatnonzero(fresh)
         if self.draws is not None and len(chosen):
             self.episodes.set_theta(chosen, self.draws(self._draws, len(chosen)))
             if self._disturbances is not None:
-                self._disturbances.begin(lanes)
+                self._disturbances.begin(fresh)
 
     def _observed(self, step: Step) -> Step:
         """A step as the agent observes it."""
@@ -216,17 +210,17 @@ class Trainer:
         parts = [b.sample(self._picks, n) for b, n in ((self.replay, count - shown), (self._shown, shown)) if n]
         return Batch(*(np.concatenate([getattr(p, name) for p in parts]) for name in Batch.__annotations__))
 
-    def _buffer(self, capacity: int, lanes: int) -> Replay:
+    def _buffer(self, capacity: int, num_envs: int) -> Replay:
         task, settings = self.task, self.settings
-        if capacity // lanes <= task.episode_steps:
+        if capacity // num_envs <= task.episode_steps:
             raise ValueError(
-                f"capacity: expected room for more than an episode of {task.episode_steps} steps in each of {lanes} "
-                f"lanes, got {capacity}"
+                f"capacity: expected room for more than an episode of {task.episode_steps} steps in each of {num_envs} "
+                f"environments, got {capacity}"
             )
         goals, reward = task.goal_size, task.goal_reward if task.goal_size else None
         k = settings.hindsight if goals else 0
         size = (len(task.channels), task.num_actions)
-        return Replay(*size, capacity, lanes, settings.discount, settings.n_step, goals, k, reward)
+        return Replay(*size, capacity, num_envs, settings.discount, settings.n_step, goals, k, reward)
 
     def _demonstrated(self, given: Trajectories) -> Replay:
         batch, horizon = given.actions.shape[:2]

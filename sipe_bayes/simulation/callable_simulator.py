@@ -125,24 +125,12 @@ class CallableSimulator:
         )
 
     def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:
-        """As ``Simulator.replay``.
-
-        Args:
-            theta: (B, N).
-            trajectories: R observed x.
-            starts: not used; there are no states.
-
-        Returns:
-            B * R trajectories of one step, R independent ones of each theta.
-        """
+        """As ``Simulator.replay`` of theta (B, N) and R observed x: B * R trajectories of one step; no starts."""
         theta, count = np.atleast_2d(np.asarray(theta, float)), len(trajectories)
         if trajectories.actions.shape[1:] != (1, 0):
             raise ValueError(f"trajectories: expected an x ({len(self.environment.channels)},), got a trajectory")
-        x = (
-            np.repeat(self._call(self.space.values(theta)), count, axis=0)
-            if not self.noisy
-            else self._drawn(theta, count)
-        )
+        noisy = self.noisy
+        x = self._drawn(theta, count) if noisy else np.repeat(self._call(self.space.values(theta)), count, axis=0)
         batch = len(x)
         observations = np.stack([np.zeros_like(x), x], axis=1)
         valid = np.stack([np.ones(batch, bool), np.isfinite(x).all(1)], axis=1)

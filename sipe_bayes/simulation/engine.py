@@ -17,7 +17,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.base import Environment
-from sipe_bayes.simulation import mjdata
+from sipe_bayes.simulation.mjdata import Fields
 
 _TIME_TOLERANCE = 0.5  # of a physics step: a reset or a repeated sample is a whole one off
 _FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
@@ -25,8 +25,26 @@ _SHORT, _PIECES = 32, 4  # of so few physics steps a thread takes few pieces: to
 HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
 
 
+class Run(NamedTuple):
+    """T control steps of B simulations to come.
+
+    Args:
+        skip: physics steps of a control step.
+        models: one for each simulation.
+        timesteps: (B,) seconds of their physics steps.
+        actions: (B, T, A).
+        start: states (B, S) to begin at.
+    """
+
+    skip: int
+    models: Sequence[mujoco.MjModel]
+    timesteps: FloatArray
+    actions: FloatArray
+    start: FloatArray
+
+
 class Motion(NamedTuple):
-    """What happened in B simulations of T control steps.
+    """What happened in them.
 
     Args:
         states: (B, T+1, S).
@@ -77,51 +95,30 @@ class Engine:
         self.physics_size = int(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._threads = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
+        self._fields = Fields(environment.data_fields, self._datas) if environment.data_fields else None
 
     @property
     def derived_size(self) -> int:
         """D: the numbers of ``derived``, sensordata or MjData's own."""
-        fields = self.environment.data_fields
-        return mjdata.fields_size(self._datas[0], fields) if fields else int(self.model.nsensordata)
+        return int(self.model.nsensordata) if self._fields is None else self._fields.size
 
     @property
     def reads_sensors(self) -> bool:
         """Whether sensordata is wanted with the states."""
         return self.environment.needs_derived or self.environment.stepwise
 
-    def advance(
-        self,
-        skip: int,
-        models: Sequence[mujoco.MjModel],
-        timesteps: FloatArray,
-        actions: FloatArray,
-        start: FloatArray,
-        first: bool = True,
-    ) -> Motion:
-        """Simulate T control steps of B simulations.
-
-        Args:
-            skip: physics steps of a control step.
-            models: one for each simulation.
-            timesteps: (B,) seconds of their physics steps.
-            actions: (B, T, A).
-            start: states (B, S) to begin at.
-            first: whether the derived quantities of sample 0 are wanted; without, they may be missing.
-        """
+    def advance(self, run: Run, first: bool = True) -> Motion:
+        """Simulate; without ``first`` the derived quantities of sample 0 may be missing."""
         with quiet:
-            if self.environment.data_fields:
-                return self._on_data(skip, models, timesteps, actions, start, first)
-            run = self._stepwise if self.environment.stepwise else self._open_loop
-            return run(skip, models, timesteps, actions, start)
+            if self._fields is not None:
+                controls = self.environment.control(self.model, run.start, run.actions)
+                states, derived, clean = self._fields.advance(run.models, run.skip, controls, run.start, first)
+                valid = _valid(states, states[:, 1:], 1, run.skip * run.timesteps[:, None], False)
+                return Motion(states, derived, clean & valid)
+            return self._stepwise(run) if self.environment.stepwise else self._open_loop(run)
 
-    def _open_loop(
-        self,
-        skip: int,
-        models: Sequence[mujoco.MjModel],
-        timesteps: FloatArray,
-        actions: FloatArray,
-        start: FloatArray,
-    ) -> Motion:
+    def _open_loop(self, run: Run) -> Motion:
+        skip, models, timesteps, actions, start = run
         environment, horizon = self.environment, actions.shape[1]
         controls = np.repeat(environment.control(self.model, start, actions), skip, axis=1)
         # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one
@@ -139,15 +136,9 @@ class Engine:
             derived = np.concatenate([sensors[:, :1], sensors[:, skip - 1 : horizon * skip : skip]], axis=1)
         return Motion(states, derived, _valid(states, out, skip, timesteps[:, None], aligned))
 
-    def _stepwise(
-        self,
-        skip: int,
-        models: Sequence[mujoco.MjModel],
-        timesteps: FloatArray,
-        actions: FloatArray,
-        start: FloatArray,
-    ) -> Motion:
+    def _stepwise(self, run: Run) -> Motion:
         """For an environment whose control depends on the state."""
+        skip, models, timesteps, actions, start = run
         environment, horizon, size = self.environment, actions.shape[1], self.physics_size
         states = np.empty((len(start), horizon + 1, start.shape[1]))
         derived = np.empty((len(start), horizon + 1, self.model.nsensordata)) if environment.needs_derived else None
@@ -172,24 +163,6 @@ class Engine:
                 derived[:, t + 1] = sensors
         return Motion(states, derived, valid)
 
-    def _on_data(
-        self,
-        skip: int,
-        models: Sequence[mujoco.MjModel],
-        timesteps: FloatArray,
-        actions: FloatArray,
-        start: FloatArray,
-        first: bool,
-    ) -> Motion:
-        """For an environment that reads MjData itself."""
-        environment = self.environment
-        controls = environment.control(self.model, start, actions)
-        states, derived, clean = mjdata.advance(
-            models, self._datas, environment.data_fields, skip, controls, start, first
-        )
-        valid = clean & _valid(states, states[:, 1:], 1, skip * timesteps[:, None], False)
-        return Motion(states, derived, valid)
-
     def sensors(self, models: Sequence[mujoco.MjModel], states: FloatArray) -> FloatArray:
         """What states hold for the sensors.
 
@@ -200,9 +173,9 @@ class Engine:
         Returns:
             Sensordata (B, D), without control.
         """
-        if self.environment.data_fields:
+        if self._fields is not None:
             with quiet:
-                return mjdata.forward(models, self._datas, self.environment.data_fields, states)
+                return self._fields.forward(models, states)
         width = mujoco.mj_stateSize(self.model, self.environment.control_spec)
         own = np.ascontiguousarray(states[:, : self.physics_size])
         flags = int(self.model.opt.disableflags)

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task, Transition
-from sipe_bayes.simulation.engine import Engine
+from sipe_bayes.simulation.base import Simulated
+from sipe_bayes.simulation.engine import Run
 
 
 @dataclass(frozen=True)
@@ -47,40 +45,6 @@ class Step:
     achieved_goals: FloatArray | None
 
 
-class Stepped(Protocol):
-    """What closed loop needs of a simulator."""
-
-    model: mujoco.MjModel
-    engine: Engine
-    environment: Environment
-    diverged: int
-    control_steps: int
-
-    @property
-    def space(self) -> ParameterSpace:
-        """As ``Simulator``'s."""
-
-    @property
-    def dt(self) -> float:
-        """As ``Simulator``'s."""
-
-    @property
-    def state_size(self) -> int:
-        """As ``Simulator``'s."""
-
-    def physics_steps(self, dt: float) -> tuple[int, float]:
-        """As ``Simulator``'s."""
-
-    def check_theta(self, theta: FloatArray, allow_outside: bool, num_envs: int | None = None) -> FloatArray:
-        """As ``Simulator``'s."""
-
-    def check_physical(self, theta: FloatArray) -> None:
-        """As ``Simulator``'s."""
-
-    def written(self, theta: FloatArray, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
-        """As ``Simulator``'s."""
-
-
 class Episodes:
     """B simulations of a simulator's task.
 
@@ -97,7 +61,7 @@ class Episodes:
 
     def __init__(
         self,
-        simulator: Stepped,
+        simulator: Simulated,
         theta: FloatArray,
         generators: Sequence[np.random.Generator],
         allow_outside: bool = False,
@@ -110,7 +74,7 @@ class Episodes:
                 "`sipe envs`"
             )
         if not len(generators):
-            raise ValueError("count: expected at least one lane, got 0")
+            raise ValueError("count: expected at least 1, got 0")
         self.task, self.simulator, self.count = task, simulator, len(generators)
         self.generators, self.allow_outside, self.end_hopeless = list(generators), allow_outside, end_hopeless
         self._skip, self._timestep = simulator.physics_steps(simulator.dt)
@@ -233,11 +197,10 @@ class Episodes:
         before = self.states[index]
         goals = None if self.goals is None else self.goals[index]
         old = None if self.derived is None else self.derived[index]
-        states, derived, sound = self.simulator.engine.advance(
-            self._skip, models, self._timesteps[index], actions[:, None], before, first=False
-        )
+        run = Run(self._skip, models, self._timesteps[index], actions[:, None], before)
+        states, derived, valid = self.simulator.engine.advance(run, first=False)
         after, new = states[:, 1], None if derived is None else derived[:, 1]
-        valid = np.asarray(sound[:, 0] & sound[:, 1])
+        valid = np.asarray(valid.all(1))
         observations = task.observe(self.simulator.model, after, new, goals)
         transition = Transition(before, old, actions, after, new, goals)
         rewards, terminated, success = task.reward(transition), task.terminated(transition), task.success(transition)

@@ -36,15 +36,7 @@ for _name in TASKS:
 
 
 def make(name: str, variant: str = "default") -> SipeEnv:
-    """A task as a Gymnasium environment; ``.simulator`` is its engine.
-
-    Args:
-        name: the task's.
-        variant: whose parameters it has.
-
-    Raises:
-        ValueError: for an unknown task, with the nearest name, or an unknown variant.
-    """
+    """A task as a Gymnasium environment with its engine; raises ValueError for an unknown task or variant."""
     return SipeEnv(name, variant)
 
 
@@ -181,7 +173,7 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self, task: str | Task, num_envs: int = 1, variant: str = "default", num_threads: int | None = None
     ) -> None:
         if num_envs < 1:
-            raise ValueError(f"num_envs: expected at least one lane, got {num_envs}")
+            raise ValueError(f"num_envs: expected at least 1, got {num_envs}")
         self.task = make_task(task) if isinstance(task, str) else task
         self.theta = np.tile(self.task.theta(variant), (num_envs, 1))
         self.simulator, self.num_envs = Simulator(self.task, num_threads), num_envs

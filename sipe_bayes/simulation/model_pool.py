@@ -82,15 +82,7 @@ class ModelPool:
             raise ValueError(f"theta: unphysical parameters ({named}); choose values within the bounds")
 
     def written(self, theta: FloatArray, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
-        """A model of one's own.
-
-        Args:
-            theta: (N,).
-            model: an earlier one, to be written anew; default a new copy.
-
-        Raises:
-            ValueError: for an unphysical theta; ``model`` stays as it was.
-        """
+        """``model``, or else a new copy, with theta (N,); raises ValueError for an unphysical one, nothing written."""
         self.check_physical(theta)
         model = copy.copy(self.model) if model is None else model
         self._write(model, theta, float(self.model.opt.timestep), None)

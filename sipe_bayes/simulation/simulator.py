@@ -10,24 +10,19 @@ nothing on the terminal, no MUJOCO_LOG.TXT; ``Simulator.diverged`` counts.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.core.validation import cores, whole
-from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task
-from sipe_bayes.simulation.engine import HUGE, Engine, quiet
+from sipe_bayes.simulation.base import Simulated
+from sipe_bayes.simulation.engine import HUGE, Run, quiet
 from sipe_bayes.simulation.episodes import Episodes, Step
-from sipe_bayes.simulation.model_pool import ModelPool
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ class Memory:
 MEMORY = Memory()
 
 
-class Simulator:
+class Simulator(Simulated):
     """Simulates an Environment for batches of theta. Not for two Python threads at a time.
 
     ``control_steps`` counts what was simulated, ``diverged`` the simulations that are not valid to their end.
@@ -59,65 +54,7 @@ class Simulator:
         ValueError: for anything but an Environment, or no whole number of threads.
     """
 
-    failure: ClassVar[str] = "diverged"  # what is said of simulations that are not valid to their end
-
-    def __init__(self, environment: Environment, num_threads: int | None = None) -> None:
-        if not isinstance(environment, Environment):
-            hint = f"sipe.make_task({environment!r})" if isinstance(environment, str) else "one of sipe.make_task(name)"
-            raise ValueError(f"environment: expected an Environment, got {environment!r}; give {hint}")
-        self.environment = environment
-        self.num_threads = cores() if num_threads is None else whole("num_threads", num_threads)
-        self.model = environment.compile()
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
-        self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show
-        self.engine = Engine(environment, self.model, self.num_threads)
-        self.pool = ModelPool(environment, self.model)
-        self.diverged = 0
-        self.control_steps = 0
-        self.episodes: Episodes | None = None
-
-    def __reduce__(self) -> tuple[type[Simulator], tuple[Environment, int]]:
-        return Simulator, (self.environment, self.num_threads)
-
-    @property
-    def space(self) -> ParameterSpace:
-        """The environment's parameters."""
-        return self.environment.space
-
-    @property
-    def state_size(self) -> int:
-        """S: the numbers of MuJoCo's full physics state, and of a stepwise environment's memory."""
-        return self.engine.physics_size + self.environment.memory_size
-
-    @property
-    def dt(self) -> float:
-        """Seconds of a control step where none are given."""
-        return float(self.environment.frame_skip * self.model.opt.timestep)
-
-    def checksum(self) -> str:
-        """SHA-256 of the compiled default model, with whatever files its MJCF includes."""
-        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
-        mujoco.mj_saveModel(self.model, None, buffer)
-        return hashlib.sha256(buffer.tobytes()).hexdigest()
-
-    def default_state(self) -> FloatArray:
-        """State (S,) after a reset of the default model."""
-        data, state = mujoco.MjData(self.model), np.empty(self.engine.physics_size)
-        mujoco.mj_getState(self.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        if not self.environment.memory_size:
-            return state
-        memory = self.environment.remember(self.engine.sensors([self.model], state[None]))
-        return np.concatenate([state, memory[0]])
-
-    def physics_steps(self, dt: float) -> tuple[int, float]:
-        """How a control step of ``dt`` seconds is divided.
-
-        Returns:
-            How many physics steps it has, and the seconds of each: never longer than the model's own.
-        """
-        steps = max(1, math.ceil(dt / self.model.opt.timestep - 1e-3))
-        own = float(self.model.opt.timestep)
-        return steps, own if math.isclose(dt, steps * own, rel_tol=1e-12) else dt / steps
+    episodes: Episodes | None = None
 
     def rollout(
         self,
@@ -216,45 +153,6 @@ class Simulator:
             names=tuple(trajectories.names) * batch,
         )
 
-    def check_theta(self, theta: FloatArray, allow_outside: bool, num_envs: int | None = None) -> FloatArray:
-        """Checked parameters.
-
-        Args:
-            theta: (..., N); with ``num_envs`` (num_envs, N) or (N,).
-            allow_outside: whether it may leave [0, 1].
-            num_envs: how many simulations it is for.
-
-        Returns:
-            A copy; (num_envs, N) where that is given.
-
-        Raises:
-            ValueError: for another shape, NaN, or values outside [0, 1] that are not allowed.
-        """
-        theta, n = np.array(theta, float), len(self.space)
-        if theta.shape not in ((n,), (num_envs, n)) if num_envs is not None else theta.shape[-1:] != (n,):
-            expected = f"({n},)" if num_envs in (None, 1) else f"({num_envs}, {n}) or ({n},)"
-            raise ValueError(
-                f"theta: expected {n} parameters, shape {expected}, got {theta.shape}; see the space's names"
-            )
-        if num_envs is not None:
-            theta = np.tile(theta, (num_envs, 1)) if theta.ndim == 1 else theta
-        if not np.isfinite(theta).all():
-            raise ValueError("theta: expected finite numbers, got NaN or infinity")
-        if not allow_outside and not ((theta >= 0) & (theta <= 1)).all():
-            raise ValueError(
-                f"theta: expected values in [0, 1], got {theta.min():.4g} to {theta.max():.4g}; "
-                "clip them, or pass allow_outside=True"
-            )
-        return theta
-
-    def check_physical(self, theta: FloatArray) -> None:
-        """Raises ValueError for theta (N,) that no model can have."""
-        self.pool.check_physical(theta)
-
-    def written(self, theta: FloatArray, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
-        """A model of one's own with theta (N,) written in; see ``ModelPool.written``."""
-        return self.pool.written(theta, model)
-
     def reset(
         self,
         theta: FloatArray | None = None,
@@ -333,12 +231,12 @@ class Simulator:
                 f"dt: {self.environment.name} has control steps of {self.dt:g} s, got {dts.min():g}; leave it out"
             )
         if dts.shape not in ((), (1,), (batch,)):
-            raise ValueError(f"dt: expected one number or ({batch},), one for each lane, got shape {dts.shape}")
+            raise ValueError(f"dt: expected one number or ({batch},), one for each simulation, got shape {dts.shape}")
         if not (np.isfinite(dts) & (dts > 0)).all():
             raise ValueError(f"dt: expected seconds above zero, got {float(dts.min()):g}")
         names: list[str | None] = [None] * batch if logs is None else list(logs)
         if len(names) != batch:
-            raise ValueError(f"logs: expected {batch} names, one for each lane, got {len(names)}")
+            raise ValueError(f"logs: expected {batch} names, one for each simulation, got {len(names)}")
         return np.broadcast_to(dts, (batch,)), names
 
     def _chunks(self, steps: IntArray, horizon: int) -> Iterator[tuple[int, IntArray]]:
@@ -367,7 +265,9 @@ class Simulator:
         if not run.any():
             return
         models, at = self.pool.models(slots[run]), chunk[run]
-        states, derived, valid = self.engine.advance(skip, models, timesteps[run], actions[run], initial_state[run])
+        states, derived, valid = self.engine.advance(
+            Run(skip, models, timesteps[run], actions[run], initial_state[run])
+        )
         targets = None if goals is None else goals[run, None]
         observations = self.environment.observe(self.model, states, derived, targets)
         biases = self.pool.biases(slots[run])[:, None]

@@ -225,7 +225,7 @@ def test_wrong_input() -> None:
         (lambda: quietly("Pendulum", noise=-0.1), ValueError, "none below zero"),
         (lambda: sipe.demonstrations(pendulum()), ValueError, "no starting states"),
         (lambda: sipe.demonstrations(3), TypeError, "expected a task's name"),
-        (lambda: sipe.demonstrations(lanes), ValueError, "lanes differ"),
+        (lambda: sipe.demonstrations(lanes), ValueError, "parameters differ"),
     ]
     for call, exception, words in table:
         with pytest.raises(exception, match=words):

@@ -11,6 +11,7 @@ import pytest
 
 from sipe_bayes.envs.task import Transition
 from sipe_bayes.envs.tasks.adroit import Adroit, door, relocate
+from sipe_bayes.simulation.engine import Run
 from sipe_bayes.simulation.simulator import Simulator
 
 STEPS = 100
@@ -80,7 +81,9 @@ def motion(simulator: Simulator, seed: int, theta: Any) -> tuple[Any, Transition
     commands, states = actions(task, seed), task.states(*(x[None] for x in start(task, seed)))
     run = simulator.rollout(theta, commands, states)
     timestep = np.array([simulator.model.opt.timestep])
-    x, d, _ = simulator.engine.advance(task.frame_skip, [simulator.written(theta)], timestep, commands[None], states)
+    x, d, _ = simulator.engine.advance(
+        Run(task.frame_skip, [simulator.written(theta)], timestep, commands[None], states)
+    )
     assert d is not None
     return run, Transition(x[:, :-1], d[:, :-1], commands[None], x[:, 1:], d[:, 1:])
 

@@ -15,6 +15,7 @@ from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.tasks.fetch import _euler
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.simulation.engine import Run
 from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
@@ -156,7 +157,7 @@ def test_writing_in_place_equals_compiling(simulator: Simulator, theta: tuple[fl
     velocity = 1 + written.nq + written.joint("object0:joint").dofadr[0]
     start[:, velocity : velocity + 2] = -0.6, -0.4
     ends = [
-        simulator.engine.advance(20, [m], np.array([0.002]), np.zeros((1, 25, 4)), start)[0]
+        simulator.engine.advance(Run(20, [m], np.array([0.002]), np.zeros((1, 25, 4)), start))[0]
         for m in (written, compiled)
     ]
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-9)

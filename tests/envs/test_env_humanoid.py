@@ -16,6 +16,7 @@ from sipe_bayes.envs.assets import gymnasium_asset
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.targets import body_frame_inertia
 from sipe_bayes.envs.tasks.humanoid import Humanoid
+from sipe_bayes.simulation.engine import Run
 from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]
@@ -129,7 +130,7 @@ def test_in_place_equals_compiled(simulator: Simulator, seed: int) -> None:
     rng = np.random.default_rng(seed)
     (start, _), actions = task.initial_states(rng, 1), rng.uniform(-0.4, 0.4, (1, 100, 17))
     states = [
-        simulator.engine.advance(task.frame_skip, [model], np.array([model.opt.timestep]), actions, start)[0]
+        simulator.engine.advance(Run(task.frame_skip, [model], np.array([model.opt.timestep]), actions, start))[0]
         for model in (written, compiled)
     ]
     np.testing.assert_allclose(states[0], states[1], rtol=0, atol=1e-9)

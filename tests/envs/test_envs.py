@@ -20,6 +20,7 @@ from sipe_bayes.diagnostics.sensitivity import sensitivity
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import VARIANTS, Task
 from sipe_bayes.envs.tasks.fetch import Fetch
+from sipe_bayes.simulation.engine import Run
 from sipe_bayes.simulation.simulator import Simulator
 
 gymnasium.register_envs(sipe.gym)  # another test may have imported sipe_bayes before gymnasium
@@ -197,7 +198,8 @@ def test_states_and_derived_are_those_of_plain_mujoco(task: Task, simulator: Sim
         pytest.skip("compared with the published class in its family's test")
     case = Case(task, lanes=1, steps=3)
     model, skip = simulator.written(case.theta[0]), task.frame_skip
-    _, derived, _ = simulator.engine.advance(skip, [model], np.array([model.opt.timestep]), case.actions, case.start)
+    run = Run(skip, [model], np.array([model.opt.timestep]), case.actions, case.start)
+    _, derived, _ = simulator.engine.advance(run)
     whole = case.rollout(simulator)
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, case.start[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -197,6 +197,6 @@ def test_an_empty_buffer_and_wrong_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="no transitions"):
         filled(1, 0).sample(np.random.default_rng(0), 4)
     with pytest.raises(ValueError, match="capacity: expected at least 2"):
-        Replay(4, 1, 3, lanes=2)
+        Replay(4, 1, 3, num_envs=2)
     with pytest.raises(ValueError, match="hindsight: expected 0"):
         Replay(4, 1, 100, hindsight=4)

@@ -265,8 +265,8 @@ def call(**changes: Any) -> Any:
         ({"initial_state": np.zeros((3, 3))}, "batch sizes differ: theta 7, actions 7, initial_state 3"),
         ({"dt": 0.0}, "dt: expected seconds above zero, got 0"),
         ({"dt": np.nan}, "dt: expected seconds above zero, got nan"),
-        ({"dt": np.full(3, 0.01)}, r"dt: expected one number or \(7,\), one for each lane, got shape \(3,\)"),
-        ({"logs": ["a"]}, "logs: expected 7 names, one for each lane, got 1"),
+        ({"dt": np.full(3, 0.01)}, r"dt: expected one number or \(7,\), one for each simulation, got shape \(3,\)"),
+        ({"logs": ["a"]}, "logs: expected 7 names, one for each simulation, got 1"),
     ],
 )
 def test_wrong_input_is_named(changes: dict[str, Any], words: str) -> None:
