@@ -177,9 +177,9 @@ def _trajectory(episode: Any, dt: float, dataset: str) -> Trajectory:
 def _rows(values: Any, goals_last: bool) -> FloatArray:
     """(T, O) of arrays (T, ...), or of dictionaries and tuples of such."""
     if isinstance(values, dict):
-        keys = (
-            [k for k in values if k not in _GOALS] + [k for k in _GOALS if k in values] if goals_last else list(values)
-        )
+        keys = list(values)
+        if goals_last:
+            keys = [k for k in keys if k not in _GOALS] + [k for k in _GOALS if k in values]
         return np.concatenate([_rows(values[key], goals_last) for key in keys], axis=1)
     if isinstance(values, tuple):
         return np.concatenate([_rows(part, goals_last) for part in values], axis=1)

@@ -191,13 +191,8 @@ class MjcfEnvironment(Environment):
 
     @cached_property
     def _inertial_bodies(self) -> list[int]:
-        return sorted(
-            {
-                named(self._model, "body", split(t.spec)[1], t.spec)
-                for _, _, t in self._targets
-                if t.spec.startswith("body:") and ".inertia_" in t.spec
-            }
-        )
+        specs = [t.spec for _, _, t in self._targets if t.spec.startswith("body:") and ".inertia_" in t.spec]
+        return sorted({named(self._model, "body", split(spec)[1], spec) for spec in specs})
 
     @cached_property
     def _shares(self) -> dict[str | None, dict[int, list[int]]]:

@@ -134,9 +134,8 @@ def _hinge(model: mujoco.MjModel, joint: int) -> bool:
 def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) -> Maker:
     def make(model: mujoco.MjModel, spec: str, joint: int) -> Target:
         start = int(model.jnt_dofadr[joint])
-        size = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(
-            int(model.jnt_type[joint]), 1
-        )
+        sizes = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}
+        size = sizes.get(int(model.jnt_type[joint]), 1)
         unit = hinge_unit if _hinge(model, joint) else slide_unit
         value = float(getattr(model, field)[start])
 

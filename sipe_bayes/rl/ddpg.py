@@ -214,13 +214,9 @@ class Agent:
 
     def update(self, batch: Batch) -> None:
         """One step of the critic, the actor and the targets."""
-        observations, following, actions, returns, discounts = (
-            self._on_device(x)
-            for x in (
-                *(self._normalised(x) for x in (batch.observations, batch.next_observations)),
-                *(batch.actions, batch.returns, batch.discounts),
-            )
-        )
+        seen = (self._normalised(x) for x in (batch.observations, batch.next_observations))
+        given = (*seen, batch.actions, batch.returns, batch.discounts)
+        observations, following, actions, returns, discounts = (self._on_device(x) for x in given)
         # the critic follows its target
         targets = self._targets(following, returns, discounts)
         pairs = torch.cat([observations, actions], 1)

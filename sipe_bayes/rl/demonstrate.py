@@ -105,11 +105,8 @@ def make(
     else:
         act = scripted.demonstrator(made)
     shown = demonstrate(simulator, act, count, seed)
-    facts = Facts(
-        *(task, command, seed, by, len(shown.trajectories), shown.attempts, shown.return_mean),
-        iterations=iterations,
-        score=score,
-    )
+    made_of = len(shown.trajectories), shown.attempts, shown.return_mean
+    facts = Facts(task, command, seed, by, *made_of, iterations, score)
     shown.trajectories.save(path)
     plain = {name: value for name, value in asdict(facts).items() if value is not None}
     write_text(path.with_suffix(".json"), to_json(plain, indent=2))

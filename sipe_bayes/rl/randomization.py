@@ -78,10 +78,8 @@ class Randomization:
         """The same for the same randomisation."""
         tensors, settings = self.posterior._state()
         noise = np.asarray(self.observation_noise, float)
-        plain = [
-            *(type(self.posterior).__name__, self.posterior.space.to_dict(), settings),
-            *(noise.tolist(), int(self.action_delay)),
-        ]
+        own = type(self.posterior).__name__, self.posterior.space.to_dict(), settings
+        plain = [*own, noise.tolist(), int(self.action_delay)]
         digest = hashlib.sha256(json.dumps(plain, sort_keys=True, default=float).encode())
         for name in sorted(tensors):
             digest.update(name.encode() + tensors[name].contiguous().numpy().tobytes())

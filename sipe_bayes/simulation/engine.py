@@ -164,15 +164,7 @@ class Engine:
         return Motion(states, derived, valid)
 
     def sensors(self, models: Sequence[mujoco.MjModel], states: FloatArray) -> FloatArray:
-        """What states hold for the sensors.
-
-        Args:
-            models: one for each of B simulations.
-            states: (B, S).
-
-        Returns:
-            Sensordata (B, D), without control.
-        """
+        """Sensordata (B, D) of states (B, S) without control, a model for each."""
         if self._fields is not None:
             with quiet:
                 return self._fields.forward(models, states)
@@ -211,14 +203,9 @@ class Engine:
 
 
 def _valid(kept: FloatArray, out: FloatArray, skip: int, timestep: FloatArray, derived: bool) -> BoolArray:
-    """Which samples are neither reset, repeated nor huge.
+    """Which samples ``kept`` (B, T+1, S) of the physics steps ``out`` (B, P, S) are neither reset, repeated nor huge.
 
-    Args:
-        kept: the samples (B, T+1, S).
-        out: the physics steps (B, P, S) that they were taken of.
-        skip: physics steps of a control step.
-        timestep: (B, 1).
-        derived: whether the step that filled the samples' sensordata must have been valid too.
+    Where ``derived``, the step that filled a sample's sensordata must have been valid too.
     """
     count = kept.shape[1]
     expected = kept[:, :1, 0] + np.arange(count) * skip * timestep

@@ -27,15 +27,10 @@ from sipe_bayes.simulation.episodes import Episodes, Step
 
 @dataclass(frozen=True)
 class Memory:
-    """What a rollout may hold at once.
+    """What a rollout may hold at once."""
 
-    Args:
-        numbers: of state and sensor output, 128 MiB.
-        model_bytes: of written models.
-    """
-
-    numbers: int = 2**24
-    model_bytes: int = 2**29
+    numbers: int = 2**24  # of state and sensor output, 128 MiB
+    model_bytes: int = 2**29  # of written models
 
 
 MEMORY = Memory()

@@ -89,9 +89,7 @@ class Adroit(Task):
     derived_late = True
     scene_file: ClassVar[str]
     observed: ClassVar[tuple[str, ...]]  # joints whose position comes first in an observation
-    places: ClassVar[
-        tuple[tuple[str, mujoco.mjtObj], ...]
-    ]  # (name, mjOBJ) of what the sensordata holds the positions of
+    places: ClassVar[tuple[tuple[str, mujoco.mjtObj], ...]]  # what the sensordata holds the positions of
 
     def compile(self) -> mujoco.MjModel:
         """The simulated model: what is measured, without what is only seen."""

@@ -77,14 +77,9 @@ _PUBLISHED = _Published()
 
 
 def rod_length(model: mujoco.MjModel, spec: str) -> Target:
-    """The target ``rod:NAME.length`` (m); the rod's mass stays.
+    """The target ``rod:NAME.length`` (m) of a uniform rod along z from its joint, drawn as the capsule of that name.
 
-    Args:
-        model: in which the body NAME is a uniform rod along z from its joint, drawn as the capsule of that name.
-        spec: the target.
-
-    Raises:
-        TargetError: for another form, or a name that the model does not have.
+    The rod's mass stays. Raises TargetError for another form, or a name that the model does not have.
     """
     match = _ROD.match(spec)
     if not match:

@@ -54,9 +54,8 @@ _PUBLISHED, _EXCITATION = _Published(), _Excitation()
 _FINGER = "robot0:r_gripper_finger_joint"  # the left one's follows it
 
 _GRIP, _LINK, _OBJECT = "robot0:grip", "robot0:gripper_link", "object0"
-_SIGHTS: tuple[
-    tuple[str, str, str, str, int], ...
-] = (  # name, sensor, kind of object, object, size: the memory's columns
+# name, sensor, kind of object, object, size: the memory's columns
+_SIGHTS: tuple[tuple[str, str, str, str, int], ...] = (
     ("grip", "FRAMEPOS", "SITE", _GRIP, 3),
     ("link", "FRAMEPOS", "XBODY", _LINK, 3),
     ("link_quaternion", "FRAMEQUAT", "XBODY", _LINK, 4),

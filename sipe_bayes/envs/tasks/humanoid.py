@@ -166,7 +166,6 @@ class Humanoid(LinkTask):
 
     def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
         """Positions and velocities."""
-        """45 of position and velocity, and 331 that MuJoCo derives."""
         observed: list[int | None] = list(range(_OBSERVED.start, _OBSERVED.stop))
         return tuple(observed + [None] * (len(self.channels) - len(observed)))
 

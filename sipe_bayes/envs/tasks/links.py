@@ -68,14 +68,11 @@ class _Groups:
         return cls(bodies, np.array([row[g] for g in flat], int), starts, shape)
 
     def add(self, places: FloatArray, inertial: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What the bodies' geoms add up to.
+        """Mass (k,), centre of mass (k, 3) and inertia about it (k, 3, 3) of the bodies.
 
         Args:
             places: the centres (G, 3) of all links.
             inertial: their mass and moments across and along the axis, (G, 3).
-
-        Returns:
-            Mass (k,), centre of mass (k, 3) and inertia about it (k, 3, 3) of the bodies.
         """
         at, inertial = places[self.rows], inertial[self.rows]
         moment = inertial[:, :1] * at
@@ -171,9 +168,8 @@ class Links:
         model.body_inertia[self._single_bodies] = single[:, (1, 1, 2)]
         model.body_ipos[self._single_bodies] = places[self._single]
         if self._groups.bodies:
-            for body, mass, centre, tensor in zip(
-                self._groups.bodies, *self._groups.add(places, inertial), strict=True
-            ):
+            added = self._groups.add(places, inertial)
+            for body, mass, centre, tensor in zip(self._groups.bodies, *added, strict=True):
                 model.body_mass[body], model.body_ipos[body] = mass, centre
                 mujoco.mju_eig3(model.body_inertia[body], np.empty(9), model.body_iquat[body], tensor.ravel())
 
@@ -275,18 +271,9 @@ class _Axis:
 def _ride(
     point: FloatArray, link: int, rows: Sequence[int], axes: Sequence[_Axis], stays: Sequence[float], count: int
 ) -> FloatArray:
-    """How a point that rides on a link moves as the factors grow.
+    """How a point (3,) that rides on one of a body's links moves as all factors grow, (3, G).
 
-    Args:
-        point: (3,), in the frame of the body.
-        link: which of the body's own.
-        rows: the body's links among all.
-        axes: theirs.
-        stays: the coordinate of the point of each that stays.
-        count: G, how many links there are.
-
-    Returns:
-        (3, G).
+    ``rows`` are the body's links among all ``count``, with their axes and the coordinates of the points that stay.
     """
     move = np.zeros((3, count))
     move[:, rows[link]] = (axes[link].nearest(point) - stays[link]) * axes[link].direction
