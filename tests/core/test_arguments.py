@@ -6,7 +6,9 @@ And the guide in the docstring runs.
 from __future__ import annotations
 
 import inspect
+import sys
 import textwrap
+import types
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -92,10 +94,12 @@ def test_what_a_search_makes_of_a_prior_is_said(name: str, words: str) -> None:
     assert began_there == (words == "only to begin")
 
 
-def test_the_guides_example_is_an_estimator(tmp_path: Path) -> None:
+def test_the_guides_example_is_an_estimator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its code, as printed: it spends the budget, keeps the best, resumes, and is better than the prior mean."""
     code = textwrap.dedent(inspect.getdoc(Estimator).split("keeps the best::")[1].split("``find``")[0])  # type: ignore[union-attr]
-    exec(code, names := dict[str, Any]())
+    module = types.ModuleType("a_users_own")
+    monkeypatch.setitem(sys.modules, module.__name__, module)  # where its annotations are looked up
+    exec(code, names := vars(module))
     simulator = pendulum()
     truth = simulator.space.normalise(np.array([0.45, 0.16]))
     made = [names["RandomSearch"](simulator, budget=60, seed=2, checkpoint=tmp_path / "state") for _ in "ab"]

@@ -125,7 +125,7 @@ def test_states_tell_the_controllers_memory(simulator: Simulator) -> None:
     assert states is not None
     forgotten = states.copy()
     forgotten[:, physics:] = 7.0
-    found = chain._recalled(forgotten, chain.dt)
+    found = chain.with_memory(forgotten, chain.dt)
     np.testing.assert_allclose(found[1:], states[1:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(found[0], states[0], rtol=0, atol=1e-5)
 

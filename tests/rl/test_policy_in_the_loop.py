@@ -225,9 +225,11 @@ def test_a_run_converges_where_its_policy_solves_the_environment(threshold: floa
 
 def test_convergence_is_asked_of_the_simulators_trained_in_and_not_of_the_reference() -> None:
     run = run_of(told())
-    last = {"update": 1, "failure": None, "simulation_success": None, "reference_success": None}
+    run.iterate(None)
+    (last,) = run.history
+    last = replace(last, failure=None, simulation_success=None, reference_success=None)
     for inside, outside in ((-199.0, -201.0), (-201.0, -199.0)):
-        run.history = [{**last, "simulation_return": inside, "reference_return": outside}]
+        run.history = [replace(last, simulation_return=inside, reference_return=outside)]
         assert run.result().converged == (inside >= -200)
         assert run.result().solved_reference == (outside >= -200)
     door = sipe.make_task("Door")

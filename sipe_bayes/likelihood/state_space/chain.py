@@ -239,7 +239,7 @@ class Chain:
         result = self.simulator.rollout(
             np.repeat(theta, len(at), axis=0),
             np.tile(self.actions[at], (batch, 1, 1)),
-            self._with_memory(states.reshape(batch * len(at), -1), np.tile(self.dt[at], batch)),
+            self.with_memory(states.reshape(batch * len(at), -1), np.tile(self.dt[at], batch)),
             np.tile(self.dt[at], batch),
             [self.names[k] for k in at] * batch,
             goals=None if self.goals is None else np.tile(self.goals[at], (batch, 1)),
@@ -251,7 +251,7 @@ class Chain:
         predicted = np.where(self.late, observations[:, 1], observations[:, 0]).reshape(*shape, -1)
         return predicted, result.states[:, 1].reshape(*shape, -1), valid.reshape(shape)
 
-    def _with_memory(self, states: FloatArray, dt: FloatArray) -> FloatArray:
+    def with_memory(self, states: FloatArray, dt: FloatArray) -> FloatArray:
         """States (B, S) with the memory that a controller comes to them with.
 
         Positions and velocities tell it: a physics step ago the positions were less by these velocities.
