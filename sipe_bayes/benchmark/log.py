@@ -19,7 +19,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import Split
-from sipe_bayes.datasets.demonstrations import demonstrations
+from sipe_bayes.datasets.demonstrations import NoAgentWarning, demonstrations
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Variant
 from sipe_bayes.likelihood.binding import bind
@@ -61,7 +61,7 @@ def recorded(task: str, variant: Variant, seed: int, steps: int, split: Split = 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         trajectories = demonstrations(simulator, split=split, variant=variant, count=1, seed=seed, steps=steps)
-    source = "excitation" if any("excitation" in str(w.message) for w in caught) else "expert"
+    source = "excitation" if any(issubclass(w.category, NoAgentWarning) for w in caught) else "expert"
     truth = made.theta(variant)
     inside = bool(((truth >= 0) & (truth <= 1)).all())
     return Log(truth, trajectories, determined(simulator, truth, trajectories) if inside else None, source)

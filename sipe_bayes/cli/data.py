@@ -91,7 +91,7 @@ def export(
     """Write demonstrations as a Minari data set."""
     import warnings
 
-    from sipe_bayes.datasets.demonstrations import demonstrations
+    from sipe_bayes.datasets.demonstrations import NoAgentWarning, demonstrations
     from sipe_bayes.datasets.minari_data import to_minari
 
     with exit_on_error(), warnings.catch_warnings(record=True) as caught:
@@ -101,7 +101,7 @@ def export(
             task, one.type, one.split, one.variant, count=count, seed=seed, steps=steps, folder=folder
         )
         about = f"{type} trajectories of {task} ({variant}, {split})."
-        stand_in = [str(w.message) for w in caught if "excitation" in str(w.message)]
+        stand_in = [str(w.message) for w in caught if issubclass(w.category, NoAgentWarning)]
         written = to_minari(made, minari, task, " ".join([about, *stand_in]), command_line())
     for line in stand_in:
         print(f"sipe: {line}", file=sys.stderr)

@@ -165,13 +165,27 @@ def _checked(name: str, value: Any, hint: Any, limits: Limits) -> Any:
         return _number(name, value, kind, limits)
     elif kind is Path and isinstance(value, str):
         return Path(value)
+    elif isinstance(kind, type) and issubclass(kind, Options) and not isinstance(value, kind):
+        raise ValueError(f"{name}: expected {kind.__name__}(...), got {value!r}")
+    elif typing.get_origin(kind) is tuple:
+        return _sequence(name, value, typing.get_args(kind), limits)
     return value
+
+
+def _sequence(name: str, value: Any, kinds: tuple[Any, ...], limits: Limits) -> tuple[Any, ...]:
+    """A tuple of as many values as its type says, each as the type and the limits have it."""
+    if not isinstance(value, tuple | list):
+        raise ValueError(f"{name}: expected a sequence, got {value!r}")
+    every = (kinds[0],) * len(value) if kinds[1:] == (...,) else kinds
+    if len(every) != len(value):
+        raise ValueError(f"{name}: expected {len(every)} values, got {len(value)}")
+    return tuple(_checked(name, v, kind, limits) for v, kind in zip(value, every, strict=True))
 
 
 def _number(name: str, value: Any, kind: type, limits: Limits) -> Any:
     whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
     if kind is int and (isinstance(value, bool) or not whole):
-        raise ValueError(f"{name}: expected a whole number, got {value!r}")
+        raise ValueError(f"{name}: expected a whole number, got {value!r}; give one without a fraction")
     if isinstance(value, bool) or not isinstance(value, Real) or not limits.allows(float(value)):
         raise ValueError(f"{name}: expected {limits.text()}, got {value!r}")
     return kind(value)

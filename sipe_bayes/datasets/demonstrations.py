@@ -52,6 +52,10 @@ _ROBOTS = {  # tasks that share the agent of another: what is unknown differs, t
 }
 
 
+class NoAgentWarning(UserWarning):
+    """An excitation policy stands in for an agent that is not installed."""
+
+
 def demonstrations(
     env: Environment,
     type: Agent = "expert",
@@ -106,7 +110,7 @@ def demonstrations(
         if behaviour is None:
             warnings.warn(
                 f"demonstrations: no {type} agent of {task.name} is installed; an excitation policy was used instead",
-                UserWarning,
+                NoAgentWarning,
                 stacklevel=_caller(),
             )
             behaviour = acting.excitation(task, simulator.dt)

@@ -1,6 +1,6 @@
 """How well simulations follow logs: errors over open-loop windows, signals with their band, residuals.
 
-Windows start from the measured state (``likelihood.estimate_states``), so a held-out log needs no fit of its own; a
+Windows start from the measured state (``likelihood.starts``), so a held-out log needs no fit of its own; a
 parameter that differs between logs takes the mean of the calibrated ones there.
 """
 

@@ -52,7 +52,7 @@ class Target:
         value: in the model that it is bound to.
         write: writes another one into a copy of that model.
         order: writes with a smaller order come first.
-        constants: MuJoCo's derived constants depend on it, so mj_setConst follows a write.
+        constants: MuJoCo's derived constants, counts or flags depend on it, so mj_setConst follows a write.
         minimum: the smallest physical value.
         physical: whether it is a property of the machine that a report may compare with the model's.
         step: the least change that a finite difference can be taken over, from values below it.

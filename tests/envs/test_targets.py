@@ -169,7 +169,7 @@ def element(spec: Any, target: str) -> Any:
 def fields(model: Any) -> dict[str, Any]:
     """All numbers of a model but its statistics and bounding volumes."""
     every = {f: getattr(model, f) for f in dir(model) if not f.startswith("_")}
-    arrays = {f: v for f, v in every.items() if isinstance(v, np.ndarray) and not f.startswith("bvh")}
+    arrays = {f: np.asarray(v) for f, v in every.items() if isinstance(v, np.ndarray | int) and "bvh" not in f}
     options = {f"opt.{f}": getattr(model.opt, f) for f in dir(model.opt) if not f.startswith("_")}
     return {**arrays, **{f: np.asarray(v) for f, v in options.items() if np.ndim(v) or np.isscalar(v)}}
 

@@ -40,8 +40,8 @@ class CEMOptions(Options):
     """How the Gaussian follows its elites."""
 
     population: int | None = option(None, "simulated in each generation, 12 + 4 N by default", least=4)
-    elites: float = option(0.25, "share of the population that counts as best", above=0, most=1)
-    smoothing: float = option(0.6, "share of the way to the elites' moments that a generation goes", above=0, most=1)
+    elites: float = option(0.25, "share of the population that counts as best", above=0, below=1)
+    smoothing: float = option(0.6, "share of the way to the elites' moments that a generation goes", above=0, below=1)
     converged_sd: float = option(1e-4, "sd of every parameter where the search ends", "theta", above=0)
 
 

@@ -53,19 +53,21 @@ def test_the_damping_rule() -> None:
 
 
 def test_a_search_damps_its_steps_by_the_rule() -> None:
-    """A simulation refuses every step longer than a tenth of the way: of the damping that is first short enough."""
+    """A simulation refuses every step longer than .08: of the damping that is first short enough."""
     start = bowl().theta
 
     def narrow(theta: np.ndarray) -> float:
         return 0.1 if np.linalg.norm(theta - start) < 0.08 else np.inf
 
-    tried = [1e-4 * 8.0**k for k in range(9)]  # the step is the way over one and the damping
+    rule, tried = DampingRule(), [1e-4]  # the step is the way over one and the damping
+    for _ in range(12):
+        tried.append(rule.after(tried[-1], lowered=False))
     way = float(np.linalg.norm(bowl().middle - start))
     first = next(k for k, damping in enumerate(tried) if way / (1 + damping) < 0.08)
     problem = bowl(narrow)
     fit = descend(problem, 1e-4, 1e-6, DampingRule())
     assert problem.simulations == first + 1
-    assert fit.damping == pytest.approx(0.2 * tried[first])
+    assert fit.damping == pytest.approx(rule.after(tried[first], lowered=True))
     assert fit.point is not None
     assert np.linalg.norm(fit.point - start) == pytest.approx(way / (1 + tried[first]))
     assert fit.gained == pytest.approx(problem.energy - 0.1)
@@ -80,13 +82,21 @@ def test_a_full_step_is_tried_first_and_ends_at_the_bottom() -> None:
     assert not fit.converged
 
 
+def _first_regular(damping: float, least: float) -> float:
+    """Damping after a step at the first damping, in the rule's order, that is at least ``least``."""
+    rule = DampingRule()
+    while damping < least:
+        damping = rule.after(damping, lowered=False)
+    return rule.after(damping, lowered=True)
+
+
 @pytest.mark.parametrize(
     ("problem", "tolerance", "stale", "expected"),
     [
         (bowl(), 1.0, False, {"converged": True, "gained": 0.0, "refused": 0.0, "damping": 1e-4}),
         (bowl(lambda t: np.inf), 1e-9, False, {"converged": True, "gained": 0.0, "damping": 1e-4}),
         (bowl(lambda t: np.inf), 1e-9, True, {"converged": False, "expected": np.inf, "damping": 1e-4}),
-        (bowl(singular_below=1e-2), 1e-9, False, {"damping": 0.2 * 1e-4 * 8.0**3}),
+        (bowl(singular_below=1e-2), 1e-9, False, {"damping": _first_regular(1e-4, 1e-2)}),
     ],
     ids=["too little to gain", "every step diverges", "a stale linearisation is left", "singular until damped"],
 )
