@@ -2,7 +2,8 @@
 
     python examples/studies/truth.py [--budget 10000] [--seeds 3]
 
-`npe` and `bayessim` on x = M theta + noise, `laplace` and `mcmc` on four carts in MuJoCo (tests/problems/linear_gaussian.py).
+`npe` and `bayessim` on x = M theta + noise, `laplace` and `mcmc` on four carts in MuJoCo
+(tests/problems/linear_gaussian.py).
 2,000 draws each; 0.5 is perfect, the bar 0.60.
 """
 
