@@ -85,17 +85,17 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
             points = grown(self.problem, chain)
         if points is None:
             points = screened(self.problem, chain)
-        return KnownStartState(points, 0, self.begin(points[0]), uncounted=chain.uncounted)
+        return KnownStartState(points, 0, self._begin(points[0]), uncounted=chain.uncounted)
 
     def phases(self) -> dict[Phase, Callable[[KnownStartState, ChainLinearisation], KnownStartState]]:
         """A function for each phase."""
         return {Phase.FOLLOW: self._follow, Phase.SMOOTH: self._smooth, Phase.NOISE: self._noise}
 
-    def linearised(self, here: KnownStartPosition) -> ChainLinearisation | None:
+    def _linearised(self, here: KnownStartPosition) -> ChainLinearisation | None:
         """Over the surroundings that are open, after short differences first."""
         return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
 
-    def begin(self, theta: FloatArray) -> KnownStartPosition:
+    def _begin(self, theta: FloatArray) -> KnownStartPosition:
         """At a starting point (N,)."""
         chain, ones = self.chain, np.ones(self.chain.num_start)
         return KnownStartPosition(
@@ -137,7 +137,7 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
         """An estimate of the noise, which may be worth recording, and a step."""
         state, noise, ends = self.estimated(state, linear)
         if ends:
-            return state.next_point(self.begin)
+            return state.next_point(self._begin)
         try:
             return self._stepped(state, linear, noise)
         except BudgetExhausted:

@@ -90,7 +90,7 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         chain.rollouts += chain.setup_rollouts
         points = screened(self.problem, chain) if initial is None else initial
         none = np.empty((0, chain.num_theta))
-        return StateSpaceState(points, 0, self.begin(points[0]), uncounted=chain.uncounted, regressed=none)
+        return StateSpaceState(points, 0, self._begin(points[0]), uncounted=chain.uncounted, regressed=none)
 
     def phases(self) -> dict[Phase, Callable[[StateSpaceState, ChainLinearisation], StateSpaceState]]:
         """A function for each phase."""
@@ -101,11 +101,11 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
             Phase.NOISE: self._noise,
         }
 
-    def linearised(self, here: SmoothingPosition) -> ChainLinearisation | None:
+    def _linearised(self, here: SmoothingPosition) -> ChainLinearisation | None:
         """By short differences, by theta alone for the regression."""
         return linearise(self.chain, here.theta, here.states, with_states=here.phase is not Phase.REGRESS)
 
-    def begin(self, theta: FloatArray) -> SmoothingPosition:
+    def _begin(self, theta: FloatArray) -> SmoothingPosition:
         """At a starting point (N,)."""
         chain = self.chain
         phase, ones = Phase.REGRESS if chain.determined.all() else Phase.FOLLOW, np.ones(chain.num_start)
@@ -123,7 +123,7 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         if not still:
             return state.at(here)
         if any(np.abs(theta - earlier).max() < tuning.same for earlier in state.regressed):
-            return state.next_point(self.begin)
+            return state.next_point(self._begin)
         movement = chain.movement(here.states)
         noise = self._guessed(first_noise(chain, linear, movement, self.tuning.noise), movement)
         here = replace(here, phase=Phase.SMOOTH, noise=noise, movement=movement)
@@ -230,7 +230,7 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
                 return state.at(replace(here, phase=Phase.SMOOTH, steps=0))
         value = evidence(self.problem, here, linear, noise, settled)
         if value <= worthwhile:
-            return state.next_point(self.begin)
+            return state.next_point(self._begin)
         state = state.at(here)
         state = state.with_optimum(optimum_at(self.problem, state, linear, noise, value, settled))
         # then from the optimum: without any outlier, or with those that stand out now
@@ -238,13 +238,13 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         if outliers.any():
             other = self._without_outliers(here, linear, noise)
             if other is None or other[1] <= value + tuning.smoothing.settled:
-                return state.next_point(self.begin)
+                return state.next_point(self._begin)
             end, _ = other
             again = replace(again, theta=end.point.theta, states=end.point.states, damping=end.damping)
             return state.at(replace(again, noise=replace(here.noise, outliers=np.zeros_like(outliers))))
         proposed = self._candidates(here, linear, noise)
         if not proposed.any():
-            return state.next_point(self.begin)
+            return state.next_point(self._begin)
         noise = replace(here.noise, outliers=proposed)
         return state.at(replace(again, noise=noise, proposals=here.proposals + 1))
 

@@ -166,11 +166,11 @@ class ChainSearch(Generic[S]):
         """What a step does in each phase with the linearisation where the search stands."""
 
     @abstractmethod
-    def begin(self, theta: FloatArray) -> Any:
+    def _begin(self, theta: FloatArray) -> Any:
         """The position at a starting point (N,)."""
 
     @abstractmethod
-    def linearised(self, here: Any) -> ChainLinearisation | None:
+    def _linearised(self, here: Any) -> ChainLinearisation | None:
         """The linearisation that a step needs at a position; None where it diverges."""
 
     def step(self, state: S) -> S:
@@ -182,8 +182,8 @@ class ChainSearch(Generic[S]):
         self.chain.uncounted, here = state.uncounted, state.here
         states = self.chain.predicted(here.theta) if here.phase is Phase.FOLLOW else None
         state = state if states is None else state.at(replace(here, states=states))
-        linear = self.linearised(state.here)
-        after = state.after_divergence(self.begin) if linear is None else self.phases()[here.phase](state, linear)
+        linear = self._linearised(state.here)
+        after = state.after_divergence(self._begin) if linear is None else self.phases()[here.phase](state, linear)
         return replace(after, uncounted=self.chain.uncounted)
 
 
