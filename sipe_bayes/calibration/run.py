@@ -97,7 +97,6 @@ def calibrate(
         *of_logs(problem.reports),
         *_left_out(problem, method),
     )
-    noise_rows = zip(noise.sd.tolist(), noise.tau.tolist(), fitted_units(fitted), strict=True)
     measured = method.diagnostics.get("mixing")
     return Calibration(
         name=run_name(problem.config.path),
@@ -114,7 +113,7 @@ def calibrate(
         comparison=predictions.comparison,
         misfit=lacks,
         outside=outside,
-        noise={channel: ChannelNoise(*row) for channel, row in zip(fitted.fitted, noise_rows, strict=True)},
+        noise=_channel_noise(fitted, noise),
         mixing=Mixing.of(measured, method.space.names) if measured else None,
         logs=list(problem.reports),
         rollouts=method.rollouts,
@@ -161,6 +160,11 @@ def _own(method: Estimator) -> list[Finding]:
     """What the estimator noticed itself; bounds are told by parameter, with their values."""
     spread = [] if method.uncertain else [finding(Code.SEARCH_SPREAD, method=method.name)]
     return [item for item in method.findings if item.code is not Code.AT_BOUND] + spread
+
+
+def _channel_noise(fitted: Windows, noise: Noise) -> dict[str, ChannelNoise]:
+    rows = zip(noise.sd.tolist(), noise.tau.tolist(), fitted_units(fitted), strict=True)
+    return {channel: ChannelNoise(*row) for channel, row in zip(fitted.fitted, rows, strict=True)}
 
 
 def _residuals(
