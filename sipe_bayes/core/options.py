@@ -166,7 +166,8 @@ def _checked(name: str, value: Any, hint: Any, limits: Limits) -> Any:
     elif kind is Path and isinstance(value, str):
         return Path(value)
     elif isinstance(kind, type) and issubclass(kind, Options) and not isinstance(value, kind):
-        raise ValueError(f"{name}: expected {kind.__name__}(...), got {value!r}")
+        home = kind.__module__.removeprefix("sipe_bayes.")
+        raise ValueError(f"{name}: expected {home}.{kind.__name__}(...), got {value!r}")
     elif typing.get_origin(kind) is tuple:
         return _sequence(name, value, typing.get_args(kind), limits)
     return value
