@@ -21,9 +21,6 @@ from safetensors.numpy import save
 
 from sipe_bayes.core.files import write_bytes
 
-State = dict[str, Any]
-"""Arrays, numbers, text, booleans and lists of text by name; nothing nested."""
-
 
 class CheckpointError(ValueError):
     """A checkpoint that cannot be read or belongs to another run."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Self
 
 from sipe_bayes.core.finding_texts import TEXTS, Code, Severity
 
@@ -38,16 +37,6 @@ class Finding:
         """As JSON has it."""
         plain = {"code": str(self.code), "severity": str(self.severity), "parameters": list(self.parameters)}
         return asdict(self) | plain
-
-    @classmethod
-    def from_dict(cls, data: dict[str, object]) -> Self:
-        """What ``to_dict`` made; raises ValueError or KeyError for anything else."""
-        names = data["parameters"]
-        if not isinstance(names, list | tuple):
-            raise ValueError(f"parameters: expected a list of names, got {names!r}")
-        log = data.get("log")
-        code, severity = Code[str(data["code"]).upper()], Severity(str(data["severity"]))
-        return cls(code, severity, str(data["text"]), tuple(map(str, names)), None if log is None else str(log))
 
 
 def finding(

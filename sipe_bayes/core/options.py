@@ -1,7 +1,7 @@
 """Options of a method: one frozen dataclass each, whose fields carry unit, reason and limits.
 
-The constructor's arguments and their check, the checkpoint's fingerprint, the command line and the documentation all
-come from the fields::
+The constructor's arguments and their check, and the checkpoint's fingerprint, come from the fields; so do the options
+of `sipe train`::
 
     @dataclass(frozen=True)
     class SimOptOptions(Options):
@@ -126,15 +126,6 @@ class Options:
     def plain(self) -> dict[str, object]:
         """Names and values as JSON has them, for fingerprints and records."""
         return {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
-
-    @classmethod
-    def table(cls) -> list[tuple[str, str, str, str]]:
-        """Rows of documentation: name, default, unit, why."""
-        rows = []
-        for field in dataclasses.fields(cls):
-            limits = field.metadata.get("limits", Limits(""))
-            rows.append((field.name, repr(field.default), limits.unit, limits.why))
-        return rows
 
 
 def _plain(value: Any) -> Any:

@@ -1,8 +1,7 @@
 """Every threshold of a verdict, each with its unit and its reason: the one place where they stand.
 
 A threshold decides what is said of a result: at a bound, determined, mixed, worse. How a search proceeds is an option
-of its method, and a numerical tolerance stands where it is used. A new threshold is a field of ``Thresholds``;
-``Thresholds.table()`` lists them all.
+of its method, and a numerical tolerance stands where it is used. A new threshold is a field of ``Thresholds``.
 """
 
 from __future__ import annotations
