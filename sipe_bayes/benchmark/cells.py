@@ -31,13 +31,13 @@ Deviations:
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.datasets.acting import Split
 from sipe_bayes.datasets.demonstrations import default_steps
 from sipe_bayes.datasets.trajectory_sets import TASKS as NINE
@@ -367,5 +367,4 @@ def _no_match(name: str, cells: list[Cell], pattern: str) -> str:
     elsewhere = next((other for other in SUITES if any(matches(c.id, pattern) for c in suite(other))), None)
     if elsewhere is not None:
         return f"matches no cell of the suite {name}; take --suite {elsewhere}"
-    close = difflib.get_close_matches(pattern, [cell.id for cell in cells], 1, 0.0)
-    return f"matches no cell of any suite; the nearest is {close[0] if close else cells[0].id}"
+    return f"matches no cell of any suite{nearest_name(pattern, [cell.id for cell in cells], 0.0)}"

@@ -17,6 +17,7 @@ from functools import lru_cache
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import Split
 from sipe_bayes.datasets.demonstrations import NoAgentWarning, demonstrations
@@ -26,6 +27,8 @@ from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
+
+_NOISE = 1e-3  # assumed of noise-free logs, of each channel's spread
 
 
 @dataclass(frozen=True)
@@ -72,24 +75,20 @@ def one_step(simulator: Simulator) -> Segments:
     return Segments(simulator.dt, noise="white", starts="recorded")
 
 
-def determined(
-    simulator: Simulator, truth: FloatArray, trajectories: Trajectories, noise: float = 1e-3, share: float = 0.5
-) -> BoolArray:
+def determined(simulator: Simulator, truth: FloatArray, trajectories: Trajectories) -> BoolArray:
     """Which parameters (N,) trajectories determine; see the module.
 
     Args:
         simulator: of the task.
         truth: theta (N,).
         trajectories: with recorded states.
-        noise: sd, as a share of each channel's spread.
-        share: of the prior's sd, below which a parameter counts as determined.
     """
     windows = bind(one_step(simulator), simulator, trajectories)
     jacobian = windows.linearise(truth, windows.no_starts()).jacobian
     spread = np.concatenate([t.observations for t in trajectories]).std(0)
-    sd = noise * np.maximum(spread, noise * np.median(spread[spread > 0]))
+    sd = _NOISE * np.maximum(spread, _NOISE * np.median(spread[spread > 0]))
     rows = (jacobian / sd[:, None]).reshape(-1, len(truth))
     before = prior(simulator.space)
     information = rows.T @ rows + np.diag(1 / before.variance.numpy())
     left = np.sqrt(np.diag(np.linalg.inv(information)))
-    return np.asarray(left < share * before.stddev.numpy())
+    return np.asarray(left < THRESHOLDS.task_determines * before.stddev.numpy())

@@ -26,9 +26,9 @@ from scipy import stats
 
 from sipe_bayes.benchmark.cells import BASELINES, REFERENCE
 from sipe_bayes.benchmark.records import Record
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.scores import Scores
 
-LEVEL = 0.05  # of every test
 _EQUAL = 1e-9  # difference of two means that is rounding
 OUTSIDE = "out_of_distribution"
 ALL = "mean of all"
@@ -297,7 +297,7 @@ def differ(a: Sequence[float], b: Sequence[float]) -> bool:
     if np.ptp(a) == 0 and np.ptp(b) == 0:  # deterministic
         return bool(abs(a[0] - b[0]) > _EQUAL)
     moments = [m for v in (a, b) for m in (np.mean(v), np.std(v, ddof=1), len(v))]
-    return bool(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue < LEVEL)
+    return bool(stats.ttest_ind_from_stats(*moments, equal_var=False).pvalue < THRESHOLDS.method_comparison)
 
 
 def against(values: Sequence[float], constant: float) -> int:
@@ -309,7 +309,7 @@ def against(values: Sequence[float], constant: float) -> int:
     above = float(np.mean(values)) - constant
     if len(values) < 2 or abs(above) <= _EQUAL:
         return 0
-    if np.ptp(values) > 0 and stats.ttest_1samp(values, constant).pvalue >= LEVEL:
+    if np.ptp(values) > 0 and stats.ttest_1samp(values, constant).pvalue >= THRESHOLDS.method_comparison:
         return 0
     return 1 if above > 0 else -1
 

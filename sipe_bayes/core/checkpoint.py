@@ -12,14 +12,16 @@ import enum
 import json
 import types
 import typing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.findings import Finding
 
 
 class CheckpointError(ValueError):
@@ -37,6 +39,16 @@ class SearchState(Protocol):
 
 
 S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Snapshot(Generic[S]):
+    """A state with what was counted and noticed when it was made: what a checkpoint holds."""
+
+    state: S
+    rollouts: int
+    findings: tuple[Finding, ...]
+    diagnostics: str  # JSON
 
 
 def save_state(path: Path, state: object, fingerprint: str) -> None:

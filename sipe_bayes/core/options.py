@@ -177,7 +177,8 @@ def _sequence(name: str, value: Any, kinds: tuple[Any, ...], limits: Limits) -> 
 def _number(name: str, value: Any, kind: type, limits: Limits) -> Any:
     whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
     if kind is int and (isinstance(value, bool) or not whole):
-        raise ValueError(f"{name}: expected a whole number, got {value!r}; give one without a fraction")
+        least = max(limits.least or 1, 1)
+        raise ValueError(f"{name}: expected a whole number, got {value!r}; give one, such as {least:g}")
     if isinstance(value, bool) or not isinstance(value, Real) or not limits.allows(float(value)):
         raise ValueError(f"{name}: expected {limits.text()}, got {value!r}")
     return kind(value)

@@ -16,11 +16,12 @@ def seed_integer(entropy: Sequence[int]) -> int:
     return int(np.random.SeedSequence(list(entropy)).generate_state(1)[0])
 
 
-def torch_generator_from(random: np.random.Generator) -> Generator:
-    """A generator of torch's own, seeded with the next number of one of NumPy's."""
+def torch_generator_from(random: np.random.Generator | np.random.RandomState) -> Generator:
+    """A generator of torch's own, seeded with the next number of one of NumPy's; of RandomState, which emcee wants."""
     import torch
 
-    return torch.Generator().manual_seed(int(random.integers(2**62)))
+    seed = random.randint(2**31) if isinstance(random, np.random.RandomState) else random.integers(2**62)
+    return torch.Generator().manual_seed(int(seed))
 
 
 def torch_generator(entropy: Sequence[int]) -> Generator:

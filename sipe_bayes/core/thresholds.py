@@ -33,6 +33,13 @@ class Thresholds(Options):
         above=0,
         below=1,
     )
+    task_determines: float = option(
+        0.5,
+        "a log of the benchmark that leaves less of a parameter counts as determining it, whatever methods say",
+        "of the prior's sd",
+        above=0,
+        below=1,
+    )
     well_determined: float = option(
         0.8,
         "a parameter that contracts more has an interval of at most a fifth of the prior's",
@@ -88,6 +95,9 @@ class Thresholds(Options):
     # predictions of held-out logs
     comparison: float = option(
         0.05, "false alarms of two models that predict alike", "p-value of the paired t-test", above=0, below=1
+    )
+    method_comparison: float = option(
+        0.05, "false alarms of one method compared with another, or with a baseline", "p-value", above=0, below=1
     )
     alike: float = option(1.05, "errors within this factor of one another count as the same", "ratio", above=1)
     starts_rule: float = option(

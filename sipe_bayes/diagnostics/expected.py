@@ -37,13 +37,13 @@ from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION, ridges
 from sipe_bayes.diagnostics.records import Ridge
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
 from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
 _IDLE = 1e-6  # contraction of a uniform prior below which the experiment does not touch a parameter
-_FLAT_PRECISION = 0.01  # sd 10 in units of the cube
 _DRAWS = 4000  # of the normal that is left, among which ridges are looked for
 
 
@@ -221,7 +221,7 @@ def expect(
     centre = information(simulator, likelihood, plan, noise, middle)
     centre = gains[0] if centre is None else centre
     covariance = np.asarray(np.linalg.inv(precision + centre), np.float64)
-    open_covariance = np.linalg.inv(centre + _FLAT_PRECISION * np.eye(len(middle)))
+    open_covariance = np.linalg.inv(centre + FLAT_PRECISION * np.eye(len(middle)))
     normal = GaussianMixture([0.0], middle[None], open_covariance[None], known.space)
     values = normal.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
     names, excited = known.space.names, np.mean([np.diag(one) for one in gains], axis=0) / (2 * UNIFORM_PRECISION)

@@ -13,40 +13,31 @@ import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
 
-from sipe_bayes.core.checkpoint import SearchState, load_state, save_state
-from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
+from sipe_bayes.core.checkpoint import SearchState, Snapshot, load_state, save_state
+from sipe_bayes.core.findings import Code, Findings, Severity, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
+from sipe_bayes.inference.arguments import check_simulator, stated_prior
 from sipe_bayes.inference.recorded import Progress, Recorded, digest
 from sipe_bayes.likelihood.binding import bind, default_likelihood
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 S = TypeVar("S", bound=SearchState)
-
-
-@dataclass(frozen=True)
-class Snapshot(Generic[S]):
-    """A state with what was counted and noticed when it was made: what a checkpoint holds."""
-
-    state: S
-    rollouts: int
-    findings: tuple[Finding, ...]
-    diagnostics: str  # JSON
 
 
 class Estimator(ABC, Generic[S]):
@@ -72,13 +63,14 @@ class Estimator(ABC, Generic[S]):
       When the budget runs out in mid-step, BudgetExhausted ends the fit with the last whole state.
     - ``posterior(state, trajectories) -> Posterior``: of any state, without simulating.
 
-    Arguments of its own are the fields of a frozen dataclass of ``core.options``, set as ``options_type``. The simplest
-    method draws from the prior and keeps the best::
+    Arguments of its own are the fields of a frozen dataclass of ``core.options``, set as ``options_type``, and come as
+    ``self.options``. The simplest method draws from the prior and keeps the best::
 
         from dataclasses import dataclass, replace
         import numpy as np
         from sipe_bayes.core.arrays import FloatArray
         from sipe_bayes.core.findings import Code
+        from sipe_bayes.core.options import Options, option
         from sipe_bayes.core.seeding import torch_generator
         from sipe_bayes.inference.base import Estimator
         from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
@@ -90,16 +82,22 @@ class Estimator(ABC, Generic[S]):
             cost: FloatArray
             done: bool = False
 
+        @dataclass(frozen=True)
+        class RandomSearchOptions(Options):
+            batch: int = option(10, "draws of a step", least=1)
+
         class RandomSearch(Estimator[RandomSearchState]):
             name = "random_search"
+            options_type = RandomSearchOptions
             state_type = RandomSearchState
+            options: RandomSearchOptions
 
             def start(self, trajectories):
                 return RandomSearchState(np.empty((0, len(self.space))), np.empty(0))
 
             def step(self, state, trajectories):
                 generator = torch_generator([self.seed, len(state.theta)])  # other draws with every seed
-                theta = self.prior.sample((1,), generator=generator).numpy()
+                theta = self.prior.sample((self.options.batch,), generator=generator).numpy()
                 windows = self.windows(trajectories)
                 predicted = simulate(windows, theta)  # raises BudgetExhausted
                 cost = StateDifference(windows, channel_scale(windows, predicted))(predicted)
@@ -114,18 +112,23 @@ class Estimator(ABC, Generic[S]):
                     self.find(Code.DIVERGED_COUNT_AS_WORST, count=lost, total=len(state.cost), failure=failure)
                 return Dirac(state.theta[state.cost.argmin()], self.space)
 
-    ``find`` notes a finding, whose code and text stand in ``core.finding_texts``.
+    ``find`` notes a finding, whose code and text stand in ``core.finding_texts``. What else a class may say of itself:
+
+    - ``uses_prior = False``: the prior plays no part, or only at the beginning.
+    - ``uncertain = False``: the spread is that of a search, not an uncertainty.
+    - ``searches = True``: it looks for optima of a likelihood: takes ``StateSpace``, ``restarts`` and ``candidates``.
+    - ``amortised = True``: what one fit learned serves another; ``default_budget``: rollouts.
     """
 
     name: ClassVar[str]
     amortised: ClassVar[bool] = False
-    searches: ClassVar[bool] = False  # takes ``restarts`` and ``candidates``
+    searches: ClassVar[bool] = False
     uses_prior: ClassVar[bool] = True
-    uncertain: ClassVar[bool] = True  # False: the spread is that of a search, not an uncertainty
+    uncertain: ClassVar[bool] = True
     default_budget: ClassVar[int] = 1000
     checkpoint_seconds: float = 1.0
     options_type: ClassVar[type[Options]] = Options
-    state_type: ClassVar[Any]  # the frozen dataclass of a method's state
+    state_type: ClassVar[type[SearchState]]  # the frozen dataclass of a method's state
     options: Options
 
     def __init__(
@@ -141,20 +144,9 @@ class Estimator(ABC, Generic[S]):
         **options: object,
     ) -> None:
         self.options = self.options_type.of(options, self.name)
-        if not isinstance(simulator, Simulator | CallableSimulator):
-            raise ValueError(
-                f"simulator: expected a Simulator or a CallableSimulator, got {simulator!r}; sipe.get_estimator takes "
-                "the name of an environment as well"
-            )
-        if prior is not None and not isinstance(prior, Posterior):
-            raise ValueError(f"prior: expected a posterior with a density, such as load_posterior(path), got {prior!r}")
+        check_simulator(simulator)
         self.simulator, self.space = simulator, simulator.space
-        self.prior = default_prior(self.space) if prior is None else prior
-        if self.prior.space.names != self.space.names or not self.prior.has_density:
-            raise ValueError(f"prior: expected a density over {list(self.space.names)}, got {self.prior!r}")
-        difference = self.prior.space.difference(self.space)
-        if difference:
-            raise ValueError(f"prior: {difference} in the simulator; use the same bounds and scale")
+        self.prior = stated_prior(prior, self.space)
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
         if not isinstance(likelihood, Segments | StateSpace | None):
             raise ValueError(
@@ -165,13 +157,13 @@ class Estimator(ABC, Generic[S]):
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: expected a function (what, rollouts, budget), got {progress!r}")
         self.seed = whole("seed", seed, 0)
-        self.likelihood: Any = likelihood or default_likelihood(simulator)  # StateSpace only where it ``searches``
+        self.likelihood: Segments | StateSpace = likelihood or default_likelihood(simulator)  # the latter for searches
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts, self.findings = 0, Findings()
         self.diagnostics: dict[str, Any] = {}
         self._last: Snapshot[S] | None = None
         self._run = ""  # fingerprint of the run that it belongs to
-        self._bound: tuple[Trajectories, Windows] | None = None
+        self._bound: tuple[Trajectories, Windows | Chain] | None = None
         self._given = Given()
         self._observed: Trajectory | None = None
         if self.searches and isinstance(simulator, CallableSimulator) and simulator.noise_sd is None:
@@ -239,9 +231,8 @@ class Estimator(ABC, Generic[S]):
         self._last, self._run = None, fingerprint
         if last is not None:
             self.go_on_from(last)
-        saved = time.monotonic()
+        saved, last = time.monotonic(), last or self._started(batch)
         try:
-            last = last or self._keep(self.start(batch))
             while not last.state.done:
                 last = self._keep(self.step(last.state, batch))
                 late = time.monotonic() - saved > self.checkpoint_seconds
@@ -250,9 +241,7 @@ class Estimator(ABC, Generic[S]):
                     saved = time.monotonic()
                 if self.progress is not None:
                     self.progress(self.describe(last.state), self.rollouts, self.budget)
-        except BudgetExhausted as error:
-            if last is None:
-                raise BudgetTooSmall(f"budget: {error}; raise it") from None
+        except BudgetExhausted:
             self.find(Code.BUDGET_SPENT, budget=self.budget)
         return self._finished(last.state, batch)
 
@@ -265,10 +254,7 @@ class Estimator(ABC, Generic[S]):
         batch, last = self._given.stack(self._recorded(trajectories)), self._last
         if last is None:
             self._run = self._fingerprint(batch)
-            try:
-                last = self._keep(self.start(batch))
-            except BudgetExhausted as error:
-                raise BudgetTooSmall(f"budget: {error}; raise it") from None
+            last = self._started(batch)
         if not last.state.done:
             self.go_on_from(last)
             try:
@@ -285,6 +271,13 @@ class Estimator(ABC, Generic[S]):
             )
         self.go_on_from(self._last)
         return self._finished(self._last.state, self._given.stack(self._recorded(trajectories)))
+
+    def _started(self, batch: Trajectories) -> Snapshot[S]:
+        """The first state, kept."""
+        try:
+            return self._keep(self.start(batch))
+        except BudgetExhausted as error:
+            raise BudgetTooSmall(f"budget: {error}; raise it") from None
 
     def _resumed(self, trajectories: Trajectories, fingerprint: str) -> Snapshot[S] | None:
         """Where a fit goes on: at its checkpoint; amortised methods also where an earlier fit ended."""
@@ -368,7 +361,13 @@ class Estimator(ABC, Generic[S]):
         return self.name
 
     def windows(self, trajectories: Trajectories) -> Windows:
-        """The trajectories bound to the likelihood, budget counted."""
+        """``bound``, for a method that takes no ``StateSpace``."""
+        bound = self.bound(trajectories)
+        assert isinstance(bound, Windows)  # as the constructor checks
+        return bound
+
+    def bound(self, trajectories: Trajectories) -> Windows | Chain:
+        """The trajectories bound to the likelihood, budget counted; a Chain where the method ``searches``."""
         if self._bound is None or self._bound[0] is not trajectories:
             bound = bind(self.likelihood, self.simulator, trajectories)
             bound.budget, bound.rollouts = self.budget, self.rollouts

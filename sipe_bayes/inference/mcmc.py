@@ -29,6 +29,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
@@ -168,7 +169,7 @@ class MCMC(Estimator[MCMCState]):
 
     def start(self, trajectories: Trajectories) -> MCMCState:
         """Fit ``laplace``, which places the walkers and supplies the starts' Jacobian."""
-        tuning, windows = self.options.tuning, self.windows(trajectories)
+        tuning, windows = self.options.tuning, self.bound(trajectories)
         search = Laplace(
             self.simulator,
             prior=self.prior,
@@ -258,7 +259,7 @@ class MCMC(Estimator[MCMCState]):
         """A block of steps of the whole ensemble."""
         import emcee
 
-        windows = self.windows(trajectories)
+        windows = self.bound(trajectories)
         walkers, dimensions = state.walkers.shape
         room = (self.budget - windows.rollouts) // (walkers * len(trajectories))
         steps = min(self.options.tuning.block, room)
@@ -326,7 +327,7 @@ class MCMC(Estimator[MCMCState]):
             rhat, ess, remedy = mixing["rhat"], mixing["ess"], "raise the budget"
             self.find(Code.NOT_MIXED, what="chains", rhat=rhat, ess=ess, unit=" draws", remedy=remedy)
         if error > tuning.nonlinear:
-            chained = isinstance(self.windows(trajectories), Chain)
+            chained = isinstance(self.bound(trajectories), Chain)
             self.find(Code.NONLINEAR_STATES if chained else Code.NONLINEAR_STARTS, error=error)
         flat = np.clip(theta.reshape(-1, len(self.space)), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state.best, 0, 1), sample_stats=stats)
@@ -363,8 +364,7 @@ class IndependentMove:
 
     def sample(self, count: int, random: np.random.RandomState) -> FloatArray:
         """Draws (count, N)."""
-        generator = torch.Generator().manual_seed(int(random.randint(2**31)))
-        return self.theta.sample((count,), generator=generator).numpy()
+        return self.theta.sample((count,), generator=torch_generator_from(random)).numpy()
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Of points (B, N) the log density (B,), up to a constant."""

@@ -32,8 +32,8 @@ Deviations:
   believes in, and start as far from the log's estimated start as noise leaves that: a linear regression on single steps
   follows the start more than it does theta. Where states are recorded, the noise that the estimator infers, and for
   those that infer none, or where a function makes its own, as ``noise_level`` says.
-- With a ``StateSpace`` their states are shaken by the process noise that the fit of the log inferred, but for jumps
-  that it let go; that is never inferred to be zero, so that where there is none the result is somewhat too wide.
+- With a ``StateSpace`` their states are shaken by the process noise that the fit of the log inferred, but for
+  outlying jumps; that is never inferred to be zero, so that where there is none the result is somewhat too wide.
 - A model that is wrong is not mended by simulating it.
 """
 
@@ -60,12 +60,10 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.log_noise import NOISE_BUDGET, fitted_noise, noise_is_unknown, process_noise
 from sipe_bayes.inference.recorded import Progress, Recorded
 from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.replicas import Replicas, observation_noise
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.posterior import GaussianMixture, Posterior
-
-_FLAT_PRECISION = 0.01  # sd 10 in units of the cube: added to a prior's, so that a uniform one has an inverse
 
 
 @dataclass(frozen=True)
@@ -363,7 +361,7 @@ class Recalibrated(Estimator[RecalibratedState]):
     def _before(self) -> QuadraticPrior:
         """The prior's normal, or a flat one."""
         own = QuadraticPrior.of(self.prior)
-        flat = _FLAT_PRECISION * np.eye(len(self.space))
+        flat = FLAT_PRECISION * np.eye(len(self.space))
         precision = own.precision + flat
         pull = own.precision @ own.mean + flat @ np.full(len(self.space), 0.5)
         return QuadraticPrior(np.linalg.solve(precision, pull), precision)

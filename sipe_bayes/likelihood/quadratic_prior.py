@@ -9,7 +9,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.posterior import Posterior
 
-FLAT_PRECISION = 0.01  # sd 10 in units of the cube: closes the directions that the data leave open, flat within it
+FLAT_PRECISION = 0.01  # sd 10 in units of the cube: closes directions that data or prior leave open, flat within it
 
 
 @dataclass(frozen=True)

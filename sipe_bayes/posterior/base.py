@@ -107,13 +107,14 @@ class Posterior(TorchDistribution):
     other files that do not say otherwise. Dirac and Particles draw, but their ``log_prob`` raises
     NoDensityError.
 
-    **Adding a family** takes one file and one line in ``registry.FAMILIES``. The base class owns batches,
+    **Adding a family** takes one file and its class in ``registry.FAMILIES``. The base class owns batches,
     dtypes, seeds, shape checks and files; a subclass writes its own mathematics on plain (n, N) tensors:
 
     - ``_sample(n, generator) -> (n, N)``: exact draws, random numbers from ``generator`` alone.
     - ``_log_prob(theta (n, N)) -> (n,)``: normalised log density of points inside the cube.
     - ``_state() -> (tensors, settings)`` and ``_restore(space, tensors, settings)``: what goes to disk and
-      back; settings are plain JSON numbers and strings.
+      back; settings are plain JSON numbers and strings. A posterior in them is an entry ``name: {"family",
+      "settings"}`` with tensors ``name.*``; ``_restore`` gets it as a posterior.
 
     and, where it knows better than 20,000 fixed-seed draws, ``_moments() -> (mean, covariance)``,
     ``_quantile(q (Q,)) -> (Q, N)``, ``_mode() -> (N,)``, ``marginal(names)``. The simplest one::

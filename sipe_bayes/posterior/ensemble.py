@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from scipy.special import ndtr, ndtri
-from torch import Generator, Tensor
+from torch import Tensor
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.posterior.base import Posterior
 
 if TYPE_CHECKING:
@@ -148,8 +149,7 @@ def log_jacobian(z: FloatArray) -> FloatArray:
 
 def draws_on_line(distribution: Posterior, count: int, random: np.random.RandomState) -> FloatArray:
     """Draws z (count, N) of a distribution over theta."""
-    generator = Generator().manual_seed(int(random.randint(2**31)))
-    return onto_line(distribution.sample((count,), generator=generator).numpy())
+    return onto_line(distribution.sample((count,), generator=torch_generator_from(random)).numpy())
 
 
 class DefensiveMixture:

@@ -1,34 +1,29 @@
 """The list of posterior families, and reading a saved posterior back.
 
-A new family is its own file plus one line in FAMILIES: class name -> the module that defines it, imported
-only when it is asked for.
+A new family is its own file plus its class in FAMILIES.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
+from typing import Any
+
+from torch import Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior
+from sipe_bayes.posterior.dirac import Dirac
+from sipe_bayes.posterior.flow import Flow
+from sipe_bayes.posterior.independent import IndependentPrior
+from sipe_bayes.posterior.mixture import GaussianMixture
+from sipe_bayes.posterior.particles import Particles
 from sipe_bayes.posterior.storage import read_pair
+from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
-FAMILIES: dict[str, str] = {
-    "Dirac": "sipe_bayes.posterior.dirac",
-    "Particles": "sipe_bayes.posterior.particles",
-    "GaussianMixture": "sipe_bayes.posterior.mixture",
-    "IndependentPrior": "sipe_bayes.posterior.independent",
-    "SurrogatePosterior": "sipe_bayes.posterior.surrogate",
-    "Flow": "sipe_bayes.posterior.flow",
+FAMILIES: dict[str, type[Posterior]] = {
+    family.__name__: family
+    for family in (Dirac, Particles, GaussianMixture, IndependentPrior, SurrogatePosterior, Flow)
 }
-
-
-def get_family(name: str) -> type[Posterior]:
-    """The posterior class called ``name``; raises ValueError listing the names there are."""
-    if name not in FAMILIES:
-        raise ValueError(f"posterior family: expected one of {sorted(FAMILIES)}, got {name!r}")
-    family: type[Posterior] = getattr(importlib.import_module(FAMILIES[name]), name)
-    return family
 
 
 def load_posterior(path: str | os.PathLike[str]) -> Posterior:
@@ -39,8 +34,25 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
     header, tensors = read_pair(path)
     try:
         space = ParameterSpace.from_dict(header["space"])
-        return get_family(header["family"])._restore(space, tensors, header["settings"])
+        return _restored(header["family"], space, tensors, header["settings"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{path}: not a posterior this version reads ({error}); save it again with posterior.save(path)"
         ) from error
+
+
+def _restored(family: str, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Posterior:
+    """The posterior of a family's name, after the posteriors that its settings hold."""
+    if family not in FAMILIES:
+        raise ValueError(f"posterior family: expected one of {sorted(FAMILIES)}, got {family!r}")
+    inner = {
+        name: _restored(
+            part["family"],
+            space,
+            {key.removeprefix(f"{name}."): tensor for key, tensor in tensors.items() if key.startswith(f"{name}.")},
+            part["settings"],
+        )
+        for name, part in settings.items()
+        if isinstance(part, dict) and "family" in part
+    }
+    return FAMILIES[family]._restore(space, tensors, settings | inner)

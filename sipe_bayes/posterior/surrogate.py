@@ -155,13 +155,10 @@ class SurrogatePosterior(Posterior):
 
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
-        from sipe_bayes.posterior.registry import get_family
-
-        stored = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("prior.")}
-        prior = get_family(settings["prior"]["family"])._restore(space, stored, settings["prior"]["settings"])
         numbers = {name: float(settings[name]) for name in _OF_PROCESS}
         process = GaussianProcess(tensors["x"], tensors["y"], tensors["lengthscale"], **numbers)
-        return cls(process, prior=prior, draws=tensors["draws"], **{name: settings[name] for name in _OWN})
+        own = {name: settings[name] for name in (*_OWN, "prior")}
+        return cls(process, draws=tensors["draws"], **own)
 
 
 def log_acceptance(process: GaussianProcess, epsilon: float, theta: Tensor) -> Tensor:

@@ -47,11 +47,11 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.checkpoint import SearchState, load_state, save_state
+from sipe_bayes.core.checkpoint import SearchState, Snapshot, load_state, save_state
 from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.core.findings import Finding, Findings
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.base import Estimator, Snapshot
+from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.search.base import Search
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import LoopResult, LoopRun, Plan, Update

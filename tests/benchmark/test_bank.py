@@ -20,7 +20,10 @@ def filled(folder: Path, budget: int) -> int:
 
 
 def test_shards_merge_resume_and_verify(tmp_path: Path) -> None:
-    """Two folders that hold shards of one bank are merged by copying; what results is what an estimator simulates by itself."""
+    """Two folders that hold shards of one bank are merged by copying.
+
+    What results is what an estimator simulates by itself.
+    """
     filled(tmp_path / "a", 230)
     units = bank.shards(PENDULUM_BANK, 430, bank.place(PENDULUM_BANK, tmp_path / "a"))
     assert bank.place(PENDULUM_BANK, tmp_path / "a") == bank.known_place(PENDULUM_BANK, tmp_path / "a")

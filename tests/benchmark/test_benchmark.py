@@ -112,7 +112,7 @@ def test_status_finds_cells_that_do_not_compare(undisturbed: Path, tmp_path: Pat
 
 
 def test_killed_at_three_moments_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
-    """SIGKILL at random moments: after its plan is there, when it simulates, and after the first and the third record."""
+    """SIGKILL at random moments: with its plan there, when it simulates, after the first and the third record."""
     out, rng = tmp_path / "out", random.Random(6)
     command = [sys.executable, "-m", "sipe_bayes.cli.app", "benchmark", "run", *SMALL, *PENDULUM, "--out", str(out)]
     seen: dict[Path, int] = {}
@@ -181,7 +181,10 @@ def toy(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.usefixtures("toy")
 def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) -> None:
-    """Found in the CLI, the tables and the plots. Seed 1 fails; the others go on; it runs again when it is asked for, and then only it."""
+    """Found in the CLI, the tables and the plots.
+
+    Seed 1 fails; the others go on; it runs again when it is asked for, and then only it.
+    """
     assert "Pendulum/middle/direct/default/seed2" in sipe("benchmark", "cells", "all").output.splitlines()
     chosen = ["--select", "pendulum/middle/direct/in_distribution"]
     found = measured(tmp_path, *chosen)

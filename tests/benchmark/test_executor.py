@@ -25,7 +25,7 @@ CELLS = [
 
 
 def test_pool_survives_the_death_of_its_processes() -> None:
-    """The unit that kills its process is given up after the second time, and the others are done, on one thread each."""
+    """The unit that kills its process is given up after the second time; the others are done, on one thread each."""
     before = dict(os.environ)
     with Pool(1) as pool:
         for name in ("look", "die", "raise", "look again"):
@@ -60,7 +60,7 @@ class OnceStuck(EstimateMeasurement):
 
 
 def test_ray_cluster_loses_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two node processes one is killed while it is at work on a cell: every cell finishes once, as on one machine."""
+    """Of two node processes one is killed while at work on a cell: every cell finishes once, as on one machine."""
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 

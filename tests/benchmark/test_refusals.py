@@ -87,8 +87,10 @@ def test_versions_of_cells_not_asked_for_count_too(undisturbed: Path, tmp_path: 
 
 
 def test_a_folder_that_is_elsewhere(undisturbed: Path) -> None:
-    """On a machine that does not see the folder of results a cell makes its simulations itself: the same result, their cost apart,
-    and nothing left behind."""
+    """On a machine that does not see the folder of results a cell makes its simulations itself.
+
+    The same result, their cost apart, and nothing left behind.
+    """
     nowhere, cell = Path("/proc/nowhere"), replace(Cell("Pendulum", "regression"), budget=60, steps=20)
     done = ESTIMATES.run(cell, nowhere, "")
     assert not done.failed, done.line
@@ -102,7 +104,10 @@ def test_a_folder_that_is_elsewhere(undisturbed: Path) -> None:
 def test_full_disk_loses_nothing(
     room_for: int, kept: int, monkeypatch: pytest.MonkeyPatch, undisturbed: Path, tmp_path: Path
 ) -> None:
-    """After some files, plan and times among them, there is no room: what is there is whole, and the same command goes on."""
+    """After some files, plan and times among them, there is no room.
+
+    What is there is whole, and the same command goes on.
+    """
     room, replacing = [room_for], files.replacing
 
     @contextmanager

@@ -52,7 +52,7 @@ def written(folder: Path, found: report_contents.Contents) -> Path:
 
 
 def test_what_stands_beside_from_another_setting_does_not_compete(found: report_contents.Contents) -> None:
-    """laplace of the direct setting is in the table of policies, and neither its best nor said to be."""
+    """Laplace of the direct setting is in the table of policies, and neither its best nor said to be."""
     section = next(s for s in found.sections if s.anchor == "policy-in_distribution")
     accuracy = next(t for t in section.tables if t.measure.name == "accuracy")
     assert "laplace, direct" in dict(accuracy.rows)
@@ -157,7 +157,8 @@ const table = document.querySelector("table.scores"), said = {};
 const values = () => [...table.tBodies[0].rows].map(r => Number(r.cells[1].dataset.value));
 const button = table.tHead.rows[0].cells[1].querySelector("button");
 said.given = values(); button.click(); said.descending = values(); button.click(); said.ascending = values();
-said.drawn = [...document.images].filter(i => i.complete && i.naturalWidth > 0).length; said.images = document.images.length;
+said.drawn = [...document.images].filter(i => i.complete && i.naturalWidth > 0).length;
+said.images = document.images.length;
 said.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth; said.width = innerWidth;
 parent.postMessage(JSON.stringify(said), "*"); });</script>"""
 _WINDOW = """<iframe src="page.html" style="width: {width}px; height: 900px; border: 0"></iframe><pre></pre>
@@ -173,8 +174,11 @@ def browser(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 @pytest.mark.parametrize("width", [360, 1200])
 def test_page_in_a_browser(written: Path, tmp_path: Path, width: int) -> None:
-    """On a phone and on a desk: figures are drawn, tables sort, nothing is wider than the window, and the console stays empty. The page
-    is in a frame, since Chromium's own window has at least 500 pixels."""
+    """On a phone and on a desk.
+
+    Figures are drawn, tables sort, nothing is wider than the window, and the console stays empty. The page is in a
+    frame, since Chromium's own window has at least 500 pixels.
+    """
     page = (written / "report.html").read_text(encoding="utf-8")
     (tmp_path / "page.html").write_text(page.replace("</body>", _PROBE + "</body>"), encoding="utf-8")
     (tmp_path / "window.html").write_text(_WINDOW.format(width=width), encoding="utf-8")

@@ -58,7 +58,11 @@ def test_the_best_is_set_apart_only_outside_noise() -> None:
 
 
 def test_nothing_is_best_where_the_truth_is_the_centre() -> None:
-    records = [make(estimator=e, seed=s, variant="default", at=near(error, s)) for e, error in (("adr", 0.0), ("simopt", 0.2)) for s in range(3)]  # fmt: skip
+    records = [
+        make(estimator=e, seed=s, variant="default", at=near(error, s))
+        for e, error in (("adr", 0.0), ("simopt", 0.2))
+        for s in range(3)
+    ]
     apart = tables.score_table(records, "accuracy", tables.Context.of(records))
     inside = [dataclasses.replace(r, variant="in_distribution") for r in records]
     same = tables.score_table(inside, "accuracy", tables.Context.of(inside))
@@ -121,7 +125,11 @@ def test_baselines_are_better_worse_or_not_told_apart() -> None:
         "noisy": (0.1, 0.28, 0.45),
     }  # the prior mean's: 0.275
     away = np.array([1, -1])
-    records = [make(estimator=n, seed=s, at=TRUTHS["in_distribution"] + e[s] * away) for n, e in errors.items() for s in range(3)]  # fmt: skip
+    records = [
+        make(estimator=n, seed=s, at=TRUTHS["in_distribution"] + e[s] * away)
+        for n, e in errors.items()
+        for s in range(3)
+    ]
     records += [make(estimator="prior_mean"), make(estimator="prior")]
     context = tables.Context.of(records)
     (table,) = [t for t in [tables.score_table(records, "accuracy", context)] if t]
@@ -137,8 +145,8 @@ def test_gain_of_a_setting_is_paired_by_environment_and_seed() -> None:
     labels = ("state differences", "learned rewards")
     (said,) = findings.pair_findings(left, right, labels)
     assert (
-        "adr: mean accuracy with learned rewards less that with state differences is 0.022 ± 0.001, a gain outside noise"
-        in said
+        "adr: mean accuracy with learned rewards less that with state differences is 0.022 ± 0.001, "
+        "a gain outside noise" in said
     )
     assert "positive on 2 of 2" in said
     (same,) = findings.pair_findings(left, left, labels)
@@ -149,15 +157,19 @@ def test_rows_that_do_not_compare_are_named() -> None:
     assert findings.unequal([make(seed=0), make(seed=1)]) == ""
     said = findings.unequal([make(seed=0), make(seed=1, budget=100), make("FetchPush", steps=20), make("FetchPush")])
     assert (
-        said
-        == "The rows do not compare: budgets differ (100, 1,000 rollouts) and trajectories differ in length on FetchPush."
+        said == "The rows do not compare: budgets differ (100, 1,000 rollouts) and "
+        "trajectories differ in length on FetchPush."
     )
 
 
 def test_search_is_held_against_the_defaults() -> None:
     """Two combinations tie for the best, and both are far ahead of the defaults."""
     errors = {4: 0.05, 6: 0.05, 10: 0.3}
-    mine = [make("FetchPush", "adr", s, "sweep", at=near(e, s), label=f"sweep,particles={n}", values={"particles": n}) for n, e in errors.items() for s in range(3)]  # fmt: skip
+    mine = [
+        make("FetchPush", "adr", s, "sweep", at=near(e, s), label=f"sweep,particles={n}", values={"particles": n})
+        for n, e in errors.items()
+        for s in range(3)
+    ]
     mine.append(make("FetchPush", "prior_mean"))
     rows = findings.sweep_rows(mine)
     assert [(row.estimator, row.default) for row in rows] == [
@@ -183,8 +195,8 @@ def test_wall_time_is_summed_by_suite() -> None:
     assert by_suite([dataclasses.replace(run, command="sipe simulate Door")]).keys() == {"sipe simulate"}
     said = dict(findings.facts([make()], runs))["wall time"]
     assert (
-        said
-        == "1.5 h on 2 cores, cells that were measured again included (direct 1.0 h, policy 30.0 min); CPU use 95% while simulating"
+        said == "1.5 h on 2 cores, cells that were measured again included (direct 1.0 h, policy 30.0 min); "
+        "CPU use 95% while simulating"
     )
 
 

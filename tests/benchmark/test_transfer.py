@@ -136,7 +136,7 @@ def test_variations_are_in_the_id_and_not_of_the_truth() -> None:
 
 
 def test_variations_come_once() -> None:
-    """A suite that holds some already; the default model and the baseline stay what they are, but for noise and delay."""
+    """A suite that holds some already; default model and baseline stay what they are, but for noise and delay."""
     points = varied(select("study", ["fetch_push/*/transfer*/in_distribution/seed0"]), point="mean")
     ids = [cell.id for cell in points]
     assert len(set(ids)) == len(ids)
@@ -220,7 +220,10 @@ def test_status_and_report(undisturbed: Path, tmp_path: Path) -> None:
 
 
 def test_killed_twice_and_resumed(undisturbed: Path, tmp_path: Path) -> None:
-    """SIGKILL in the middle of each of the two trainings; what results is what an undisturbed run gives, to the last bit."""
+    """SIGKILL in the middle of each of the two trainings.
+
+    What results is what an undisturbed run gives, to the last bit.
+    """
     out, rng = tmp_path / "out", random.Random(7)
     command = [
         sys.executable,
@@ -355,8 +358,10 @@ def test_results_of_another_kind_are_left_alone(undisturbed: Path, tmp_path: Pat
 
 
 def test_the_report_scores_what_was_drawn_from(undisturbed: Path) -> None:
-    """The truth's CRPS is zero, the estimate's that of the benchmark's cell, whose draws the record keeps; another number of threads
-    does not make a mean stale."""
+    """The truth's CRPS is zero, the estimate's that of the benchmark's cell, whose draws the record keeps.
+
+    Another number of threads does not make a mean stale.
+    """
     records = TransferRecord.all_in(undisturbed)
     found = Sources.of(records, undisturbed).crps(records)
     by_name = {r.estimator: found[r.id] for r in records}

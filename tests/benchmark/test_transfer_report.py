@@ -98,7 +98,10 @@ def test_rows_and_table() -> None:
 
 
 def test_negative_returns_and_a_missing_oracle() -> None:
-    """Where returns are negative the paper's percentage means nothing and is left out; without an oracle there is none at all."""
+    """Where returns are negative the paper's percentage means nothing and is left out.
+
+    Without an oracle there is none at all.
+    """
     given = [record("truth", 0, -200.0, random=evaluated(-1200.0)), record("adr", 0, -700.0, random=evaluated(-1200.0))]
     found = rows(given)
     assert [(row.percent, row.paper) for row in found] == [((100.0, None), None), ((50.0, None), None)]
@@ -131,7 +134,7 @@ def test_contrasts_are_paired_by_seed_over_targets() -> None:
 
 
 def test_variations_are_held_against_what_they_vary() -> None:
-    """With noise and delay against the prior that has them, too; a point of a delayed posterior against that posterior."""
+    """With noise and delay against the prior that has them too; a point of a delayed posterior against that one."""
     names = (
         "truth",
         "prior",
@@ -159,9 +162,11 @@ def test_variations_are_held_against_what_they_vary() -> None:
 
 
 def test_whether_better_posteriors_train_better_policies() -> None:
-    """Four randomisations in the same order of quality and return have a correlation of one, and of 24 orders two are as far from zero
-    (p is within .01 of that, 3.6 sds of its permutations); with a second target in the opposite order the mean is zero. The oracle,
-    variations and what is not scored do not count."""
+    """Four randomisations in the same order of quality and return have a correlation of one.
+
+    Of 24 orders two are as far from zero (p is within .01 of that, 3.6 sds of its permutations); with a second target
+    in the opposite order the mean is zero. The oracle, variations and what is not scored do not count.
+    """
     given, crps = [], {}
     for task, sign in (("HalfCheetahLinks", 1), ("FetchPush", -1)):
         for k, name in enumerate(("prior", "adr", "npe", "laplace")):
@@ -185,8 +190,10 @@ def test_whether_better_posteriors_train_better_policies() -> None:
 
 def test_the_studys_figures_tell_every_randomisation_apart() -> None:
     """Each has its own look and one entry of the legend, also the default model, which the first group lacks."""
-    given = [replace(record(c.estimator, c.seed, 400.0 + 100 * c.seed + len(c.estimator), c.task), variant=c.variant, id=c.id, setting=c.id.split("/")[2])
-             for c in select("study")]  # fmt: skip
+    given = []
+    for cell in select("study"):
+        one = record(cell.estimator, cell.seed, 400.0 + 100 * cell.seed + len(cell.estimator), cell.task)
+        given.append(replace(one, variant=cell.variant, id=cell.id, setting=cell.id.split("/")[2]))
     found = rows(given)
     names = [n for n in in_order({row.name for row in found}) if n != "truth"]
     assert len(names) == 12
@@ -203,8 +210,11 @@ def test_the_studys_figures_tell_every_randomisation_apart() -> None:
 def test_long_names_keep_to_the_figure() -> None:
     """A single panel with three variations at once."""
     long = "wider=2.0,observation_noise=0.01,action_delay=2"
-    given = [replace(record(name, 0, 500.0), id=f"{name},{v}", setting=",".join([SETTING, *([v] if v else [])]))
-             for name in ("truth", "prior", "laplace", "regression") for v in (("", long) if name != "truth" else ("",))]  # fmt: skip
+    given = [
+        replace(record(name, 0, 500.0), id=f"{name},{v}", setting=",".join([SETTING, *([v] if v else [])]))
+        for name in ("truth", "prior", "laplace", "regression")
+        for v in (("", long) if name != "truth" else ("",))
+    ]
     for figure in (curves(given), bars(rows(given))):
         figure.savefig(io.BytesIO())
         width = figure.bbox.width

@@ -108,8 +108,10 @@ def test_the_same_command_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_the_benchmark_s_sets_are_disjoint(tmp_path: Path) -> None:
-    """9 tasks, 3 variants, 3 splits, 3 agents; two cheetahs share the default variant's 9 files. No two sets of a task and
-    variant have an action in common."""
+    """9 tasks, 3 variants, 3 splits, 3 agents; two cheetahs share the default variant's 9 files.
+
+    No two sets of a task and variant have an action in common.
+    """
     every = list(trajectory_sets.names())
     assert len({name.file for name in every}) == len(every) == 9 * 27 - 9
     agent(sipe.make_task("Pendulum")).save(tmp_path / "Pendulum-expert.safetensors")

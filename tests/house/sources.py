@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -58,7 +59,11 @@ class House:
         return modules
 
     def imports(self, module: Module) -> Iterator[tuple[str, str, str]]:
-        """(module of this house, name taken from it or ``""``, what the file calls it) for each import in a file."""
+        """(module of this house, name taken from it or ``""``, what the file calls it) for each import in a file.
+
+        A text that names one of its modules (``"sipe_bayes.core.units"``, ``"sipe_bayes.core.units:UNITS"``) is an
+        import of it too: somebody hands it to importlib.
+        """
         for node in module.nodes:
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == self.folder:
                 for alias in node.names:
@@ -68,6 +73,10 @@ class House:
                 for alias in node.names:
                     if alias.name.split(".")[0] == self.folder:
                         yield alias.name, "", alias.asname or ""
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = re.fullmatch(rf"({self.folder}(?:\.\w+)+)(?::\w+)?", node.value)
+                if named and named[1] in self.modules:
+                    yield named[1], "", ""
 
     @cached_property
     def edges(self) -> dict[str, set[str]]:

@@ -74,6 +74,16 @@ def house(folder: Path, files: dict[str, str]) -> House:
     return House(folder)
 
 
+def test_a_module_named_in_a_text_is_imported(tmp_path: Path) -> None:
+    """By a list of names for importlib, or with what is taken from it; a format's name or a sentence is none."""
+    texts = '"sipe_bayes.core.b", "sipe_bayes.core.c:f", "sipe_bayes.posterior/1", "see sipe_bayes.core.d"'
+    files = {f"core/{name}.py": "" for name in "bcd"} | {"core/a.py": f"NAMES = ({texts})\n"}
+    found = house(tmp_path / "forth", files)
+    assert found.edges["sipe_bayes.core.a"] == {"sipe_bayes.core.b", "sipe_bayes.core.c"}
+    back = house(tmp_path / "back", {**files, "core/c.py": "import sipe_bayes.core.a\n"})
+    assert offenders(back)["circles"] == {"sipe_bayes.core.a - sipe_bayes.core.c": 2}
+
+
 @pytest.mark.parametrize("limit", LIMITS)
 def test_what_breaks_a_limit_is_seen(limit: str, tmp_path: Path) -> None:
     """Alone: what breaks one limit breaks no other."""

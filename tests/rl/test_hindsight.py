@@ -17,8 +17,9 @@ from sipe_bayes.rl.trainer import Trainer
 
 NEAR = 0.1
 XML = """
-<mujoco><option timestep="0.02" gravity="0 0 0"><flag contact="disable"/></option><worldbody><body><geom size="0.1" mass="1"/>
-<joint name="x" type="slide" axis="1 0 0" damping="10"/><joint name="y" type="slide" axis="0 1 0" damping="10"/></body></worldbody>
+<mujoco><option timestep="0.02" gravity="0 0 0"><flag contact="disable"/></option>
+<worldbody><body><geom size="0.1" mass="1"/><joint name="x" type="slide" axis="1 0 0" damping="10"/>
+<joint name="y" type="slide" axis="0 1 0" damping="10"/></body></worldbody>
 <actuator><motor joint="x" gear="20"/><motor joint="y" gear="20"/></actuator></mujoco>
 """
 

@@ -111,8 +111,10 @@ def test_learned_rewards(name: str) -> None:
 
 @pytest.mark.parametrize("environment", ["Pendulum", "FetchPush"])
 def test_the_estimator_gets_the_reference_under_the_actions_of_training(environment: str) -> None:
-    """The trajectories are the truth's, from where the episodes began, with their actions and goals; afterwards the agent
-    trains where the estimate says."""
+    """The trajectories are the truth's, from where the episodes began, with their actions and goals.
+
+    Afterwards the agent trains where the estimate says.
+    """
     of = task(environment)
     run = run_of(told(of), lanes=2, steps=4 * (EPISODE + HORIZON + 1), start_steps=10**6)
     run.iterate(None)

@@ -58,8 +58,11 @@ def test_draws_follow_names_and_values_not_columns() -> None:
 
 
 def test_theta_outside_the_cube_is_drawn_anew_and_counted() -> None:
-    """Bounds twice as wide for each of three parameters: one draw in eight fits, so 7 are drawn anew for each that does; 100 of
-    them within 4.4 sd (negative binomial, sd 75)."""
+    """Bounds twice as wide for each of three parameters.
+
+    One draw in eight fits, so 7 are drawn anew for each that does; 100 of them within 4.4 sd
+    (negative binomial, sd 75).
+    """
     wide = ParameterSpace(
         [replace(p, low=p.low - (p.high - p.low) / 2, high=p.high + (p.high - p.low) / 2) for p in SPACE]
     )
@@ -126,7 +129,10 @@ class Seen:
 
 
 def test_actions_arrive_late() -> None:
-    """Against a plain reference: in each episode and lane an action arrives 0 to 3 steps after it was sent, before that the middle."""
+    """Against a plain reference.
+
+    In each episode and lane an action arrives 0 to 3 steps after it was sent, before that the middle.
+    """
     trainer = Trainer(TASK, replace(SMALL, lanes=6, start_steps=10**9), 1, Randomization(prior(SPACE), action_delay=3))
     found = Seen(trainer, 402)
     sent, got = np.array(found.sent), np.array(found.got)
@@ -141,7 +147,10 @@ def test_actions_arrive_late() -> None:
 
 
 def test_observations_are_noisy_by_an_episode_of_its_own() -> None:
-    """Each episode's noise has one sd between 0 and the greatest one: of 200 samples a sd is known to 5 %, so that 25 % are 5 sd."""
+    """Each episode's noise has one sd between 0 and the greatest one.
+
+    Of 200 samples a sd is known to 5 %, so that 25 % are 5 sd.
+    """
     greatest = np.array([0.1, 0.0, 2.0])
     trainer = Trainer(TASK, replace(SMALL, lanes=6, start_steps=10**9), 1, Randomization(prior(SPACE), greatest))
     found = Seen(trainer, 200)
@@ -245,7 +254,7 @@ def test_train_command_reads_the_file(tmp_path: Path) -> None:
 
 
 def test_file_without_a_posterior_stands_for_its_normal(tmp_path: Path) -> None:
-    """Mean and covariance become those before the cube cuts them off; a point stays one; what is added by hand is read."""
+    """Mean and covariance become those before the cube cuts them off; a point stays one; additions are read."""
     posterior = normal()
     path = exported(tmp_path, posterior, named=False)
     path.write_text(to_json({**json.loads(path.read_text()), "observation_noise": [0.1, 0.1, 0.2], "action_delay": 2}))

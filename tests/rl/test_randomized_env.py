@@ -39,7 +39,7 @@ def test_gymnasium_accepts_it(disturbed: bool) -> None:
 
 
 def test_every_episode_runs_under_a_draw_of_its_own() -> None:
-    """What the simulator has, the plain environment with that theta does to the last bit; the same seed draws the same."""
+    """What the simulator has, the plain environment with that theta does to the last bit; a seed draws the same."""
     env = randomized()
     drawn = thetas(env, 3)
     assert len(np.unique(drawn, axis=0)) == 5

@@ -1,4 +1,4 @@
-"""The replay buffer: what is sampled against a plain list of episodes, with hindsight, n-step returns and a full ring."""
+"""The replay buffer: samples against a plain list of episodes, with hindsight, n-step returns and a full ring."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ def goal_reward(achieved: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 class World:
-    """Lanes that count: an observation is (lane, episode, time in it, goal), what is achieved its time. Episodes of lane i
-    take 4 + i steps and terminate if i is odd, else run out of time; ``diverging``: (lane, episode, time) where one fails.
+    """Lanes that count: an observation is (lane, episode, time in it, goal), what is achieved its time.
+
+    Episodes of lane i take 4 + i steps and terminate if i is odd, else run out of time; ``diverging``: (lane, episode,
+    time) where one fails.
     """
 
     def __init__(self, lanes: int, diverging: tuple[int, int, int] = (-1, -1, -1)) -> None:

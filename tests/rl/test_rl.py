@@ -269,7 +269,10 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, task: str, setti
 
 
 def test_a_finished_training_is_read_and_another_one_is_not(tmp_path: Path) -> None:
-    """Without its checkpoint: the same run is there at once; under another randomisation, and for more steps, it is trained."""
+    """Without its checkpoint: the same run is there at once.
+
+    Under another randomisation, and for more steps, it is trained.
+    """
     space, folder = sipe.make_task("Pendulum").space, tmp_path / "run"
     run = {"evaluate_every": 90, "evaluation_episodes": 2, "checkpoint_every": 75}
 

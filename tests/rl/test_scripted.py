@@ -1,4 +1,4 @@
-"""Scripted controllers and demonstrations: they solve the tasks, the same seed gives the same, failures are left out."""
+"""Scripted controllers and demonstrations: they solve the tasks, a seed gives the same, failures are left out."""
 
 from __future__ import annotations
 
@@ -52,7 +52,10 @@ def test_demonstrations_are_the_first_attempts_that_succeed() -> None:
 
 
 def test_demonstrations_in_simulators_drawn_from_what_is_believed() -> None:
-    """A point where the published model is gives what it gives; the prior gives each attempt a theta of its own, the same again."""
+    """A point where the published model is gives what it gives.
+
+    The prior gives each attempt a theta of its own, the same again.
+    """
     task = sipe.make_task("FetchPush")
     simulator, act = Simulator(task, 1), scripted.demonstrator(task)
     plain, _ = record(simulator, act, range(2), 3)

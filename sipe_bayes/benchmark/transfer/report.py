@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from sipe_bayes.benchmark.records import RecordError
-from sipe_bayes.benchmark.tables import LEVEL, against
+from sipe_bayes.benchmark.tables import against
 from sipe_bayes.benchmark.transfer.figures import bars, curves
 from sipe_bayes.benchmark.transfer.rows import WORDS, Percent, Row, Target, by_quality, contrasts, label, rows
 from sipe_bayes.benchmark.transfer.status import Sources
 from sipe_bayes.benchmark.transfer.study import TRUTH, TransferRecord
 from sipe_bayes.core.files import write_bytes, write_text
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.report.drawing import png
 
 _EXPLAINED = """\
@@ -115,8 +116,9 @@ def _compared(given: Sequence[Row]) -> list[str]:
     targets = [g for g in dict.fromkeys(row.group for row in given) if any(g in c.by_target for c in compared)]
     seeds = " or ".join(map(str, sorted({len(c.gains) for c in compared})))
     tests = sum(len(c.by_target) + (len(c.by_target) > 1) for c in compared if len(c.gains) > 1)
+    by_chance = THRESHOLDS.method_comparison * tests
     uncorrected = (
-        f" The {tests} tests are not corrected for their number: chance alone would call {LEVEL * tests:.1f} of them "
+        f" The {tests} tests are not corrected for their number: chance alone would call {by_chance:.1f} of them "
         "better or worse."
     )
     head = [*("trained under", "against", "mean of its targets"), *(_words(t).replace(" target:", "") for t in targets)]

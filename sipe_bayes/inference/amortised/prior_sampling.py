@@ -31,21 +31,21 @@ import hashlib
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, from_numpy
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.checkpoint import CheckpointError
+from sipe_bayes.core.checkpoint import CheckpointError, Snapshot
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.experiment import Experiment, Looks, measured
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
-from sipe_bayes.inference.base import Estimator, Snapshot
+from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
 from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.settings import BudgetExhausted
@@ -120,6 +120,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
 
     amortised: ClassVar[bool] = True
     options_type: ClassVar[type[Options]] = PriorSamplingOptions
+    state_type: ClassVar[type[PriorSamplingState[Any]]]
     options: PriorSamplingOptions
 
     def prepare(self) -> None:
@@ -154,8 +155,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         """Nothing simulated yet; raises BudgetExhausted where nothing could be."""
         self._check(trajectories)
         self._affordable(trajectories)
-        state: S = self.state_type(digest(trajectories))
-        return state
+        return cast(S, self.state_type(digest(trajectories)))
 
     def step(self, state: S, trajectories: Trajectories) -> S:
         """A block of simulations, or the training once the budget is spent."""

@@ -79,7 +79,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def start(self, trajectories: Trajectories) -> LaplaceState:
         """The first state of the search that fits the likelihood."""
-        return LaplaceState(self._strategy(self.windows(trajectories)).start())
+        return LaplaceState(self._strategy(self.bound(trajectories)).start())
 
     def describe(self, state: LaplaceState) -> str:
         """Starting point and step, or draws."""
@@ -89,9 +89,9 @@ class Laplace(Estimator[LaplaceState]):
 
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
         """A step of the search, or, where it has ended, one more batch of draws."""
-        windows = self.windows(trajectories)
         if state.draws is not None:
-            return self._drawn(windows, state, state.draws)
+            return self._drawn(self.windows(trajectories), state, state.draws)
+        windows = self.bound(trajectories)
         search = self._strategy(windows).step(state.search)
         state = replace(state, search=search)
         return self._probed(windows, state) if search.done else state
@@ -143,7 +143,7 @@ class Laplace(Estimator[LaplaceState]):
         """
         kept = distinct(state.search.optima)
         if not kept:
-            step = self._strategy(self.windows(trajectories)).step_rollouts
+            step = self._strategy(self.bound(trajectories)).step_rollouts
             raise BudgetTooSmall(
                 f"budget: {self.budget} rollouts were not enough for one optimum; "
                 f"one step takes {step} rollouts, so raise the budget"

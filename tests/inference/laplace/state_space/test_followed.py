@@ -30,7 +30,7 @@ def test_a_known_start_costs_two_fifths_of_the_budget_at_most() -> None:
     logs, likelihood = [hung_log(np.array([0.4]), 0)], StateSpace(starts="recorded")
     for budget in (20, 100):
         estimator = Laplace(hung(), likelihood=likelihood, budget=budget)
-        chain = estimator.windows(Trajectories.stack(logs))
+        chain = estimator.bound(Trajectories.stack(logs))
         points = estimator.start(Trajectories.stack(logs)).search.points
         print(budget, points)
         assert points.shape[1] == 1

@@ -77,7 +77,7 @@ def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
 
 def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray | None, Laplace]:
     estimator = Laplace(bouncing(), likelihood=KNOWN, **settings)  # type: ignore[arg-type]
-    return grown(estimator.problem, estimator.windows(Trajectories.stack(logs))), estimator
+    return grown(estimator.problem, estimator.bound(Trajectories.stack(logs))), estimator
 
 
 def test_many_logs_and_late_samples_grow_as_well() -> None:
@@ -99,7 +99,7 @@ def test_many_logs_and_late_samples_grow_as_well() -> None:
 def test_a_model_that_diverges_as_given_is_said_to() -> None:
     theta = np.array([0.87, 0.38, 0.5])
     estimator = Laplace(bouncing(), likelihood=KNOWN, restarts=1)
-    windows = estimator.windows(Trajectories.stack([bouncing_log(theta, 0, 30)]))
+    windows = estimator.bound(Trajectories.stack([bouncing_log(theta, 0, 30)]))
     simulator, rollout = windows.simulator, windows.simulator.rollout
 
     def broken(thetas, *rest, **more):  # type: ignore[no-untyped-def]
