@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import LineStyleType
@@ -259,23 +258,18 @@ def _panels(
         ax.set_title(task, fontweight="bold")
     outer_labels(axes, columns, xlabel, "mean accuracy")
     across = [line_handle(_ACROSS, name, level.line) for name, level in levels.items()]
-    legend_above(figure, [*(_handle(n, k) for k, n in enumerate(names)), *across], 6)
+    legend_above(figure, [*(look(k).handle(n, STYLE.curve) for k, n in enumerate(names)), *across], 6)
     return figure
 
 
 def _curve(ax: Axes, points: Points, index: int) -> None:
     x = np.array(sorted(points))
-    mean, (colour, line, marker) = [np.mean(points[at]) for at in x], look(index)
+    mean, one = [np.mean(points[at]) for at in x], look(index)
     every = max(1, len(x) // 6)
-    ax.plot(x, mean, ms=4, lw=STYLE.curve, color=colour, ls=line, marker=marker, markevery=every)
+    ax.plot(x, mean, ms=4, lw=STYLE.curve, color=one.colour, ls=one.line, marker=one.marker, markevery=every)
     if any(len(points[at]) > 1 for at in x):
         low, high = (np.array([f(points[at]) for at in x]) for f in (min, max))
         if len(x) > 1:
-            ax.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
+            ax.fill_between(x, low, high, color=one.colour, alpha=0.12, lw=0)
         else:
-            ax.vlines(x, low, high, color=colour, lw=1)
-
-
-def _handle(label: str, index: int) -> Line2D:
-    colour, line, marker = look(index)
-    return line_handle(colour, label, line, lw=STYLE.curve, marker=marker, ms=4)
+            ax.vlines(x, low, high, color=one.colour, lw=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,21 +42,6 @@ class Shares:
 SHARES = Shares()
 
 
-@dataclass(frozen=True)
-class _Estimate:
-    """A posterior, what it cost, what was found on the way; the rest as of ``Record``."""
-
-    posterior: Posterior
-    seconds: float | None = 0.0
-    cpu_seconds: float | None = 0.0
-    rollouts: int = 0
-    warnings: list[str] = field(default_factory=list)
-    history: list[Look] = field(default_factory=list)
-    simulation_cpu_seconds: float = 0.0
-    converged: bool | None = None
-    solved_reference: bool | None = None
-
-
 class EstimateMeasurement(Measurement[Record]):
     """An estimator on the recorded trajectory of its cell, or on those of an agent that is trained meanwhile."""
 
@@ -80,18 +65,16 @@ class EstimateMeasurement(Measurement[Record]):
         log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
         simulator = Simulator(make_task(cell.task), num_threads=1)
         if cell.estimator in BASELINES:
-            estimate = _baseline(cell, simulator)
+            posterior, record = _baseline(cell, simulator), replace(record, seconds=0.0, cpu_seconds=0.0)
         elif cell.with_policy:
-            estimate = _with_policy(cell, simulator, folder / self.trained_in(cell))
+            posterior, record = _with_policy(cell, record, simulator, folder / self.trained_in(cell))
         else:
-            estimate = _estimated(cell, simulator, log, folder)
-        posterior = estimate.posterior
+            posterior, record = _estimated(cell, record, simulator, log, folder)
         scores = score(posterior, log.truth)
-        before = [look for look in estimate.history if look.rollouts < estimate.rollouts]
+        before = [look for look in record.history if look.rollouts < record.rollouts]
         record = replace(
             record,
-            **{k: v for k, v in vars(estimate).items() if k not in ("posterior", "history")},
-            history=[*before, Look(estimate.rollouts, scores.mean_accuracy, scores.mean_crps)],
+            history=[*before, Look(record.rollouts, scores.mean_accuracy, scores.mean_crps)],
             names=list(simulator.space.names),
             truth=log.truth.tolist(),
             mean=posterior.mean.tolist(),
@@ -102,16 +85,16 @@ class EstimateMeasurement(Measurement[Record]):
             checksums={**record.checksums, "model": simulator.checksum(), "log": digest(log.trajectories)},
         )
         line = f"accuracy {scores.mean_accuracy:.3f}, CRPS {scores.mean_crps:.3f}"
-        line += "" if estimate.seconds is None else f", {estimate.seconds:.1f} s"
+        line += "" if record.seconds is None else f", {record.seconds:.1f} s"
         return record, ((str(posterior_path(Path(), cell.id)), netcdf(posterior, cell.seed)),), line
 
 
 ESTIMATES = EstimateMeasurement()
 
 
-def _baseline(cell: Cell, simulator: Simulator) -> _Estimate:
+def _baseline(cell: Cell, simulator: Simulator) -> Posterior:
     space = simulator.space
-    return _Estimate(prior(space) if cell.estimator == "prior" else Dirac(np.full(len(space), 0.5), space))
+    return prior(space) if cell.estimator == "prior" else Dirac(np.full(len(space), 0.5), space)
 
 
 def _estimator(cell: Cell, simulator: Simulator, **settings: object) -> Estimator:
@@ -121,7 +104,7 @@ def _estimator(cell: Cell, simulator: Simulator, **settings: object) -> Estimato
     return get_estimator(simulator, cell.estimator, budget=cell.budget, seed=cell.seed, **every)
 
 
-def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Estimate:
+def _estimated(cell: Cell, record: Record, simulator: Simulator, log: Log, folder: Path) -> tuple[Posterior, Record]:
     """Step by step; the looks at the estimate along the way cost the method nothing and change nothing."""
     shares = issubclass(estimator_class(cell.estimator), PriorSampling)
     simulations = folder / bank.FOLDER
@@ -136,13 +119,13 @@ def _estimated(cell: Cell, simulator: Simulator, log: Log, folder: Path) -> _Est
             looks = [share for share in looks if share > estimator.rollouts]
             history += _look(estimator, log)
     posterior = clock.time(lambda: estimator.get_parameter_estimate(log.trajectories))
-    return _Estimate(
-        posterior,
-        clock.seconds,
-        clock.cpu_seconds,
-        estimator.rollouts,
-        list(estimator.warnings),
-        history,
+    return posterior, replace(
+        record,
+        seconds=clock.seconds,
+        cpu_seconds=clock.cpu_seconds,
+        rollouts=estimator.rollouts,
+        warnings=list(estimator.warnings),
+        history=history,
         simulation_cpu_seconds=simulated,
     )
 
@@ -166,7 +149,7 @@ def _look(estimator: Estimator, log: Log) -> list[Look]:
     return [Look(estimator.rollouts, scores.mean_accuracy, scores.mean_crps)]
 
 
-def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Estimate:
+def _with_policy(cell: Cell, record: Record, simulator: Simulator, folder: Path) -> tuple[Posterior, Record]:
     from sipe_bayes.benchmark.transfer.study import agent_of, demonstrations_of
     from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, train_in_the_loop
 
@@ -184,13 +167,13 @@ def _with_policy(cell: Cell, simulator: Simulator, folder: Path) -> _Estimate:
             resume=True,
         )
     )
-    return _Estimate(
-        result.posterior,
-        clock.seconds if fresh else None,
-        clock.cpu_seconds if fresh else None,
-        result.history[-1].rollouts,
-        list(result.warnings),
-        [Look(row.rollouts, row.accuracy) for row in result.history],
+    return result.posterior, replace(
+        record,
+        seconds=clock.seconds if fresh else None,
+        cpu_seconds=clock.cpu_seconds if fresh else None,
+        rollouts=result.history[-1].rollouts,
+        warnings=list(result.warnings),
+        history=[Look(row.rollouts, row.accuracy) for row in result.history],
         converged=result.converged,
         solved_reference=result.solved_reference,
     )

@@ -20,44 +20,31 @@ class Thresholds(Options):
         0.02,
         "a median or mode nearer to a bound than this sits on it: a truth beyond would have pushed it there",
         "of the range",
-        above=0,
-        below=1,
     )
     bound_sds: float = option(
-        10.0, "a mode may be as near to a bound as its sd is small: within at_bound times this many sds", "sds", above=0
+        10.0, "a mode may be as near to a bound as its sd is small: within at_bound times this many sds", "sds"
     )
     not_determined: float = option(
         0.5,
         "a parameter that contracts less keeps more than half of the prior's sd: the logs do not determine it",
         "contraction",
-        above=0,
-        below=1,
     )
     task_determines: float = option(
         0.5,
         "a log of the benchmark that leaves less of a parameter counts as determining it, whatever methods say",
         "of the prior's sd",
-        above=0,
-        below=1,
     )
     well_determined: float = option(
-        0.8,
-        "a parameter that contracts more has an interval of at most a fifth of the prior's",
-        "contraction",
-        above=0,
-        below=1,
+        0.8, "a parameter that contracts more has an interval of at most a fifth of the prior's", "contraction"
     )
-    idle: float = option(
-        0.1, "a calibrated posterior that contracts less says no more than the prior", "contraction", above=0, below=1
-    )
+    idle: float = option(0.1, "a calibrated posterior that contracts less says no more than the prior", "contraction")
     no_effect: float = option(
         1e-7,
         "a parameter that moves no channel by more changes nothing: ten times what rounding of a rollout does",
         "of the signal's spread",
-        above=0,
     )
     sensitivity: float = option(
-        1e-3, "a change of the value by a tenth that moves observations less moves nothing", "of their spread", above=0
+        1e-3, "a change of the value by a tenth that moves observations less moves nothing", "of their spread"
     )
 
     # several parameters
@@ -65,106 +52,82 @@ class Thresholds(Options):
         0.03,
         "an eigenvalue of the correlation matrix below it: the combination is six times better known than its members",
         "of one",
-        above=0,
-        below=1,
     )
     ridge_member: float = option(
-        0.25, "a parameter with a smaller loading is no member of a ridge", "of the largest loading", above=0, below=1
+        0.25, "a parameter with a smaller loading is no member of a ridge", "of the largest loading"
     )
 
     # logs and what the model lacks
     logs_disagree: float = option(
-        0.01, "false alarms of logs that agree; rare, since each pair of logs is a chance", "p-value", above=0, below=1
+        0.01, "false alarms of logs that agree; rare, since each pair of logs is a chance", "p-value"
     )
     misfit: float = option(
-        0.05, "false alarms of residuals that are noise, and of logs that the prior gives", "p-value", above=0, below=1
+        0.05, "false alarms of residuals that are noise, and of logs that the prior gives", "p-value"
     )
     small_misfit: float = option(
-        0.1, "a cause that explains less of every channel's residual is small", "of the residual", above=0, below=1
+        0.1, "a cause that explains less of every channel's residual is small", "of the residual"
     )
     much_process_noise: float = option(
-        0.1, "process noise below it leaves the motion to the model", "of the movement in a control step", above=0
+        0.1, "process noise below it leaves the motion to the model", "of the movement in a control step"
     )
     far_shift: float = option(
-        1.0,
-        "a parameter that would move further if the model had the cause is not to be trusted",
-        "posterior sds",
-        above=0,
+        1.0, "a parameter that would move further if the model had the cause is not to be trusted", "posterior sds"
     )
 
     # predictions of held-out logs
-    comparison: float = option(
-        0.05, "false alarms of two models that predict alike", "p-value of the paired t-test", above=0, below=1
-    )
+    comparison: float = option(0.05, "false alarms of two models that predict alike", "p-value of the paired t-test")
     method_comparison: float = option(
-        0.05, "false alarms of one method compared with another, or with a baseline", "p-value", above=0, below=1
+        0.05, "false alarms of one method compared with another, or with a baseline", "p-value"
     )
-    alike: float = option(1.05, "errors within this factor of one another count as the same", "ratio", above=1)
+    alike: float = option(1.05, "errors within this factor of one another count as the same", "ratio")
     starts_rule: float = option(
-        0.95,
-        "measured starts that make more of the error rule it: both models get starts of their own",
-        "of the error",
-        above=0,
-        below=1,
+        0.95, "measured starts that make more of the error rule it: both models get starts of their own", "of the error"
     )
 
     # chains and calibration
-    mixed: float = option(1.05, "chains with a larger R-hat have not mixed", "R-hat", above=1)
+    mixed: float = option(1.05, "chains with a larger R-hat have not mixed", "R-hat")
     miscalibrated: float = option(
-        0.01, "false alarms of one check of all parameters when every posterior is right", "p-value", above=0, below=1
+        0.01, "false alarms of one check of all parameters when every posterior is right", "p-value"
     )
-    shown_interval: float = option(
-        0.9, "the central interval whose coverage sentences speak of", "of the mass", above=0, below=1
-    )
+    shown_interval: float = option(0.9, "the central interval whose coverage sentences speak of", "of the mass")
 
     # searches
     search_wide: float = option(
-        0.15,
-        "a search whose distribution is wider was cut short: half of a uniform prior's sd",
-        "sd, of the range",
-        above=0,
+        0.15, "a search whose distribution is wider was cut short: half of a uniform prior's sd", "sd, of the range"
     )
     best_at_bound: float = option(
-        2e-3, "an evaluated point nearer to a bound went there as far as it could", "of the range", above=0, below=1
+        2e-3, "an evaluated point nearer to a bound went there as far as it could", "of the range"
     )
-    mixed_draws: float = option(400.0, "fewer effective draws tell an interval's ends badly", "draws", above=0)
+    mixed_draws: float = option(400.0, "fewer effective draws tell an interval's ends badly", "draws")
     epsilon_probability: float = option(
-        0.01, "where epsilon is less probable at the median draw, the prior's room rules", "probability", above=0
+        0.01, "where epsilon is less probable at the median draw, the prior's room rules", "probability"
     )
-    rough_density: float = option(0.2, "a larger standard error of log Z moves a density by a fifth", "nats", above=0)
+    rough_density: float = option(0.2, "a larger standard error of log Z moves a density by a fifth", "nats")
 
     # recalibration
-    refits_lost: float = option(
-        0.1, "more refits that fail leave out a part of the prior", "of the refits", above=0, below=1
-    )
-    refits_odd: float = option(
-        0.01, "false alarms of estimates that scatter normally about a line", "p-value", above=0, below=1
-    )
+    refits_lost: float = option(0.1, "more refits that fail leave out a part of the prior", "of the refits")
+    refits_odd: float = option(0.01, "false alarms of estimates that scatter normally about a line", "p-value")
 
     # amortised methods
-    few_valid: int = option(10, "of fewer valid simulations nothing is learned", "simulations", least=2)
-    few_accepted: int = option(30, "the spread of fewer accepted draws says little", "draws", least=1)
+    few_valid: int = option(10, "of fewer valid simulations nothing is learned", "simulations")
+    few_accepted: int = option(30, "the spread of fewer accepted draws says little", "draws")
     invalid_elsewhere: float = option(
         1e-3,
         "false alarms of invalid simulations that lie all over the prior; rare, as each parameter is a chance",
         "p-value",
-        above=0,
-        below=1,
     )
     unlike: float = option(
         1.0,
         "a log with a larger outlier factor is further from the simulations than any of them from the others",
         "of the simulations' largest",
-        above=0,
     )
     first_sample_sds: float = option(
-        3.0, "a log that begins further from all simulations has another start", "sds of the noise", above=0
+        3.0, "a log that begins further from all simulations has another start", "sds of the noise"
     )
     noise_ratio: float = option(
         2.0,
         "a training serves no log whose noise differs more: estimates from 60 samples do in less than 1 % of pairs",
         "ratio of sds",
-        above=1,
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -87,16 +87,18 @@ class Trajectory:
             raise ValueError(
                 f"trajectory {self.name!r}: expected 0 <= start < stop <= {len(self)}, got {start} and {stop}"
             )
-        states = None if self.states is None else self.states[start : stop + 1]
-        return Trajectory(
-            self.observations[start : stop + 1],
-            self.actions[start:stop],
-            self.dt,
-            states,
-            self.name,
-            self.channels,
-            None if self.rewards is None else self.rewards[start:stop],
+        samples, steps = slice(start, stop + 1), slice(start, stop)
+        return replace(
+            self,
+            observations=self.observations[samples],
+            actions=self.actions[steps],
+            states=_part(self.states, samples),
+            rewards=_part(self.rewards, steps),
         )
+
+
+def _part(array: FloatArray | None, rows: Any) -> FloatArray | None:
+    return None if array is None else array[rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,7 @@ class Trajectories(Sequence[Trajectory]):
     valid: BoolArray
     states: FloatArray | None = None
     names: tuple[str, ...] = ()
-    channels: tuple[str, ...] = field(default=())
+    channels: tuple[str, ...] = ()
     rewards: FloatArray | None = None
 
     @classmethod
@@ -190,29 +192,26 @@ class Trajectories(Sequence[Trajectory]):
         """One trajectory, cut to its own length, or a batch of those that are chosen."""
         if isinstance(key, (slice, Sequence, np.ndarray)):
             return self._subset(np.arange(len(self))[key])
-        n = int(self.length[key])
-        states = None if self.states is None else self.states[key, : n + 1]
-        name = self.names[key] if self.names else ""
-        dt = float(self.dt[key])
-        observations, actions = self.observations[key, : n + 1], self.actions[key, :n]
-        rewards = None if self.rewards is None else self.rewards[key, :n]
-        return Trajectory(observations, actions, dt, states, name, self.channels, rewards)
+        n, name = int(self.length[key]), self.names[key] if self.names else ""
+        samples, steps = (key, slice(n + 1)), (key, slice(n))
+        parts = self.observations[samples], self.actions[steps], float(self.dt[key]), _part(self.states, samples)
+        return Trajectory(*parts, name, self.channels, _part(self.rewards, steps))
 
     def _subset(self, chosen: IntArray) -> Trajectories:
         if not len(chosen):
             raise ValueError(f"trajectories: expected to choose at least one of {len(self)}, got none")
         length = self.length[chosen]
-        steps = int(length.max())
-        return Trajectories(
-            self.observations[chosen, : steps + 1],
-            self.actions[chosen, :steps],
-            self.dt[chosen],
-            length,
-            self.valid[chosen, : steps + 1],
-            None if self.states is None else self.states[chosen, : steps + 1],
-            tuple(self.names[i] for i in chosen) if self.names else (),
-            self.channels,
-            None if self.rewards is None else self.rewards[chosen, :steps],
+        samples, steps = (chosen, slice(length.max() + 1)), (chosen, slice(length.max()))
+        return replace(
+            self,
+            observations=self.observations[samples],
+            actions=self.actions[steps],
+            dt=self.dt[chosen],
+            length=length,
+            valid=self.valid[samples],
+            states=_part(self.states, samples),
+            names=tuple(self.names[i] for i in chosen) if self.names else (),
+            rewards=_part(self.rewards, steps),
         )
 
     def __iter__(self) -> Iterator[Trajectory]:
@@ -220,26 +219,16 @@ class Trajectories(Sequence[Trajectory]):
 
     def save(self, path: str | Path) -> None:
         """Write to an npz file, under exactly this name and atomically."""
-        arrays: dict[str, Any] = {
-            "observations": self.observations,
-            "actions": self.actions,
-            "dt": self.dt,
-            "length": self.length,
-            "valid": self.valid,
-            "names": np.array(self.names, dtype=np.str_),
-            "channels": np.array(self.channels, dtype=np.str_),
-        }
-        if self.states is not None:
-            arrays["states"] = self.states
-        if self.rewards is not None:
-            arrays["rewards"] = self.rewards
+        arrays: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
+        for name in ("names", "channels"):
+            arrays[name] = np.array(arrays[name], dtype=np.str_)
         with replacing(Path(path)) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> Trajectories:
         """Read what ``save`` wrote; runs no code from the file. Raises ValueError for another file."""
-        needed = {"observations", "actions", "dt", "length", "valid", "names", "channels"}
+        needed = {f.name for f in fields(cls)} - {"states", "rewards"}
         try:
             with np.load(path, allow_pickle=False) as data:
                 arrays = {key: data[key] for key in data.files}

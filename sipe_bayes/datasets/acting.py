@@ -140,8 +140,7 @@ def simulate(
     Raises:
         RuntimeError: where a simulation diverges.
     """
-    task = simulator.environment
-    assert isinstance(task, Task)
+    task = simulator.task
     rngs = [np.random.default_rng([seed, SPLITS.index(split), i, *behaviour.key]) for i in range(count)]
     drawn = [task.initial_states(rng, 1) for rng in rngs]
     states = np.concatenate([state for state, _ in drawn])

@@ -94,8 +94,7 @@ def demonstrations(
     one_of("type", type, AGENTS)
     one_of("split", split, SPLITS)
     simulator, theta = _placed(env, variant)
-    task = simulator.environment
-    assert isinstance(task, Task)
+    task = simulator.task
     horizon = default_steps(task) if steps is None else whole("steps", steps)
     whole("count", count)
     where = SHIPPED if folder is None else Path(folder)
@@ -179,8 +178,7 @@ def _stored(
     folder: Path,
 ) -> Trajectories | None:
     """What a folder of trajectory sets holds of it, or None."""
-    task = simulator.environment
-    assert isinstance(task, Task)
+    task = simulator.task
     for variant in VARIANTS:
         name = SetName(task.name, variant, split, type)
         if np.array_equal(theta, task.theta(variant)):

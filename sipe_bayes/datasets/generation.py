@@ -12,7 +12,6 @@ from sipe_bayes.datasets import acting, trajectory_sets
 from sipe_bayes.datasets.demonstrations import agent_file, behaviour_of, default_steps
 from sipe_bayes.datasets.trajectory_sets import Origin, SetName
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -51,7 +50,7 @@ def generate(
     simulator: Simulator | None = None
     for name in names:
         began = time.monotonic()
-        if simulator is None or not isinstance(simulator.environment, Task) or simulator.environment.name != name.task:
+        if simulator is None or simulator.task.name != name.task:
             simulator = Simulator(make_task(name.task), num_threads)
         try:
             size = _generate(simulator, name, folder, count, steps, seed, command)
@@ -64,8 +63,7 @@ def generate(
 def _generate(
     simulator: Simulator, name: SetName, folder: Path, count: int, steps: int | None, seed: int, command: str
 ) -> int:
-    task = simulator.environment
-    assert isinstance(task, Task)
+    task = simulator.task
     behaviour = behaviour_of(task, name.type)
     if behaviour is None:
         raise LookupError(f"no {name.type} agent of {name.task} is installed")

@@ -43,7 +43,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import to_json, write_bytes, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
-from sipe_bayes.envs.task import VARIANTS, Task, Variant
+from sipe_bayes.envs.task import VARIANTS, Variant
 from sipe_bayes.simulation.simulator import Simulator
 
 SHIPPED = Path(__file__).parent / "trajectories"
@@ -150,9 +150,8 @@ def manifest(folder: Path) -> dict[str, Entry]:
 
 def entry_of(folder: Path, name: SetName, simulator: Simulator) -> Entry | None:
     """The manifest's entry of a set that was made with a task's parameter values; None where there is no such set."""
-    entry, task = manifest(folder).get(name.file), simulator.environment
-    assert isinstance(task, Task)
-    shared = name.task != task.name  # the values are another task's
+    entry = manifest(folder).get(name.file)
+    shared = name.task != simulator.task.name  # the values are another task's
     return entry if entry is not None and (shared or fits(entry, simulator, name.variant)) else None
 
 
@@ -162,9 +161,7 @@ def fits(entry: Entry, simulator: Simulator, variant: Variant) -> bool:
 
 
 def _values(simulator: Simulator, variant: Variant) -> list[float]:
-    task = simulator.environment
-    assert isinstance(task, Task)
-    return [p.value(t) for p, t in zip(simulator.space, task.theta(variant).tolist(), strict=True)]
+    return [p.value(t) for p, t in zip(simulator.space, simulator.task.theta(variant).tolist(), strict=True)]
 
 
 # Writing
@@ -275,8 +272,7 @@ def read(folder: Path, name: SetName, simulator: Simulator, count: int, steps: i
     dt = float(arrays["dt"])
     time = start[:, :1] + dt * np.arange(states.shape[1])
     states = np.concatenate([time[..., None], states], axis=-1)
-    task = simulator.environment
-    assert isinstance(task, Task)
+    task = simulator.task
     if states.shape[-1] != simulator.state_size or actions.shape[-1] != task.num_actions:
         raise TrajectorySetError(
             f"{folder / name.file}: expected {simulator.state_size} numbers of state and {task.num_actions} of action "

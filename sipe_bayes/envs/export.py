@@ -19,6 +19,8 @@ from sipe_bayes.envs.targets import split
 
 _INERTIA_FROM_GEOMS, _INERTIA_AUTO = 1, 2  # mjtInertiaFromGeom, which Python does not have
 _SIX_DIGITS = {"rtol": 1e-4, "atol": 1e-10}  # what a file of six digits may change in derived fields
+NO_NUMBERS = ("bvh", "oct", "tex", "name", "path", "_")
+"""What the names of a model's fields begin with that hold none of its numbers."""
 
 
 class ExportError(RuntimeError):
@@ -68,13 +70,17 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
     """Names of the numeric fields in which two models differ by more than six digits explain."""
     differing = []
-    for name in sorted(n for n in dir(a) if not n.startswith(("_", "bvh", "oct", "tex", "name", "path"))):
-        x, y = getattr(a, name), getattr(b, name)
-        if isinstance(x, np.ndarray) and x.dtype.kind == "f" and x.size:
-            scale = float(np.abs(x).max())
-            if x.shape != y.shape or not np.allclose(x, y, _SIX_DIGITS["rtol"], 1e-5 * scale + _SIX_DIGITS["atol"]):
-                differing.append(name)
+    for name, x in number_fields(a).items():
+        y, scale = getattr(b, name), float(np.abs(x).max())
+        if x.shape != y.shape or not np.allclose(x, y, _SIX_DIGITS["rtol"], 1e-5 * scale + _SIX_DIGITS["atol"]):
+            differing.append(name)
     return differing
+
+
+def number_fields(model: mujoco.MjModel) -> dict[str, FloatArray]:
+    """A model's fields of floating-point numbers by name, views of its memory."""
+    named = ((name, getattr(model, name)) for name in sorted(dir(model)) if not name.startswith(NO_NUMBERS))
+    return {name: x for name, x in named if isinstance(x, np.ndarray) and x.dtype.kind == "f" and x.size}
 
 
 def _absolute_assets(spec: mujoco.MjSpec, source: str) -> None:

@@ -39,7 +39,7 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, distinct
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
-from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
+from sipe_bayes.inference.laplace.window_target import Target, WindowFit, WindowTarget
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
@@ -225,7 +225,7 @@ class MCMC(Estimator[MCMCState]):
         assert isinstance(optimum, WindowOptimum)
         return WindowFit.at(windows, optimum)
 
-    def _target(self, windows: Windows | Chain, fit: WindowFit | ChainFit) -> WindowTarget | ChainTarget:
+    def _target(self, windows: Windows | Chain, fit: WindowFit | ChainFit) -> Target:
         """The target of either likelihood: log p(theta | y) of walkers."""
         if isinstance(windows, Chain):
             assert isinstance(fit, ChainFit)
@@ -234,7 +234,7 @@ class MCMC(Estimator[MCMCState]):
         return WindowTarget(self.prior, windows, fit)
 
     def _place(
-        self, target: WindowTarget | ChainTarget, proposal: Proposal, count: int, random: np.random.RandomState
+        self, target: Target, proposal: Proposal, count: int, random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
         """Walkers (count, N) drawn from the proposal, each where the target is finite, and its values there."""
         draws = IndependentMove(proposal, self.space)
@@ -332,9 +332,7 @@ class MCMC(Estimator[MCMCState]):
         flat = np.clip(theta.reshape(-1, len(self.space)), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state.best, 0, 1), sample_stats=stats)
 
-    def _linearisation_error(
-        self, windows: Windows | Chain, target: WindowTarget | ChainTarget, walkers: FloatArray
-    ) -> float:
+    def _linearisation_error(self, windows: Windows | Chain, target: Target, walkers: FloatArray) -> float:
         """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""
         tuning = self.options.tuning
         if not windows.num_start:

@@ -42,21 +42,11 @@ def seeded(seed: int) -> Iterator[None]:
 
 
 class NoTracker:
-    """Keeps sbi from writing TensorBoard logs into the working directory: whatever it tells is dropped."""
+    """Keeps sbi from writing TensorBoard logs into the working directory."""
 
     log_dir = None
 
-    def log_metric(self, name: str, value: float, step: int | None = None) -> None:
-        """Nothing."""
+    def _nothing(self, *args: object, **kwargs: object) -> None:
+        """Whatever it is told."""
 
-    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Nothing."""
-
-    def log_params(self, params: dict[str, object]) -> None:
-        """Nothing."""
-
-    def add_figure(self, name: str, figure: object, step: int | None = None) -> None:
-        """Nothing."""
-
-    def flush(self) -> None:
-        """Nothing."""
+    log_metric = log_metrics = log_params = add_figure = flush = _nothing

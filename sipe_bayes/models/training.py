@@ -46,6 +46,10 @@ class TrainedNetwork:
     passes: int
     converged: bool
 
+    def summary(self, passes: str) -> dict[str, float]:
+        """How it went, for an estimator's diagnostics; what ``passes`` were."""
+        return {"held_out_loss": self.held_out_loss, passes: self.passes, "converged": self.converged}
+
 
 class EarlyStopping:
     """Keeps a network's weights where its held-out loss was least.

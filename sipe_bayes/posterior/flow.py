@@ -77,7 +77,6 @@ class Flow(Posterior):
         bins: of the splines.
     """
 
-    has_density: ClassVar[bool] = True
     coefficients_at_once: ClassVar[int] = 2**22  # of splines, in memory
     mode_starts: ClassVar[int] = 4  # draws that are climbed from
 

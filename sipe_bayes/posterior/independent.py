@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -24,8 +24,6 @@ _FLAT_SD = 1e3  # of the normal that stands for a uniform density: flat within t
 
 class IndependentPrior(Posterior):
     """A product of truncated normals; ``mean`` (N,) and ``sd`` (N,) before truncation, sd = inf uniform."""
-
-    has_density: ClassVar[bool] = True
 
     def __init__(self, mean: Numbers, sd: Numbers, space: ParameterSpace) -> None:
         super().__init__(space)

@@ -56,7 +56,6 @@ class GaussianMixture(Posterior):
         space: of the N parameters.
     """
 
-    has_density: ClassVar[bool] = True
     numbers_at_once: ClassVar[int] = 10_000_000  # in memory
     mode_starts: ClassVar[int] = 8  # components that are climbed from
     mode_steps: ClassVar[int] = 100  # of a climb, after which the density stands still

@@ -23,7 +23,7 @@ Deviations:
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -61,8 +61,6 @@ class SurrogatePosterior(Posterior):
         normaliser_error: its standard error.
         mixing: what ``posterior.ensemble`` says of the chains.
     """
-
-    has_density: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -127,11 +125,9 @@ class SurrogatePosterior(Posterior):
         accepted = log_acceptance(self.process, self.epsilon, theta)
         return self.prior.log_prob(theta) + accepted - self.log_normaliser
 
-    def _moments(self) -> tuple[Tensor, Tensor]:
-        return self.draws.mean(0), torch.atleast_2d(torch.cov(self.draws.T))
-
-    def _quantile(self, q: Tensor) -> Tensor:
-        return torch.quantile(self.draws, q, dim=0)
+    @property
+    def _reference(self) -> Tensor:
+        return self.draws
 
     def _mode(self) -> Tensor:
         """The best point, not the density's maximum."""

@@ -20,9 +20,9 @@ from sipe_bayes.diagnostics.records import Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Particles
 from sipe_bayes.report.colours import CHAINS, DEFAULT, HOLDOUT, MEASURED, POSTERIOR, PRIOR, STYLE
-from sipe_bayes.report.drawing import column_of_panels, equal_parts, new_figure, panel_grid, styled, ticks
-from sipe_bayes.report.legends import PRIOR_HANDLE, legend_above, line_handle, shade_handle
-from sipe_bayes.report.panels import correlation, draws, marginal, pair_grid, scale, view
+from sipe_bayes.report.drawing import column_of_panels, equal_parts, new_figure, styled, ticks
+from sipe_bayes.report.legends import line_handle, shade_handle
+from sipe_bayes.report.panels import correlation, draws, marginal_grid, pair_grid, scale, view
 from sipe_bayes.report.posterior_plots import MAX_PAIRS
 from sipe_bayes.report.signal_panels import error_panel, signal_panel, worst_stretch
 from sipe_bayes.report.words import shortened, unit_text, with_unit
@@ -110,22 +110,14 @@ def pair_names(calibration: Calibration, theta: FloatArray) -> list[str]:
 @styled
 def marginals(calibration: Calibration) -> list[Figure]:
     """One panel per parameter, nuisance ones last: posterior, prior, 90 % interval, default; the prior range above."""
-    theta = draws(calibration.posterior)
-    parts = equal_parts(ordered(calibration.parameters), SIZES.parameters)
-    return [_marginal_figure(calibration, part, theta) for part in parts]
-
-
-def _marginal_figure(calibration: Calibration, part: Sequence[ParameterSummary], theta: FloatArray) -> Figure:
-    figure, axes, _ = panel_grid(len(part), 1.85, 0.4)
-    space = calibration.posterior.space
-    for ax, summary in zip(axes, part, strict=True):
-        j = space.index(summary.name)
-        default = None if summary.default is None else float(space[j].normalise(summary.default))
-        interval = np.asarray(space[j].normalise(np.array([summary.q05, summary.q95])))
-        marginal(ax, space[j], theta[:, j], calibration.prior, interval, default)
-    shown = [line_handle(POSTERIOR, "posterior"), shade_handle(POSTERIOR, "90 % interval")]
-    legend_above(figure, [*shown, PRIOR_HANDLE, line_handle(DEFAULT, "model as given", "--")], 4)
-    return figure
+    theta, space, figures = draws(calibration.posterior), calibration.posterior.space, []
+    for part in equal_parts(ordered(calibration.parameters), SIZES.parameters):
+        columns = [space.index(summary.name) for summary in part]
+        chosen = [space[j] for j in columns]
+        ends = [p.normalise(np.array([s.q05, s.q95])) for p, s in zip(chosen, part, strict=True)]
+        shown = (chosen, theta[:, columns], calibration.prior, np.stack(ends, axis=1), [None] * len(part))
+        figures.append(marginal_grid(*shown))
+    return figures
 
 
 @styled

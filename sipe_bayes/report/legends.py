@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
@@ -38,10 +39,29 @@ def line_handle(
     )
 
 
-def look(index: int) -> tuple[str, LineStyleType, str]:
-    """Colour, line and marker of the curve with this place in the order."""
+@dataclass(frozen=True)
+class Look:
+    """How a curve is drawn: colour, line style, and a marker, empty for none."""
+
+    colour: str
+    line: LineStyleType
+    marker: str = ""
+
+    def handle(self, label: str, lw: float | None = None, ms: float = 4.0) -> Line2D:
+        """Its entry in a legend.
+
+        Args:
+            label: its words.
+            lw: line width, points.
+            ms: size of a mark, points.
+        """
+        return line_handle(self.colour, label, self.line, lw, self.marker, ms)
+
+
+def look(index: int) -> Look:
+    """Of the curve with this place in the order."""
     line: LineStyleType = "-" if index // len(CHAINS) % 2 == 0 else (0, (4, 1.5))
-    return CHAINS[index % len(CHAINS)], line, MARKERS[index % len(MARKERS)]
+    return Look(CHAINS[index % len(CHAINS)], line, MARKERS[index % len(MARKERS)])
 
 
 def shade_handle(colour: str, label: str, alpha: float = STYLE.interval) -> Patch:

@@ -14,8 +14,8 @@ from matplotlib.patches import Rectangle
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
-from sipe_bayes.report.drawing import new_figure, ticks
-from sipe_bayes.report.legends import legend_above
+from sipe_bayes.report.drawing import new_figure, panel_grid, ticks
+from sipe_bayes.report.legends import PRIOR_HANDLE, legend_above, line_handle, shade_handle
 from sipe_bayes.report.words import shortened, unit_text
 
 if TYPE_CHECKING:
@@ -154,6 +154,37 @@ def marginal(
     ax.set_xlabel(unit_text(parameter.unit) or "no unit", labelpad=1)
     ax.set_title(shortened(parameter.name, 40), pad=15, fontweight="bold")
     _prior_strip(ax, interval, default, truth)
+
+
+def reference_handles(known: Sequence[Place], default_mark: str = "", truth_mark: str = "") -> list[Artist]:
+    """Legend of the prior, the model as given, and, where one of them is ``known``, the truth."""
+    shown = [PRIOR_HANDLE, line_handle(DEFAULT, f"model as given{default_mark}", "--")]
+    return [*shown, *[line_handle(MEASURED, f"truth{truth_mark}", ":")] * any(k is not None for k in known)]
+
+
+def marginal_grid(
+    parameters: Sequence[Parameter],
+    theta: FloatArray,
+    prior: Posterior,
+    intervals: FloatArray,
+    truth: Sequence[Place],
+) -> Figure:
+    """A ``marginal`` of each of K parameters, with a legend.
+
+    Args:
+        parameters: K of them.
+        theta: draws of the posterior (M, K).
+        prior: of these and perhaps others.
+        intervals: the ends of the 90 % intervals in theta (2, K).
+        truth: in theta (K,).
+    """
+    figure, axes, _ = panel_grid(len(parameters), 1.85, 0.4)
+    for ax, parameter, column, interval, known in zip(axes, parameters, theta.T, intervals.T, truth, strict=True):
+        default = None if parameter.default is None else float(parameter.normalise(parameter.default))
+        marginal(ax, parameter, column, prior, interval, default, known)
+    shown = [line_handle(POSTERIOR, "posterior"), shade_handle(POSTERIOR, "90 % interval")]
+    legend_above(figure, [*shown, *reference_handles(truth)], 5)
+    return figure
 
 
 def _prior_density(prior: Posterior, name: str, grid: FloatArray) -> FloatArray:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -23,8 +22,8 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
 from sipe_bayes.report.drawing import new_figure, outer_labels, panel_grid, styled, ticks
-from sipe_bayes.report.legends import PRIOR_HANDLE, legend_above, line_handle, look, shade_handle
-from sipe_bayes.report.panels import Place, draws, marginal, pair_grid, scale, view_with
+from sipe_bayes.report.legends import legend_above, line_handle, look, shade_handle
+from sipe_bayes.report.panels import Place, draws, marginal_grid, pair_grid, reference_handles, scale, view_with
 from sipe_bayes.report.words import shortened, with_unit
 
 MAX_PAIRS = 8
@@ -47,13 +46,7 @@ def marginals(posterior: Posterior, prior: Posterior | None = None, truth: Array
     """
     before = default_prior(posterior.space) if prior is None else prior
     theta, known = draws(posterior), _known(posterior.space, truth)
-    figure, axes, _ = panel_grid(len(posterior.space), 1.85, 0.4)
-    for j, (ax, parameter) in enumerate(zip(axes, posterior.space, strict=True)):
-        default = None if parameter.default is None else float(parameter.normalise(parameter.default))
-        marginal(ax, parameter, theta[:, j], before, np.quantile(theta[:, j], _LEVELS), default, known[j])
-    shown = [line_handle(POSTERIOR, "posterior"), shade_handle(POSTERIOR, "90 % interval")]
-    legend_above(figure, [*shown, *_reference(known)], 5)
-    return figure
+    return marginal_grid(list(posterior.space), theta, before, np.quantile(theta, _LEVELS, axis=0), known)
 
 
 @styled
@@ -83,18 +76,12 @@ def pairs(
     columns = [space.index(name) for name in chosen]
     before = draws(default_prior(space) if prior is None else prior, 500)[:, columns]
     known, parameters = [_known(space, truth)[j] for j in columns], [space[j] for j in columns]
-    handles = [line_handle(POSTERIOR, "posterior"), *_reference(known, " (+)", " (×)")]
+    handles = [line_handle(POSTERIOR, "posterior"), *reference_handles(known, " (+)", " (×)")]
     return pair_grid(parameters, draws(posterior)[:, columns], before, [p.default for p in parameters], known, handles)
 
 
 def _known(space: ParameterSpace, truth: ArrayLike | None) -> list[Place]:
     return [None] * len(space) if truth is None else [float(x) for x in space.check_shape(truth)]
-
-
-def _reference(known: Sequence[Place], default_mark: str = "", truth_mark: str = "") -> list[Artist]:
-    """Legend of the prior, the model as given, and the truth."""
-    shown = [PRIOR_HANDLE, line_handle(DEFAULT, f"model as given{default_mark}", "--")]
-    return [*shown, *[line_handle(MEASURED, f"truth{truth_mark}", ":")] * any(k is not None for k in known)]
 
 
 # How a method gets there
@@ -127,7 +114,7 @@ def particle_paths(paths: ArrayLike, space: ParameterSpace, truth: ArrayLike | N
         _paths(ax, parameter, given[:, :, j], picked, before[:, j], known[j])
     outer_labels(axes, columns, "iteration")
     shown = [line_handle(POSTERIOR, "mean of the particles"), shade_handle(POSTERIOR, "90 % of them", 0.25)]
-    legend_above(figure, [*shown, *_reference(known)], 5)
+    legend_above(figure, [*shown, *reference_handles(known)], 5)
     return figure
 
 
@@ -178,11 +165,11 @@ def learning_curve(
         x, y = np.asarray(rollouts, float), np.atleast_2d(np.asarray(scores, float))
         if y.shape[1:] != x.shape:
             raise ValueError(f"curves[{name!r}]: expected scores (seeds, {len(x)}), got {y.shape}")
-        colour, line, marker = look(k)
-        ax.plot(x, np.median(y, axis=0), color=colour, marker=marker, ls=line, ms=4.5, lw=1.5, label=name)
+        one = look(k)
+        ax.plot(x, np.median(y, axis=0), color=one.colour, marker=one.marker, ls=one.line, ms=4.5, lw=1.5, label=name)
         lowest.append(float(np.min(y)))
         if len(y) > 2:
-            ax.fill_between(x, *np.quantile(y, (0.25, 0.75), axis=0), color=colour, alpha=0.18, lw=0)
+            ax.fill_between(x, *np.quantile(y, (0.25, 0.75), axis=0), color=one.colour, alpha=0.18, lw=0)
     for (name, value), style in zip(baselines.items(), ("--", ":", "-.", "-"), strict=False):
         ax.axhline(value, color="#666666", ls=style, lw=1.3, label=name)
     decades = min(lowest) > 0 and max(baselines.values()) > 20 * min(lowest)

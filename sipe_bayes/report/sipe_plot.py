@@ -33,7 +33,6 @@ from typing import Literal
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.typing import LineStyleType
@@ -42,7 +41,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.scores import Scores
 from sipe_bayes.report.colours import DASHED, DOTTED, STYLE
 from sipe_bayes.report.drawing import new_figure, styled
-from sipe_bayes.report.legends import legend_above, line_handle
+from sipe_bayes.report.legends import Look, legend_above
 
 Results = Mapping[str, Mapping[str, Sequence[Scores]]]
 Mode = Literal["mean", "min", "max"]
@@ -54,15 +53,6 @@ BASELINES = (BASELINE, "prior")
 
 _MEASURES: tuple[Measure, ...] = ("accuracy", "CRPS skill")
 _RANGES = {"accuracy": (0.0, 1.0), "CRPS skill": (-1.0, 1.0)}
-
-
-@dataclass(frozen=True)
-class Look:
-    """How a curve is drawn: colour, line style, and a marker, empty for a baseline."""
-
-    colour: str
-    line: LineStyleType
-    marker: str = ""
 
 
 GREEN = Look("#009E73", "-", "o")
@@ -261,12 +251,8 @@ def _rows(
             _radar(ax, [*curves[measure], *baselines[measure]], spokes, _RANGES[measure])
             ax.set_title(f"{title}: {measure}", fontweight="bold", pad=26)
     shown = [*rows[0][1][_MEASURES[0]], *baselines[_MEASURES[0]]]
-    legend_above(figure, [_handle(curve) for curve in shown], 7)
+    legend_above(figure, [curve.look.handle(curve.label, ms=4.5) for curve in shown], 7)
     return figure
-
-
-def _handle(curve: Curve) -> Line2D:
-    return line_handle(curve.look.colour, curve.label, curve.look.line, marker=curve.look.marker, ms=4.5)
 
 
 def _radar(ax: PolarAxes, curves: Sequence[Curve], spokes: Sequence[str], limits: tuple[float, float]) -> None:

@@ -19,7 +19,6 @@ from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import whole
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.envs.task import Task
 from sipe_bayes.envs.tasks.adroit import Adroit
 from sipe_bayes.rl import planning, scripted
 from sipe_bayes.rl.planning import Report
@@ -182,8 +181,7 @@ def record(
     Returns:
         The episodes, and which (B,) ended in success without diverging.
     """
-    task = simulator.environment
-    assert isinstance(task, Task)
+    task = simulator.task
     rngs = [np.random.default_rng([seed, attempt, 0, _KEY]) for attempt in attempts]
     theta, count = task.theta("default"), len(rngs)
     if draws is not None:

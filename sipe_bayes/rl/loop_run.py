@@ -22,11 +22,9 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.rl.evaluation import STARTS, evaluate
 from sipe_bayes.rl.randomization import Randomization
 from sipe_bayes.rl.settings import Settings
-from sipe_bayes.rl.train import Report, checksum
+from sipe_bayes.rl.train import REPORTED, Report, checksum
 from sipe_bayes.rl.trainer import Trainer
 from sipe_bayes.simulation.simulator import Simulator
-
-_REPORTED = 100  # control steps between two reports
 
 
 @dataclass(frozen=True)
@@ -205,7 +203,7 @@ class LoopRun:
         while self.trainer.steps < until:
             before = self.trainer.steps
             recorder.advance()
-            if report is not None and self.trainer.steps // _REPORTED > before // _REPORTED:
+            if report is not None and self.trainer.steps // REPORTED > before // REPORTED:
                 report(f"{self.task.name}: update {len(self.history)}", self.trainer.steps, self.plan.steps)
         # the estimator spends its share of the budget
         allowed = self.budget * (len(self.history) + 1) // self.plan.updates - self.spent

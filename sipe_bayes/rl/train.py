@@ -48,7 +48,7 @@ Report = Callable[[str, int, int], None]
 CHECKPOINT = "checkpoint/state.safetensors"
 COUNTS = "counts.json"
 _LATER = ("cloning", "end_hopeless")  # settings without which earlier runs go on
-_REPORTED = 100  # control steps between two reports
+REPORTED = 100  # control steps between two reports
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def train(
             log.evaluate(trainer)
         if last or now // pace.checkpoint_every > before // pace.checkpoint_every:
             log.save(trainer, fingerprint)
-        if report is not None and now // _REPORTED > before // _REPORTED:
+        if report is not None and now // REPORTED > before // REPORTED:
             report(log.line(trainer), now, steps)
     return log.finish(trainer, steps, fingerprint)
 

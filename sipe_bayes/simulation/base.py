@@ -13,6 +13,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import cores, whole
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.engine import Engine
 from sipe_bayes.simulation.model_pool import ModelPool
 
@@ -38,6 +39,16 @@ class Simulated:
 
     def __reduce__(self) -> tuple[type[Self], tuple[Environment, int]]:
         return type(self), (self.environment, self.num_threads)
+
+    @property
+    def task(self) -> Task:
+        """The benchmark's task that is simulated; raises ValueError for another environment."""
+        if not isinstance(self.environment, Task):
+            raise ValueError(
+                f"reset: {type(self.environment).__name__} has no starting states and no rewards; use rollout, or a "
+                "task of `sipe envs`"
+            )
+        return self.environment
 
     @property
     def space(self) -> ParameterSpace:

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.envs.task import Task, Transition
+from sipe_bayes.envs.task import Transition
 from sipe_bayes.simulation.base import Simulated
 from sipe_bayes.simulation.engine import Run
 
@@ -67,12 +67,7 @@ class Episodes:
         allow_outside: bool = False,
         end_hopeless: bool = False,
     ) -> None:
-        task = simulator.environment
-        if not isinstance(task, Task):
-            raise ValueError(
-                f"reset: {type(task).__name__} has no starting states and no rewards; use rollout, or a task of "
-                "`sipe envs`"
-            )
+        task = simulator.task
         if not len(generators):
             raise ValueError("count: expected at least 1, got 0")
         self.task, self.simulator, self.count = task, simulator, len(generators)

@@ -81,7 +81,42 @@ def _checked(options: Info | None, known: tuple[str, ...]) -> Info:
     return options or {}
 
 
-class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
+class _Face:
+    """What both faces share: a task, its engine, and episodes, which begin with the first reset."""
+
+    task: Task
+    simulator: Simulator
+    _episodes: Episodes | None = None
+
+    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: object = None) -> FloatArray:
+        """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
+        return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
+
+    def _give(self, chosen: IntArray, theta: FloatArray) -> None:
+        """Checked theta (n, N) to the chosen sub-environments (n,); raises ValueError for unphysical values."""
+        if self._episodes is None:
+            for row in np.unique(theta, axis=0):
+                self.simulator.written(row)
+        else:
+            self._episodes.allow_outside = True
+            self._episodes.set_theta(chosen, theta)
+
+    def _begin(self, theta: FloatArray, generators: list[np.random.Generator], fresh: BoolArray) -> Step:
+        """Begin episodes, at first all of them."""
+        if self._episodes is None:
+            self._episodes = Episodes(self.simulator, theta, generators, allow_outside=True)
+        else:
+            self._episodes.generators = generators
+            self._episodes.begin(fresh)
+        return self._episodes.first()
+
+    def _advance(self, actions: FloatArray) -> Step:
+        if self._episodes is None:
+            raise ValueError("step: nothing has begun yet; call reset first")
+        return self._episodes.step(actions)
+
+
+class SipeEnv(_Face, gymnasium.Env[FloatArray, FloatArray]):
     """A task as a single environment.
 
     ``set_parameters(theta)`` changes the simulator at once, ``reset(options={"theta": ...})`` from the new episode on.
@@ -98,7 +133,6 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.theta = self.task.theta(variant)
         self.simulator = Simulator(self.task, num_threads=1)
         self.observation_space, self.action_space = _spaces(self.task)
-        self._episodes: Episodes | None = None
 
     def set_parameters(self, theta: FloatArray, allow_outside: bool = False) -> None:
         """Give the simulator parameters.
@@ -111,11 +145,7 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
             ValueError: for another shape, NaN, or values outside that are not allowed.
         """
         theta = self.simulator.check_theta(theta, allow_outside, 1)
-        if self._episodes is None:
-            self.simulator.written(theta[0])  # raises for unphysical values
-        else:
-            self._episodes.allow_outside = True
-            self._episodes.set_theta(np.zeros(1, int), theta)
+        self._give(np.zeros(1, int), theta)
         self.theta = theta[0]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[FloatArray, Info]:
@@ -129,24 +159,13 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         options = _checked(options, ("theta", "allow_outside"))
         if "theta" in options:
             self.set_parameters(cast(FloatArray, options["theta"]), bool(options.get("allow_outside", False)))
-        if self._episodes is None:
-            self._episodes = Episodes(self.simulator, self.theta, [self.np_random], allow_outside=True)
-        else:
-            self._episodes.generators = [self.np_random]
-            self._episodes.begin(np.ones(1, bool))
-        return self._single(self._episodes.first())
+        return self._single(self._begin(self.theta, [self.np_random], np.ones(1, bool)))
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, Info]:
         """One control step with an action (A,); raises ValueError before the first ``reset``."""
-        if self._episodes is None:
-            raise ValueError("step: nothing has begun yet; call reset first")
-        step = self._episodes.step(np.asarray(action, float)[None])
+        step = self._advance(np.asarray(action, float)[None])
         observation, info = self._single(step)
         return observation, float(step.rewards[0]), bool(step.terminated[0]), bool(step.truncated[0]), info
-
-    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: object = None) -> FloatArray:
-        """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
-        return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
 
     @staticmethod
     def _single(step: Step) -> tuple[FloatArray, Info]:
@@ -154,7 +173,7 @@ class SipeEnv(gymnasium.Env[FloatArray, FloatArray]):
         return step.observations[0], {k: bool(v) if v.dtype == bool else v for k, v in info.items()}
 
 
-class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
+class SipeVectorEnv(_Face, VectorEnv[FloatArray, FloatArray, FloatArray]):
     """Sub-environments of a task, all in one native call a step. Autoreset: NEXT_STEP.
 
     Args:
@@ -180,7 +199,6 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self.single_observation_space, self.single_action_space = _spaces(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._episodes: Episodes | None = None
         self._generators: list[np.random.Generator] = []
 
     def set_parameters(
@@ -198,12 +216,7 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         """
         chosen = self._chosen("lanes", lanes)
         theta = self.simulator.check_theta(theta, allow_outside, len(chosen))
-        if self._episodes is not None:
-            self._episodes.allow_outside = True
-            self._episodes.set_theta(chosen, theta)
-        else:
-            for row in np.unique(theta, axis=0):
-                self.simulator.written(row)  # raises for unphysical values
+        self._give(chosen, theta)
         self.theta[chosen] = theta
 
     def _chosen(self, name: str, chosen: IntArray | BoolArray | None) -> IntArray:
@@ -239,12 +252,7 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         elif seed is not None:
             for i in chosen:
                 self._generators[i] = np.random.default_rng(seeds[i])
-        if self._episodes is None:
-            self._episodes = Episodes(self.simulator, self.theta, self._generators, allow_outside=True)
-        else:
-            self._episodes.generators = self._generators
-            self._episodes.begin(np.isin(np.arange(self.num_envs), chosen))
-        step = self._episodes.first()
+        step = self._begin(self.theta, self._generators, np.isin(np.arange(self.num_envs), chosen))
         return step.observations, self._marked(step)
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -261,14 +269,8 @@ class SipeVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self, actions: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, Info]:
         """One control step of all with actions (B, A); raises ValueError before the first ``reset``."""
-        if self._episodes is None:
-            raise ValueError("step: nothing has begun yet; call reset first")
-        step = self._episodes.step(actions)
+        step = self._advance(actions)
         return step.observations, step.rewards, step.terminated, step.truncated, self._marked(step)
-
-    def compute_reward(self, achieved: FloatArray, goals: FloatArray, info: object = None) -> FloatArray:
-        """Rewards (...,) of achieved and desired goals (..., G), for hindsight relabelling."""
-        return self.task.goal_reward(np.asarray(achieved), np.asarray(goals))
 
     def _marked(self, step: Step) -> Info:
         """Gymnasium's form: with every entry those that it holds for."""

@@ -6,7 +6,6 @@ Records or rows in, one Matplotlib figure out, no pyplot, no state.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +19,7 @@ from sipe_bayes.benchmark.transfer.study import PRIOR as PRIOR_NAME
 from sipe_bayes.benchmark.transfer.study import TRUTH, Point, TransferRecord
 from sipe_bayes.report.colours import CHAINS, DASHED, DEFAULT, MEASURED, PRIOR, STYLE
 from sipe_bayes.report.drawing import new_figure, styled
+from sipe_bayes.report.legends import Look
 
 _COLOURS = {"truth": MEASURED, "prior": PRIOR, "default": DEFAULT}
 
@@ -110,14 +110,6 @@ def _legend(figure: Figure, drawn: Mapping[str, Line2D], names: Sequence[str]) -
         frameon=False,
         title="mean over seeds; shade: their range",
     )
-
-
-@dataclass(frozen=True)
-class Look:
-    """Of a randomisation's curve."""
-
-    colour: str
-    line: LineStyleType
 
 
 def _curve(axes: Axes, mine: Sequence[Sequence[Point]], look: Look) -> Line2D:

@@ -99,6 +99,7 @@ class HalfCheetah(LinkTask):
 
     frame_skip = 5
     num_actions = 6
+    start_noise = _PUBLISHED.noise
     channels = ("torso_z", *(f"{j}_angle" for j in _JOINTS[2:]), *(f"{j}_velocity" for j in _JOINTS))
 
     def compile(self) -> mujoco.MjModel:
@@ -120,11 +121,9 @@ class HalfCheetah(LinkTask):
         forward = (step.next_states[..., _X] - step.states[..., _X]) / _PUBLISHED.step
         return np.asarray(forward - _PUBLISHED.control_cost * np.einsum("...a,...a->...", step.actions, step.actions))
 
-    def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, None]:
-        """The published draw: uniform positions, normal velocities."""
-        model = self.published
-        qpos = model.qpos0 + rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nq))
-        return self.states(qpos, _PUBLISHED.noise * rng.standard_normal((count, model.nv))), None
+    def initial_velocities(self, rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
+        """Normal (count, nv), as published."""
+        return _PUBLISHED.noise * rng.standard_normal(shape)
 
 
 def links() -> HalfCheetah:

@@ -50,6 +50,7 @@ class Hopper(LinkTask):
 
     frame_skip = 4
     num_actions = 3
+    start_noise = _PUBLISHED.noise
     channels = ("torso_z", *(f"{j}_angle" for j in _JOINTS[2:]), *(f"{j}_velocity" for j in _JOINTS))
 
     def compile(self) -> mujoco.MjModel:
@@ -80,12 +81,6 @@ class Hopper(LinkTask):
         states = step.next_states
         upright = (states[..., _Z] > _PUBLISHED.lowest) & (np.abs(states[..., _PITCH]) < _PUBLISHED.steepest)
         return np.asarray(~(upright & (np.abs(states[..., _PITCH : _VELOCITIES.stop]) < _PUBLISHED.largest).all(-1)))
-
-    def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, None]:
-        """The published draw: uniform."""
-        model = self.published
-        qpos = model.qpos0 + rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nq))
-        return self.states(qpos, rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nv))), None
 
 
 def hopper() -> Hopper:

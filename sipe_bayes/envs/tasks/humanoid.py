@@ -140,6 +140,7 @@ class Humanoid(LinkTask):
     num_actions = 17
     needs_derived = True
     derived_late = True
+    start_noise = _PUBLISHED.noise
     data_fields = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext", "subtree_com")
 
     def compile(self) -> mujoco.MjModel:
@@ -191,12 +192,6 @@ class Humanoid(LinkTask):
         """Fallen, as the published class ends an episode."""
         return ~_upright(states)
 
-    def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
-        """The published draw: uniform."""
-        model = self.published
-        qpos = model.qpos0 + rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nq))
-        return self.states(qpos, rng.uniform(-_PUBLISHED.noise, _PUBLISHED.noise, (count, model.nv))), None
-
     def bind(self, target: str) -> Target:
         """As every task's; a joint without a spring gets one that stands for none."""
         return super().bind(target) if target.startswith("link:") else _bind(self.published, target)
@@ -221,10 +216,6 @@ def _bind(model: mujoco.MjModel, target: str) -> Target:
     return replace(bound, value=_NO_SPRING) if not bound.value and target.endswith(".stiffness") else bound
 
 
-def _parameter(model: mujoco.MjModel, name: str, target: str, unit: str, description: str) -> Parameter:
-    return scaled(name, _bind(model, target).value, [target], unit, description)
-
-
 def _joint_parameters(model: mujoco.MjModel, joint: str) -> list[Parameter]:
     """Damping, stiffness and gear of a joint."""
     side, _, kind = joint.partition("_") if joint not in _MOVES else ("", "", joint)
@@ -235,24 +226,17 @@ def _joint_parameters(model: mujoco.MjModel, joint: str) -> list[Parameter]:
         else f"The published joint that {moves} has no spring: 0.001 stands for none, too little to be seen in a log. "
         "The posterior should stay the prior."
     )
-    return [
-        _parameter(
-            model,
-            f"{joint}_damping",
-            f"joint:{joint}.damping",
-            "N m s/rad",
-            f"Brakes the joint that {moves} in proportion to its speed. In fast motion it trades off against the gear.",
-        ),
-        _parameter(model, f"{joint}_stiffness", f"joint:{joint}.stiffness", "N m/rad", spring),
-        _parameter(
-            model,
-            f"{joint}_gear",
-            f"actuator:{joint}.gear",
-            "N m",
-            f"Torque of the joint that {moves} for a unit action. Raised together with damping and stiffness it "
-            "changes little but how the joint answers to inertia and contacts.",
-        ),
-    ]
+    brake = f"Brakes the joint that {moves} in proportion to its speed. In fast motion it trades off against the gear."
+    motor = (
+        f"Torque of the joint that {moves} for a unit action. Raised together with damping and stiffness it changes "
+        "little but how the joint answers to inertia and contacts."
+    )
+    kinds = (
+        ("damping", f"joint:{joint}.damping", "N m s/rad", brake),
+        ("stiffness", f"joint:{joint}.stiffness", "N m/rad", spring),
+        ("gear", f"actuator:{joint}.gear", "N m", motor),
+    )
+    return [scaled(f"{joint}_{kind}", _bind(model, on).value, [on], unit, text) for kind, on, unit, text in kinds]
 
 
 def _humanoid(

@@ -29,6 +29,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -281,7 +282,22 @@ def _ride(
 
 
 class LinkTask(Task):
-    """A task whose parameters may be links. A body whose link is a parameter has no parameter for its mass."""
+    """A task whose parameters may be links. A body whose link is a parameter has no parameter for its mass.
+
+    ``start_noise``: half-width of the starting states' uniform distribution about the model's own.
+    """
+
+    start_noise: ClassVar[float]
+
+    def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
+        """The published draw: uniform positions, then velocities."""
+        shape = count, self.published.nq
+        qpos = self.published.qpos0 + rng.uniform(-self.start_noise, self.start_noise, shape)
+        return self.states(qpos, self.initial_velocities(rng, (count, self.published.nv))), None
+
+    def initial_velocities(self, rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
+        """Uniform (count, nv), as published of most robots."""
+        return rng.uniform(-self.start_noise, self.start_noise, shape)
 
     @cached_property
     def links(self) -> Links | None:

@@ -102,7 +102,7 @@ class BayesSim(Rounds[TrainedNetwork]):
         inputs = from_numpy(self._inputs(trajectories.observations[None], trajectories))
         if not inputs.isfinite().any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
-        self.diagnostics.update(held_out_loss=learned.held_out_loss, epochs=learned.passes, converged=learned.converged)
+        self.diagnostics |= learned.summary("epochs")
         return GaussianMixture(*network.mixture(inputs), self.space)
 
     def _inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> NDArray[np.float32]:

@@ -240,9 +240,7 @@ class MAML(PriorSampling[MAMLState, TrainedNetwork]):
     def infer(self, learned: TrainedNetwork, trajectories: Trajectories) -> Dirac:
         """The network's estimate."""
         steps = recorded_steps(trajectories)
-        self.diagnostics.update(
-            held_out_loss=learned.held_out_loss, iterations=learned.passes, converged=learned.converged
-        )
+        self.diagnostics |= learned.summary("iterations")
         return Dirac(_estimate(self._restored(Adapted(learned.weights), steps), steps), self.space)
 
     def _adapted(self, state: MAMLState) -> Adapted:

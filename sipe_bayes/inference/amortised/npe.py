@@ -149,8 +149,8 @@ class NPE(Rounds[TrainedFlow]):
             )
         if self.options.embedding == "transitions" and not x.isfinite().any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
-        told = ("simulations", "epochs", "validation_loss", "converged")
-        self.diagnostics.update({name: getattr(learned, name) for name in told})
+        names = ("simulations", "epochs", "validation_loss", "converged")
+        self.diagnostics |= {name: getattr(learned, name) for name in names}
         embedding = self._embedding(x.shape[-1])
         embedding.load_state_dict(_part(learned.weights, "_embedding_net."))
         with torch.no_grad():

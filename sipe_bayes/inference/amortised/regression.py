@@ -94,9 +94,7 @@ class Regression(PriorSampling[PriorSamplingState[TrainedNetwork], TrainedNetwor
         restore(network, learned.weights)
         with torch.no_grad():
             estimate = network.map(network.inputs(steps)).double().mean(0)
-        self.diagnostics.update(
-            held_out_loss=learned.held_out_loss, iterations=learned.passes, converged=learned.converged
-        )
+        self.diagnostics |= learned.summary("iterations")
         return Dirac(estimate.clamp(0, 1), self.space)
 
 

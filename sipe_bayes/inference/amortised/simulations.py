@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -58,11 +58,7 @@ class Simulations:
     @staticmethod
     def joined(parts: Sequence[Simulations]) -> Simulations:
         """Several, one after the other."""
-        return Simulations(
-            np.concatenate([part.theta for part in parts]),
-            np.concatenate([part.observations for part in parts]),
-            np.concatenate([part.valid for part in parts]),
-        )
+        return Simulations(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Simulations)))
 
 
 class Cache:

@@ -15,6 +15,7 @@ theta; exact for white noise of one channel whose starts are known.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,8 +48,36 @@ class WindowFit:
         return cls(optimum, jacobian)
 
 
-class WindowTarget:
-    """log p(theta | y) of points (B, N), up to a constant; minus infinity outside the cube and where one diverges."""
+class Target(ABC):
+    """log p(theta | y), starts or states marginalised; a subclass writes the likelihood of one kind of logs."""
+
+    prior: Posterior
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Values (B,) of points (B, N), up to a constant; minus infinity outside the cube and where one diverges."""
+        out = np.full(len(points), -np.inf)
+        inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
+        if len(inside):
+            theta = points[inside]
+            out[inside] = self.log_likelihood(theta) + self.prior.log_prob(torch.from_numpy(theta)).numpy()
+        return np.where(np.isnan(out), -np.inf, out)
+
+    @abstractmethod
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Of points (B, N) in the cube (B,), minus infinity where one diverges."""
+
+    @property
+    @abstractmethod
+    def check_cost(self) -> int:
+        """Rollouts of a log to hold ``refreshed`` against the target."""
+
+    @abstractmethod
+    def refreshed(self, point: FloatArray) -> float:
+        """The target at one point (N,) with the Jacobians taken there, after steps of starts or states."""
+
+
+class WindowTarget(Target):
+    """Of windows: one simulation of the logs a value."""
 
     def __init__(self, prior: Posterior, windows: Windows, fit: WindowFit) -> None:
         self.prior, self.windows, self.fit = prior, windows, fit
@@ -64,20 +93,13 @@ class WindowTarget:
         moved = np.einsum("wdn,bn->bwd", optimum.slope, theta - optimum.theta)
         return np.asarray(optimum.starts - moved)
 
-    def __call__(self, points: FloatArray) -> FloatArray:
-        """Log densities (B,) of points (B, N)."""
-        out = np.full(len(points), -np.inf)
-        inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
-        if not len(inside):
-            return out
-        theta = points[inside]
-        starts = self.starts(theta)
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """See ``Target``."""
+        starts, out = self.starts(theta), np.full(len(theta), -np.inf)
         residuals, valid = self.windows.residuals(theta, starts)
-        good = np.flatnonzero(valid)
-        prior = self.prior.log_prob(torch.from_numpy(theta)).numpy()
-        for k in good:
-            out[inside[k]] = prior[k] + self._integrated(residuals[k], self.fit.jacobian, starts[k])[0]
-        return np.where(np.isnan(out), -np.inf, out)
+        for k in np.flatnonzero(valid):
+            out[k] = self._integrated(residuals[k], self.fit.jacobian, starts[k])[0]
+        return out
 
     def _integrated(self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray) -> tuple[float, FloatArray]:
         """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), and the best change of the starts (W, D).
@@ -96,11 +118,11 @@ class WindowTarget:
 
     @property
     def check_cost(self) -> int:
-        """Rollouts of a log to hold ``refreshed`` against the target."""
+        """See ``Target``."""
         return 2 * self.windows.num_start + 3
 
     def refreshed(self, point: FloatArray) -> float:
-        """The target at one point (N,) with the starts' Jacobian taken there, after one step of the starts."""
+        """See ``Target``; after one step of the starts."""
         starts, value = self.starts(point[None])[0], -np.inf
         for _ in range(2):  # a step, then the value
             lin = self.windows.linearise(point, starts, with_theta=False)

@@ -15,6 +15,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
+from sipe_bayes.inference.laplace.window_target import Target
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare, linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import (
@@ -48,8 +49,8 @@ class ChainFit:
         return cls(optimum, linear)
 
 
-class ChainTarget:
-    """log p(theta | y) of walkers (B, N), up to the prior's constant.
+class ChainTarget(Target):
+    """Of a chain of states.
 
     Args:
         prior: on theta.
@@ -67,36 +68,26 @@ class ChainTarget:
         away = np.einsum("kdn,bn->bkd", self.optimum.slope, theta - self.optimum.theta)
         return self.chain.moved(self.optimum.states, -away)
 
-    def __call__(self, points: FloatArray) -> FloatArray:
-        """Values (B,) at points (B, N); minus infinity outside the cube and where a simulation diverges."""
-        out = np.full(len(points), -np.inf)
-        inside = np.flatnonzero(((points >= 0) & (points <= 1)).all(1))
-        if not len(inside):
-            return out
-        theta = points[inside]
-        compared = compare(self.chain, theta, self.states(theta), self.fit)
-        valid = [k for k, one in enumerate(compared) if one is not None]
-        if not valid:
-            return out
-        values = self._marginal([one for one in compared if one is not None])
-        out[inside[valid]] = values + self.prior.log_prob(torch.from_numpy(theta[valid])).numpy()
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """See ``Target``; by comparisons that share the optimum's Jacobians."""
+        every, out = compare(self.chain, theta, self.states(theta), self.fit), np.full(len(theta), -np.inf)
+        valid = {k: one for k, one in enumerate(every) if one is not None}
+        if valid:
+            forces = np.stack([pull(one, self.noise).ravel() for one in valid.values()], axis=1)
+            gains = (forces * self.solved.solve(forces)).sum(0)
+            solved = [replace(self.solved, explained=float(g)) for g in gains]
+            pairs = zip(valid.values(), solved, strict=True)
+            out[list(valid)] = [log_likelihood(one, self.noise, s) for one, s in pairs]
         return out
-
-    def _marginal(self, compared: list[ChainLinearisation]) -> FloatArray:
-        """Values log p(y | theta) of comparisons that share the optimum's Jacobians."""
-        forces = np.stack([pull(one, self.noise).ravel() for one in compared], axis=1)
-        gains = (forces * self.solved.solve(forces)).sum(0)
-        solved = [replace(self.solved, explained=float(g)) for g in gains]
-        return np.array([log_likelihood(one, self.noise, s) for one, s in zip(compared, solved, strict=True)])
 
     @property
     def check_cost(self) -> int:
-        """Rollouts of a log to hold ``refreshed`` against the target."""
+        """See ``Target``."""
         sides = 2 if self.optimum.state_step.any() else 1
         return 1 + _STEPS * (1 + sides * (self.chain.num_theta + self.chain.num_start))
 
     def refreshed(self, point: FloatArray) -> float:
-        """The target at one point (N,) with the Jacobians taken there, after steps of the states alone."""
+        """See ``Target``; after steps of the states alone."""
         states = self.states(point[None])[0]
         value = -np.inf
         for _ in range(_STEPS):
