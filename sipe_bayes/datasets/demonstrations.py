@@ -168,14 +168,7 @@ def _placed(env: Environment, variant: Variant | None) -> tuple[Simulator, Float
 
 
 def _stored(
-    simulator: Simulator,
-    theta: FloatArray,
-    split: Split,
-    type: Agent,
-    count: int,
-    seed: int,
-    steps: int,
-    folder: Path,
+    simulator: Simulator, theta: FloatArray, split: Split, type: Agent, count: int, seed: int, steps: int, folder: Path
 ) -> Trajectories | None:
     """What a folder of trajectory sets holds of it, or None."""
     task = simulator.task

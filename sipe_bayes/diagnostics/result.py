@@ -32,12 +32,7 @@ FLAGS: Mapping[Code, str] = {
 }
 """Findings about single parameters, and the flag that result.json has for them."""
 NUISANCE = "nuisance"
-_PROCESS_NOISE = (
-    Code.PROCESS_NOISE,
-    Code.PROCESS_OUTLIERS,
-    Code.PROCESS_NOISE_SMALL,
-    Code.PROCESS_NOISE_LARGE,
-)
+_PROCESS_NOISE = (Code.PROCESS_NOISE, Code.PROCESS_OUTLIERS, Code.PROCESS_NOISE_SMALL, Code.PROCESS_NOISE_LARGE)
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,7 @@ _SENSOR_UNITS = {
     "N": (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_TOUCH),
     "N m": (mujoco.mjtSensor.mjSENS_TORQUE, mujoco.mjtSensor.mjSENS_JOINTACTFRC),
 }
-_OF_JOINTS = (
-    mujoco.mjtSensor.mjSENS_JOINTPOS,
-    mujoco.mjtSensor.mjSENS_JOINTVEL,
-    mujoco.mjtSensor.mjSENS_JOINTACTFRC,
-)
+_OF_JOINTS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL, mujoco.mjtSensor.mjSENS_JOINTACTFRC)
 
 
 @dataclass(frozen=True)

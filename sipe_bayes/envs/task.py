@@ -226,13 +226,7 @@ class Task(Environment):
 
 
 def scaled(
-    name: str,
-    default: float,
-    targets: Sequence[str],
-    unit: str,
-    description: str,
-    low: float = 0.5,
-    high: float = 1.5,
+    name: str, default: float, targets: Sequence[str], unit: str, description: str, low: float = 0.5, high: float = 1.5
 ) -> Parameter:
     """A parameter whose published value is theta = 0.5.
 

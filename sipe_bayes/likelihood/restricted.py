@@ -41,11 +41,7 @@ class Pulls:
 
 
 def eliminate_starts(
-    normal: FloatArray,
-    num_theta: int,
-    start_precision: FloatArray,
-    start_pull: FloatArray,
-    damping: float = 0.0,
+    normal: FloatArray, num_theta: int, start_precision: FloatArray, start_pull: FloatArray, damping: float = 0.0
 ) -> Eliminated:
     """Normal equations of theta with the windows' starts marginalised.
 
@@ -145,13 +141,7 @@ def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[flo
 
 
 def estimate_noise(
-    moments: Moments,
-    noise: Noise,
-    pulls: Pulls,
-    fixed_sd: FloatArray,
-    coloured: bool,
-    shortest: float,
-    longest: float,
+    moments: Moments, noise: Noise, pulls: Pulls, fixed_sd: FloatArray, coloured: bool, shortest: float, longest: float
 ) -> Noise:
     """Noise that maximises the restricted likelihood.
 

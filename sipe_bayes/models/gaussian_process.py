@@ -138,12 +138,7 @@ class GaussianProcess:
 
 
 def fit_gaussian_process(
-    x: Tensor,
-    y: Tensor,
-    seed: int = 0,
-    previous: GaussianProcess | None = None,
-    iterations: int = 60,
-    most: int = 300,
+    x: Tensor, y: Tensor, seed: int = 0, previous: GaussianProcess | None = None, iterations: int = 60, most: int = 300
 ) -> GaussianProcess:
     """The Gaussian process of some points, its hyper-parameters fitted.
 

@@ -19,10 +19,7 @@ MOST_STEPS = 200  # of a simulation that are looked at, spread evenly
 
 
 def control_steps(
-    observations: NDArray[np.floating],
-    actions: FloatArray,
-    length: IntArray,
-    most: int | None = MOST_STEPS,
+    observations: NDArray[np.floating], actions: FloatArray, length: IntArray, most: int | None = MOST_STEPS
 ) -> Float32Array:
     """Control steps of n simulations, or of a log.
 

@@ -163,11 +163,7 @@ def reference_handles(known: Sequence[Place], default_mark: str = "", truth_mark
 
 
 def marginal_grid(
-    parameters: Sequence[Parameter],
-    theta: FloatArray,
-    prior: Posterior,
-    intervals: FloatArray,
-    truth: Sequence[Place],
+    parameters: Sequence[Parameter], theta: FloatArray, prior: Posterior, intervals: FloatArray, truth: Sequence[Place]
 ) -> Figure:
     """A ``marginal`` of each of K parameters, with a legend.
 

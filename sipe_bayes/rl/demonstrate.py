@@ -131,12 +131,7 @@ def facts_of(path: Path) -> dict[str, object]:
 
 
 def demonstrate(
-    simulator: Simulator,
-    act: Demonstrator,
-    count: int,
-    seed: int = 0,
-    draws: Draws | None = None,
-    patience: int = 10,
+    simulator: Simulator, act: Demonstrator, count: int, seed: int = 0, draws: Draws | None = None, patience: int = 10
 ) -> Demonstrations:
     """The first successful episodes.
 

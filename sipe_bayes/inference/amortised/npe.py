@@ -126,11 +126,7 @@ class NPE(Rounds[TrainedFlow]):
         line = to_line(from_numpy(simulations.theta))
         mean, sd = line.mean(0), line.std(0).clamp_min(1e-6)
         x = from_numpy(self._features(simulations.observations, trajectories))
-        with (
-            seeded(seed_integer([self.seed, 4])),
-            warnings.catch_warnings(),
-            contextlib.redirect_stdout(io.StringIO()),
-        ):
+        with seeded(seed_integer([self.seed, 4])), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             net, summary = self._optimise(((line - mean) / sd).float(), x)
         epochs = int(summary["epochs_trained"][-1])

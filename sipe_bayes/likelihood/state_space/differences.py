@@ -45,11 +45,7 @@ def compare(
 
 
 def _compared(
-    chain: Chain,
-    states: FloatArray,
-    predicted: FloatArray,
-    ends: FloatArray,
-    slopes: ChainLinearisation | None = None,
+    chain: Chain, states: FloatArray, predicted: FloatArray, ends: FloatArray, slopes: ChainLinearisation | None = None
 ) -> ChainLinearisation:
     """Residual, jump and offset of states (K, S) with predictions (K, C) and ends of control steps (K, S)."""
     none = np.empty(0)

@@ -39,12 +39,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
 )
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.differences import linearise_by
-from sipe_bayes.likelihood.state_space.linearisation import (
-    ChainLinearisation,
-    ChainNoise,
-    eliminate_states,
-    restricted,
-)
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,7 @@ from sipe_bayes.likelihood.minimise import damped_box_step
 from sipe_bayes.likelihood.noise_level import NORMAL_MAD
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.chain import Chain
-from sipe_bayes.likelihood.state_space.linearisation import (
-    ChainLinearisation,
-    ChainNoise,
-    eliminate_states,
-    restricted,
-)
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
 
 
 def infer_noise(

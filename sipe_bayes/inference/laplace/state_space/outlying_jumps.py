@@ -42,11 +42,7 @@ def rarity(noise: ChainNoise, tuning: OutlierTuning) -> float:
 
 
 def needed(
-    linear: ChainLinearisation,
-    noise: ChainNoise,
-    prior: QuadraticPrior,
-    theta: FloatArray,
-    tuning: OutlierTuning,
+    linear: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray, tuning: OutlierTuning
 ) -> BoolArray:
     """Of the outliers (K-1,) those that have to be: the others are made regular, first the one that gains most."""
     outliers = np.zeros(len(linear.linked), bool) if noise.outliers is None else noise.outliers.copy()
@@ -60,11 +56,7 @@ def needed(
 
 
 def regular_gains(
-    linear: ChainLinearisation,
-    noise: ChainNoise,
-    prior: QuadraticPrior,
-    theta: FloatArray,
-    tuning: OutlierTuning,
+    linear: ChainLinearisation, noise: ChainNoise, prior: QuadraticPrior, theta: FloatArray, tuning: OutlierTuning
 ) -> FloatArray:
     """Nats (J,) of evidence that each of J outliers gains when made regular, exact for one linearisation.
 

@@ -20,12 +20,7 @@ from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, border
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, StrategyState
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare
-from sipe_bayes.likelihood.state_space.linearisation import (
-    ChainLinearisation,
-    ChainNoise,
-    eliminate_states,
-    restricted,
-)
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
 
 
 class Phase(StrEnum):

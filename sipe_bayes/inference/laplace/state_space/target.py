@@ -18,12 +18,7 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.window_target import Target
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare, linearise_by
-from sipe_bayes.likelihood.state_space.linearisation import (
-    ChainLinearisation,
-    eliminate_states,
-    log_likelihood,
-    pull,
-)
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, eliminate_states, log_likelihood, pull
 from sipe_bayes.posterior import Posterior
 
 _STEPS = 2  # of the states, before a fresh linearisation is compared: Gauss-Newton's second is below rounding
