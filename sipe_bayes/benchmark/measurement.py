@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
 
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.executors.work import Done
 from sipe_bayes.benchmark.records import Record
+from sipe_bayes.core.files import installed_version
 
 R = TypeVar("R", bound=Record)
 T = TypeVar("T")
@@ -153,13 +153,7 @@ class Clock:
 
 def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str]:
     """Of this package and those that numbers depend on, "" for one that is not installed."""
-    installed = {}
-    for package in packages:
-        try:
-            installed[package] = version(package)
-        except PackageNotFoundError:
-            installed[package] = ""
-    return installed
+    return {package: installed_version(package) for package in packages}
 
 
 @cache

@@ -24,7 +24,7 @@ from sipe_bayes.benchmark.measurement import Measurement
 from sipe_bayes.benchmark.records import Record, plan
 from sipe_bayes.benchmark.run_log import Run, read_runs, write_runs
 from sipe_bayes.benchmark.transfer.study import TransferRecord
-from sipe_bayes.core.files import OutputError, write_bytes
+from sipe_bayes.core.files import OutputError, not_a_file, write_bytes
 
 _LOCK = ".lock"
 Report = Callable[[str], None]
@@ -107,12 +107,6 @@ def simulate(which: Bank, budget: int, order: Order) -> int:
         if units:
             _carried_out(units, order)
         return len(units)
-
-
-def not_a_file(folder: Path) -> None:
-    """Raises OutputError where the folder to write into is a file."""
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import platform
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.calibration.problem import RUN, Problem
-from sipe_bayes.core.files import OutputError, replacing, to_json, write_text
+from sipe_bayes.core.files import OutputError, installed_version, not_a_file, replacing, to_json, write_text
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
@@ -41,19 +40,12 @@ def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None
         "seed": seed,
         "budget": budget,
         "configuration": config.model_dump(mode="json", by_alias=True),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}},
+        "versions": {"python": platform.python_version(), **{name: installed_version(name) for name in _PACKAGES}},
     }
 
 
 def _checksum(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return ""
 
 
 _IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
@@ -81,8 +73,7 @@ def claim(
     Raises:
         OutputError: when it holds another run.
     """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+    not_a_file(folder)
     record, content = folder / file, to_json(own, indent=2)
     if record.is_file():
         try:

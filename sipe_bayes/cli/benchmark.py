@@ -46,7 +46,7 @@ def report(
     with exit_on_error():
         from sipe_bayes.benchmark.report_contents import contents
         from sipe_bayes.benchmark.report_latex import write_reports
-        from sipe_bayes.benchmark.run import not_a_file
+        from sipe_bayes.core.files import not_a_file
 
         target = out or folder
         not_a_file(target)

@@ -91,8 +91,8 @@ def report(
 ) -> None:
     """transfer.md, transfer.csv, the bars of the paper's Figure 6 and learning curves."""
     with exit_on_error():
-        from sipe_bayes.benchmark.run import not_a_file
         from sipe_bayes.benchmark.transfer.report import write
+        from sipe_bayes.core.files import not_a_file
 
         if out is not None:
             not_a_file(out)

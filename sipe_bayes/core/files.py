@@ -8,6 +8,7 @@ import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,20 @@ def write_text(path: Path, text: str) -> None:
 
 class OutputError(ValueError):
     """An output folder that cannot be used."""
+
+
+def not_a_file(folder: Path) -> None:
+    """Raises OutputError where the folder to write into is a file."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+
+
+def installed_version(package: str) -> str:
+    """Of a Python package, for the records of a run; "" where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
 
 
 def to_json(data: object, indent: int | None = None) -> str:
