@@ -120,7 +120,8 @@ def _parameter_rows(
 ) -> Figure:
     """A panel per estimator, ``row`` inches high; few parameters leave room for several side by side."""
     names = [shortened(name, 26) for name in next(iter(rows.values()))[0].names]
-    undetermined = _undetermined(rows)
+    known = [r.determined for mine in rows.values() for r in mine if r.determined is not None]
+    undetermined = np.flatnonzero(~np.any(known, axis=0)).tolist() if known else []  # by no seed's log
     many = len(names) > 8
     columns = 1 if many else 2 if len(names) > 3 else 3
     lines = -(-len(rows) // columns)
@@ -142,12 +143,6 @@ def _parameter_rows(
     grey = Patch(color="#e2e5e8", lw=0, label="not determined by the log")
     legend_above(figure, [*handles, grey] if undetermined else handles, 5)
     return figure
-
-
-def _undetermined(rows: Mapping[str, Sequence[Record]]) -> list[int]:
-    """Parameters that no seed's log determines."""
-    known = [r.determined for mine in rows.values() for r in mine if r.determined is not None]
-    return [int(j) for j in np.flatnonzero(~np.any(known, axis=0))] if known else []
 
 
 # Scores along something

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from sipe_bayes.benchmark import bank
@@ -65,7 +64,8 @@ class EstimateMeasurement(Measurement[Record]):
         log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
         simulator = Simulator(make_task(cell.task), num_threads=1)
         if cell.estimator in BASELINES:
-            posterior, record = _baseline(cell, simulator), replace(record, seconds=0.0, cpu_seconds=0.0)
+            record, space = replace(record, seconds=0.0, cpu_seconds=0.0), simulator.space
+            posterior: Posterior = prior(space) if cell.estimator == "prior" else Dirac([0.5] * len(space), space)
         elif cell.with_policy:
             posterior, record = _with_policy(cell, record, simulator, folder / self.trained_in(cell))
         else:
@@ -90,11 +90,6 @@ class EstimateMeasurement(Measurement[Record]):
 
 
 ESTIMATES = EstimateMeasurement()
-
-
-def _baseline(cell: Cell, simulator: Simulator) -> Posterior:
-    space = simulator.space
-    return prior(space) if cell.estimator == "prior" else Dirac(np.full(len(space), 0.5), space)
 
 
 def _estimator(cell: Cell, simulator: Simulator, **settings: object) -> Estimator:

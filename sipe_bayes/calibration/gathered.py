@@ -68,7 +68,7 @@ class Marginals:
             ridges: whose members are open by themselves, which is then worth no more than a note.
         """
         on_ridge = {name for ridge in ridges for name in ridge.parameters}
-        noticed = []
+        noticed, near = [], THRESHOLDS.at_bound * np.minimum(1.0, THRESHOLDS.bound_sds * self.sd)
         for j, p in enumerate(self.space):
             about = functools.partial(finding, parameters=[p.name], unit=p.unit)
             pieces = dead.get(p.name, [])
@@ -82,15 +82,11 @@ class Marginals:
                 severity = Severity.NOTE if idle or p.name in on_ridge else Severity.CAUTION
                 contraction = float(self.contraction[j])
                 noticed.append(about(Code.NOT_DETERMINED, severity=severity, contraction=contraction))
-            elif self._at_bound(j):
+            elif min(self.theta[j], 1 - self.theta[j]) < near[j]:
                 value = float(p.value(float(self.theta[j])))
                 bound = p.low if value - p.low < p.high - value else p.high
                 noticed.append(about(Code.MODE_AT_BOUND, bound=bound))
         return noticed
-
-    def _at_bound(self, j: int) -> bool:
-        near = THRESHOLDS.at_bound * min(1.0, THRESHOLDS.bound_sds * self.sd[j])
-        return bool(min(self.theta[j], 1 - self.theta[j]) < near)
 
 
 def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:

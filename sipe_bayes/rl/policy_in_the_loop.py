@@ -41,7 +41,6 @@ Deviations:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -175,7 +174,10 @@ class _Folder:
         for path in self._kept.iterdir():  # also what an interruption left
             if path.name != Path(CHECKPOINT).name and not path.stem.endswith(f"-{number}"):
                 path.unlink()
-        _write_history(self._folder / "history.csv", run.history, run.task.space.names)
+        *plain, _, _ = (field.name for field in fields(Update))  # and a column for each parameter's mean and sd
+        names = [*plain, *(f"{kind}_{name}" for kind in ("mean", "sd") for name in run.task.space.names)]
+        rows = ([*(getattr(row, key) for key in plain), *row.mean, *row.sd] for row in run.history)
+        write_table(self._folder / "history.csv", names, rows)
 
     def finish(self, run: LoopRun, result: LoopResult) -> None:
         result.policy.save(self._folder / "policy.safetensors")
@@ -208,10 +210,3 @@ class _Folder:
             run.estimator.go_on_from(state.search)
             run.estimator.rollouts = run.spent
         run.estimator.findings = Findings(state.findings)
-
-
-def _write_history(path: Path, history: Sequence[Update], names: Sequence[str]) -> None:
-    """With a column for each parameter's mean and sd."""
-    *plain, _, _ = (field.name for field in fields(Update))
-    header = [*plain, *(f"{kind}_{name}" for kind in ("mean", "sd") for name in names)]
-    write_table(path, header, ([*(getattr(row, key) for key in plain), *row.mean, *row.sd] for row in history))

@@ -128,7 +128,8 @@ class Replay:
         self.terminated[row], self.transition[row] = step.terminated, step.valid & ~self._over
         ended = (step.terminated | step.truncated) & ~self._over
         for env in np.flatnonzero(ended):
-            self._end(int(env), self.head + bool(step.valid[env]))
+            passed = np.arange(max(self._starts[env], self.head - self.rows + 1), self.head + 1)
+            self.ends[passed % self.rows, env] = self.head + bool(step.valid[env])
         self._starts[self._over] = self.head + 1
         self._over = ended
         self.head += 1
@@ -232,10 +233,6 @@ class Replay:
         self.observations[row], self.transition[row], self.ends[row] = observations, False, -1
         if self.goal_size:
             self.achieved[row] = achieved
-
-    def _end(self, env: int, end: int) -> None:
-        steps = np.arange(max(self._starts[env], self.head - self.rows + 1), self.head + 1)
-        self.ends[steps % self.rows, env] = end
 
     def _draw(self, rng: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """Steps and columns (count,) of transitions: places are drawn anew until enough of them hold one."""

@@ -153,12 +153,13 @@ class Humanoid(LinkTask):
         model = self.published
         bodies = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) for i in range(model.nbody)]
         joints = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, model.njnt)]
+        inertial = [*(f"inertia_{m}" for m in _MOMENTS), *(f"mass_offset_{a}" for a in _AXES), "mass"]
         return (
             *("torso_z", "torso_qw", "torso_qx", "torso_qy", "torso_qz"),
             *(f"{joint}_angle" for joint in joints),
             *(f"root_{kind}_{axis}" for kind in ("velocity", "angular_velocity") for axis in _AXES),
             *(f"{joint}_velocity" for joint in joints),
-            *(f"{body}_{entry}" for body in bodies for entry in _inertia_entries()),
+            *(f"{body}_{entry}" for body in bodies for entry in inertial),
             *(f"{body}_{kind}_velocity_{a}" for body in bodies for kind in ("angular", "linear") for a in _AXES),
             *(f"root_actuator_{kind}_{axis}" for kind in ("force", "torque") for axis in _AXES),
             *(f"{joint}_actuator_torque" for joint in joints),
@@ -204,10 +205,6 @@ def _upright(states: FloatArray) -> BoolArray:
 
 def _compiled() -> mujoco.MjModel:
     return compiled_without_visuals(gymnasium_asset("humanoid.xml"))
-
-
-def _inertia_entries() -> list[str]:
-    return [*(f"inertia_{m}" for m in _MOMENTS), *(f"mass_offset_{a}" for a in _AXES), "mass"]
 
 
 def _bind(model: mujoco.MjModel, target: str) -> Target:
