@@ -1,8 +1,8 @@
 """A search's state on disk: a frozen dataclass as one safetensors file, numbers and text in its JSON header.
 
-Fields may be arrays, numbers, text, booleans, None, enumerations, ``Finding``-like plain dictionaries of JSON, other
-frozen dataclasses, and tuples or dictionaries by name of all these. The dataclass that is asked for says how to read
-them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there.
+Fields may be arrays, tensors, numbers, text, booleans, None, enumerations, ``Finding``-like plain dictionaries of JSON,
+other frozen dataclasses, and tuples or dictionaries by name of all these. The dataclass that is asked for says how to
+read them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
+from torch import Tensor, from_numpy
 
 from sipe_bayes.core.files import write_bytes
 from sipe_bayes.core.findings import Finding
@@ -93,8 +94,8 @@ def load_state(path: Path, kind: type[S], fingerprint: str) -> S:
 
 
 def _flattened(name: str, value: Any, arrays: dict[str, Any]) -> Any:
-    """The value as JSON; arrays go into ``arrays`` under their dotted names, and leave None."""
-    if isinstance(value, np.ndarray):
+    """The value as JSON; arrays and tensors go into ``arrays`` under their dotted names, and leave None."""
+    if isinstance(value, np.ndarray | Tensor):
         arrays[name] = np.asarray(value, order="C")  # ascontiguousarray would give one number an axis
         return None
     if dataclasses.is_dataclass(value):
@@ -112,7 +113,7 @@ def _flattened(name: str, value: Any, arrays: dict[str, Any]) -> Any:
 def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
     """The value of type ``kind`` that ``_flattened`` made ``plain`` and ``arrays`` of."""
     if name in arrays:
-        return arrays[name]
+        return from_numpy(arrays[name]) if kind is Tensor else arrays[name]
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
         if plain is None and not _stored(name, arrays):

@@ -106,30 +106,8 @@ class BayesOptOptions(CandidateOptions):
 
 
 @dataclass(frozen=True)
-class Hyperparameters:
-    """Of the Gaussian process; ``models.gaussian_process`` says what they are."""
-
-    lengthscale: FloatArray
-    noise: float
-    level: float
-    location: float
-    scale: float
-
-    @classmethod
-    def of(cls, process: GaussianProcess) -> Hyperparameters:
-        """Those of a process."""
-        numbers = (process.noise, process.level, process.location, process.scale)
-        return cls(process.lengthscale.numpy(), *numbers)
-
-    def process(self, theta: FloatArray, values: Tensor) -> GaussianProcess:
-        """The process of values (n,) at theta (n, N)."""
-        numbers = (self.noise, self.level, self.location, self.scale)
-        return GaussianProcess(torch.from_numpy(theta), values, torch.from_numpy(self.lengthscale), *numbers)
-
-
-@dataclass(frozen=True)
 class BayesOptState:
-    """The evaluations and the process's hyper-parameters.
+    """The evaluations and the process over them.
 
     Args:
         trajectories: digest of those that were evaluated.
@@ -138,7 +116,7 @@ class BayesOptState:
         units: (C,), what differences of states are divided by; NaN before the first valid simulation.
         independent: independent residuals at the best theta.
         fitted: evaluations that the hyper-parameters were fitted to.
-        hyperparameters: None before the first fit.
+        process: the one that was fitted; None before the first fit.
         done: whether the budget is spent.
     """
 
@@ -148,7 +126,7 @@ class BayesOptState:
     units: FloatArray
     independent: float = 0.0
     fitted: int = 0
-    hyperparameters: Hyperparameters | None = None
+    process: GaussianProcess | None = None
     done: bool = False
 
 
@@ -240,17 +218,17 @@ class BayesOpt(Estimator[BayesOptState]):
         return torch.from_numpy(np.log(np.where(finite, state.cost, worst) + self.options.floor))
 
     def _process(self, state: BayesOptState) -> GaussianProcess:
-        assert state.hyperparameters is not None  # fitted to the initial design
-        return state.hyperparameters.process(state.theta, self._values(state))
+        assert state.process is not None  # fitted to the initial design
+        return state.process.with_data(torch.from_numpy(state.theta), self._values(state))
 
     def fitted(self, state: BayesOptState) -> BayesOptState:
         """The state with new hyper-parameters where the data have grown enough."""
         count = len(state.theta)
         if count < self.options.growth * state.fitted:
             return state
-        previous = None if state.hyperparameters is None else self._process(state)
+        previous = None if state.process is None else self._process(state)
         process = fit_gaussian_process(torch.from_numpy(state.theta), self._values(state), self.seed, previous)
-        return replace(state, hyperparameters=Hyperparameters.of(process), fitted=count)
+        return replace(state, process=process, fitted=count)
 
     @property
     def acquisition(self) -> Acquisition:
