@@ -48,7 +48,9 @@ def logs(simulator: sipe.Simulator, count: int) -> tuple[Trajectories, Trajector
     if behaviour is None:
         raise SystemExit(f"{task.name}: its expert is not installed")
     steps = STEPS.get(task.name, 100)
-    recorded, _ = acting.simulate(simulator, task.theta("default"), behaviour, "reference", 1, 0, steps)
+    recorded, _ = acting.simulate(
+        simulator, task.theta("default"), behaviour, acting.Recording("reference", 1, 0, steps)
+    )
     spread = recorded.observations[0].std(0)
     if not excited:
         spread = np.maximum(spread, LEAST_SPREAD * spread.max())

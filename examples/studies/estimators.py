@@ -61,7 +61,7 @@ def recorded(task: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, Trajecto
     environment = simulator.environment
     steps, truth = min(STEPS, environment.episode_steps), environment.theta("in_distribution")
     behaviour = acting.excitation(environment, simulator.dt)
-    trajectories, _ = acting.simulate(simulator, truth, behaviour, "reference", 1, seed, steps)
+    trajectories, _ = acting.simulate(simulator, truth, behaviour, acting.Recording("reference", 1, seed, steps))
     return simulator, truth, trajectories
 
 

@@ -58,7 +58,7 @@ def recorded(
     known, channels = task in KNOWN, simulator.environment.channels
     behaviour = behaviour_of(simulator.environment, "expert") if known else None
     behaviour = behaviour or acting.excitation(simulator.environment, simulator.dt)
-    motion, _ = acting.simulate(simulator, theta, behaviour, "reference", 1, seed, steps)
+    motion, _ = acting.simulate(simulator, theta, behaviour, acting.Recording("reference", 1, seed, steps))
     clean = motion[0].observations
     used = np.array([not any(part in name for part in UNSEEN.get(task, ())) for name in channels])
     spread = clean.std(axis=0)

@@ -120,8 +120,18 @@ def smooth_actions(task: Task, dt: float, steps: int, rng: np.random.Generator) 
     return np.asarray(centre + of.amplitude * half * wave)
 
 
+@dataclass(frozen=True)
+class Recording:
+    """Which trajectories: of which split, how many, of which seed, and how many control steps each."""
+
+    split: Split
+    count: int
+    seed: int
+    steps: int
+
+
 def simulate(
-    simulator: Simulator, theta: FloatArray, behaviour: Behaviour, split: Split, count: int, seed: int, steps: int
+    simulator: Simulator, theta: FloatArray, behaviour: Behaviour, asked: Recording
 ) -> tuple[Trajectories, FloatArray | None]:
     """Trajectories of a behaviour.
 
@@ -129,10 +139,7 @@ def simulate(
         simulator: of a task.
         theta: (N,).
         behaviour: how it acts.
-        split: of the trajectories.
-        count: how many.
-        seed: of all.
-        steps: control steps.
+        asked: which.
 
     Returns:
         The trajectories, and their goals (B, G) or None.
@@ -140,13 +147,14 @@ def simulate(
     Raises:
         RuntimeError: where a simulation diverges.
     """
-    task = simulator.task
-    rngs = [np.random.default_rng([seed, SPLITS.index(split), i, *behaviour.key]) for i in range(count)]
+    task, count = simulator.task, asked.count
+    begin = [asked.seed, SPLITS.index(asked.split)]
+    rngs = [np.random.default_rng([*begin, i, *behaviour.key]) for i in range(count)]
     drawn = [task.initial_states(rng, 1) for rng in rngs]
     states = np.concatenate([state for state, _ in drawn])
     given = [goal for _, goal in drawn if goal is not None]
     goals = np.concatenate(given) if given else None
-    actions = np.stack([behaviour.plan(steps, rng) for rng in rngs])
+    actions = np.stack([behaviour.plan(asked.steps, rng) for rng in rngs])
     if behaviour.respond is not None:
         actions = _closed_loop(simulator, theta, behaviour, states, goals, actions, rngs)
     elif behaviour.single:
@@ -157,7 +165,7 @@ def simulate(
             f"demonstrations: {int((~motion.valid[:, -1]).sum())} of {count} simulations of {task.name} diverged; "
             "take another seed, or fewer steps"
         )
-    return replace(motion, names=tuple(f"{split}_{i}" for i in range(count))), goals
+    return replace(motion, names=tuple(f"{asked.split}_{i}" for i in range(count))), goals
 
 
 def _closed_loop(

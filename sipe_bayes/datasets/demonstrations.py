@@ -26,7 +26,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import one_of, whole
 from sipe_bayes.datasets import acting, trajectory_sets
-from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Behaviour, Split
+from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Behaviour, Recording, Split
 from sipe_bayes.datasets.trajectory_sets import COUNT, SHIPPED, SetName, TrajectorySetError
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import VARIANTS, Task, Variant
@@ -96,9 +96,8 @@ def demonstrations(
     simulator, theta = _placed(env, variant)
     task = simulator.task
     horizon = default_steps(task) if steps is None else whole("steps", steps)
-    whole("count", count)
-    where = SHIPPED if folder is None else Path(folder)
-    recorded = _stored(simulator, theta, split, type, count, seed, horizon, where)
+    asked = Recording(split, whole("count", count), seed, horizon)
+    recorded = _stored(simulator, theta, type, asked, SHIPPED if folder is None else Path(folder))
     if recorded is None and folder is not None:
         raise TrajectorySetError(
             f"folder {folder}: holds no {type} {split} set of {task.name} with these parameters, seed {seed}, and at "
@@ -113,7 +112,7 @@ def demonstrations(
                 stacklevel=_caller(),
             )
             behaviour = acting.excitation(task, simulator.dt)
-        recorded, _ = acting.simulate(simulator, theta, behaviour, split, count, seed, horizon)
+        recorded, _ = acting.simulate(simulator, theta, behaviour, asked)
     return _noisy(recorded, noise, noise_seed)
 
 
@@ -168,16 +167,17 @@ def _placed(env: Environment, variant: Variant | None) -> tuple[Simulator, Float
 
 
 def _stored(
-    simulator: Simulator, theta: FloatArray, split: Split, type: Agent, count: int, seed: int, steps: int, folder: Path
+    simulator: Simulator, theta: FloatArray, type: Agent, asked: Recording, folder: Path
 ) -> Trajectories | None:
     """What a folder of trajectory sets holds of it, or None."""
     task = simulator.task
     for variant in VARIANTS:
-        name = SetName(task.name, variant, split, type)
+        name = SetName(task.name, variant, asked.split, type)
         if np.array_equal(theta, task.theta(variant)):
             entry = trajectory_sets.entry_of(folder, name, simulator)
-            if entry is not None and entry.seed == seed and count <= entry.count and steps <= entry.steps:
-                return trajectory_sets.read(folder, name, simulator, count, steps)
+            enough = entry is not None and asked.count <= entry.count and asked.steps <= entry.steps
+            if entry is not None and enough and entry.seed == asked.seed:
+                return trajectory_sets.read(folder, name, simulator, asked.count, asked.steps)
     return None
 
 

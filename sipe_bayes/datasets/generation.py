@@ -68,7 +68,8 @@ def _generate(
     if behaviour is None:
         raise LookupError(f"no {name.type} agent of {name.task} is installed")
     horizon = default_steps(task) if steps is None else steps
-    made, goals = acting.simulate(simulator, task.theta(name.variant), behaviour, name.split, count, seed, horizon)
+    asked = acting.Recording(name.split, count, seed, horizon)
+    made, goals = acting.simulate(simulator, task.theta(name.variant), behaviour, asked)
     file = agent_file(name.task, name.type)
     agent = hashlib.sha256(file.read_bytes()).hexdigest() if file else ""
     return trajectory_sets.write(folder, name, simulator, made, goals, Origin(seed, agent, command)).bytes

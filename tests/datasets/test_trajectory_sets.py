@@ -87,7 +87,9 @@ def test_loading_shows_what_is_stored_and_simulates_no_further(task: str, tmp_pa
     """A jump in the stored motion is there, and what comes after it is as stored."""
     simulator, name = Simulator(sipe.make_task(task), 1), SetName(task, "default", "test", "random")
     theta = simulator.environment.theta("default")  # type: ignore[attr-defined]
-    made, goals = acting.simulate(simulator, theta, acting.random(simulator.environment), "test", 2, 0, STEPS)  # type: ignore[arg-type]
+    made, goals = acting.simulate(
+        simulator, theta, acting.random(simulator.task), acting.Recording("test", 2, 0, STEPS)
+    )
     states = made.states.copy()  # type: ignore[union-attr]
     column = simulator.environment.state_columns(simulator.model)[3]
     assert column is not None
@@ -120,7 +122,9 @@ def test_the_benchmark_s_sets_are_disjoint(tmp_path: Path) -> None:
         for behaviour in acting.AGENTS:
             task = sipe.make_task("Pendulum")
             chosen = acting.random(task) if behaviour == "random" else acting.agent(task, agent(task), behaviour)
-            found, _ = acting.simulate(Simulator(task, 1), task.theta("default"), chosen, split, 5, 0, 1)
+            found, _ = acting.simulate(
+                Simulator(task, 1), task.theta("default"), chosen, acting.Recording(split, 5, 0, 1)
+            )
             assert found.states is not None
             starts += [s.tobytes() for s in found.states[:, 0]]
     assert len(set(starts)) == len(starts) == 45

@@ -188,7 +188,7 @@ def test_a_point_that_the_start_moves_more_than_theta_does() -> None:
         rng = np.random.default_rng(seed)
         theta = rng.uniform(0.1, 0.9, 3)
         excitation = acting.excitation(simulator.environment, simulator.dt)
-        clean = acting.simulate(simulator, theta, excitation, "reference", 1, seed, 50)[0][0]
+        clean = acting.simulate(simulator, theta, excitation, acting.Recording("reference", 1, seed, 50))[0][0]
         noise = 0.05 * clean.observations.std(0) * rng.standard_normal(clean.observations.shape)
         found = recalibrated.fit(sipe.Trajectory(clean.observations + noise, clean.actions, clean.dt))
         low, high = found.quantile([0.05, 0.95]).numpy()

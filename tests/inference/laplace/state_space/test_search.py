@@ -161,7 +161,7 @@ def cheetah_log(simulator: Simulator, steps: int) -> tuple[np.ndarray, Trajector
     )  # the start is drawn by that of the seed alone
     theta = truths.uniform(0.1, 0.9, len(simulator.space))
     behaviour = acting.excitation(simulator.environment, simulator.dt)
-    motion, _ = acting.simulate(simulator, theta, behaviour, "reference", 1, 0, steps)
+    motion, _ = acting.simulate(simulator, theta, behaviour, acting.Recording("reference", 1, 0, steps))
     clean = motion[0].observations
     noisy = clean + 0.01 * clean.std(axis=0) * rng.standard_normal(clean.shape)
     return theta, Trajectory(noisy, motion[0].actions, motion[0].dt)
