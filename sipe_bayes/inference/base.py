@@ -84,7 +84,7 @@ class Estimator(ABC, Generic[S]):
 
         @dataclass(frozen=True)
         class RandomSearchOptions(Options):
-            batch: int = option(10, "draws of a step", least=1)
+            batch: int = option(1, "draws of a step", least=1)
 
         class RandomSearch(Estimator[RandomSearchState]):
             name = "random_search"
