@@ -22,7 +22,7 @@ from tests.problems.benchmarks import PENDULUM, TIMES, measured, refused, sipe, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--suite", "paper", "--select", "fetch_pushh/npe"], ["fetch_pushh/npe", "nearest is FetchPush/npe"]),
+        (["--suite", "paper", "--select", "fetch_pushh/npe"], ["fetch_pushh/npe", "did you mean 'FetchPush/npe"]),
         (["--suite", "paper", "--select", "Hopper/npe"], ["of the suite paper", "--suite all"]),
         (["--suite", "papers"], ["--suite papers", "quick"]),
         (["--jobs", "0", "--executor", "pool"], ["--jobs 0"]),
