@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -19,12 +20,21 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import Channel, Reader, check_sensors, reader_of, state_column
-from sipe_bayes.envs.targets import Target, TargetError, bind, check_inertia, named, restore_inertia, split
+from sipe_bayes.envs.inertia import check_inertia, restore_inertia
+from sipe_bayes.envs.laws import LAW_OF, declare
+from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
 from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, shifted_channels, with_model_values
 
 _LONGEST_STEP = 0.25  # of the cube: a finite difference of what is not smooth
 _LINEAR_INTERPOLATION = 1
 _UNEVEN = 1e-9  # relative: values that differ by less are the same, written differently
+
+
+class Edit(Protocol):
+    """A change of a model before it is compiled: picklable, as a frozen dataclass is."""
+
+    def __call__(self, spec: mujoco.MjSpec) -> None:
+        """Change the spec in place."""
 
 
 class ModelError(ValueError):
@@ -61,12 +71,14 @@ class MjcfEnvironment(Environment):
         actuators: what the columns of ``actions`` drive; others get zero.
         measurements: what the columns of ``observations`` are.
         parameters: the unknowns.
+        edits: what is changed in the MJCF before it is compiled.
     """
 
     source: str
     actuators: tuple[str, ...]
     measurements: tuple[Channel, ...]
     parameters: ParameterSpace
+    edits: tuple[Edit, ...] = ()
 
     @classmethod
     def build(
@@ -75,6 +87,7 @@ class MjcfEnvironment(Environment):
         parameters: Iterable[Parameter],
         actuators: Sequence[str],
         measurements: Sequence[str | Channel],
+        edits: Sequence[Edit] = (),
     ) -> MjcfEnvironment:
         """Check everything against the model and fill in units and defaults.
 
@@ -84,6 +97,7 @@ class MjcfEnvironment(Environment):
                 value, or, where it is ``relative``, keep their proportions.
             actuators: names of those that the log drives.
             measurements: what the log holds; a text stands for a channel with that target.
+            edits: what is changed in the MJCF before it is compiled.
 
         Raises:
             ModelError: for an MJCF that does not compile.
@@ -91,7 +105,8 @@ class MjcfEnvironment(Environment):
             ValueError: for measurements of the same name.
         """
         channels = tuple(c if isinstance(c, Channel) else Channel(c) for c in measurements)
-        model = compile_spec(load_spec(str(source)), str(source))
+        parameters = tuple(parameters)
+        model = compile_spec(_prepared(str(source), parameters, edits), str(source))
         for actuator in actuators:
             _single_control(model, actuator)
         channels = tuple(replace(c, name=c.label, unit=reader_of(model, c).unit) for c in channels)
@@ -101,7 +116,7 @@ class MjcfEnvironment(Environment):
         check_sensors(model, channels)
         space = ParameterSpace(with_model_values(model, p, channels) for p in parameters)
         check_conflicts(space)
-        return cls(str(source), tuple(actuators), channels, space)
+        return cls(str(source), tuple(actuators), channels, space, tuple(edits))
 
     @property
     def space(self) -> ParameterSpace:  # type: ignore[override]
@@ -129,24 +144,12 @@ class MjcfEnvironment(Environment):
         return any(r.derived for r in self._readers)
 
     def spec(self) -> mujoco.MjSpec:
-        """A fresh MjSpec.
+        """A fresh MjSpec, edited.
 
-        It has a command history for each actuator whose delay is a parameter, and not MuJoCo's short cut for bodies
-        whose centre of mass lies in their origin where that may change.
+        It has a command history for each actuator whose delay is a parameter, the laws that parameters write, and not
+        MuJoCo's short cut for bodies whose centre of mass lies in their origin where that may change.
         """
-        spec = load_spec(self.source)
-        timestep = spec.option.timestep
-        for parameter in self.parameters:
-            for target in physical_targets(parameter.targets):
-                kind, name, attribute = split(target)
-                if kind == "body" and attribute != "mass":
-                    spec.body(name).simple = False
-                if kind == "actuator" and attribute == "delay":
-                    actuator = spec.actuator(name)
-                    # the physics step may be refined to half the model's own
-                    actuator.nsample = max(actuator.nsample, math.ceil(2 * parameter.high / timestep) + 2)
-                    actuator.interp = _LINEAR_INTERPOLATION
-        return spec
+        return _prepared(self.source, self.parameters, self.edits)
 
     def compile(self) -> mujoco.MjModel:
         """A fresh model at the MJCF's own values."""
@@ -157,7 +160,7 @@ class MjcfEnvironment(Environment):
         return self.compile()
 
     def __getstate__(self) -> dict[str, object]:
-        return {f: getattr(self, f) for f in ("source", "actuators", "measurements", "parameters")}
+        return {f: getattr(self, f) for f in ("source", "actuators", "measurements", "parameters", "edits")}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
@@ -315,6 +318,28 @@ class MjcfEnvironment(Environment):
                 f"actuator:{actuator}.delay: {longest:g} s do not fit the history of {samples} physics steps "
                 f"of {timestep:g} s; set the model's timestep no longer than the log's"
             )
+
+
+def _prepared(source: str, parameters: Iterable[Parameter], edits: Iterable[Edit]) -> mujoco.MjSpec:
+    """The MjSpec of a source, edited, with what its parameters write to."""
+    spec = load_spec(source)
+    for edit in edits:
+        edit(spec)
+    timestep = spec.option.timestep
+    for parameter in parameters:
+        for target in physical_targets(parameter.targets):
+            kind, name, attribute = split(target)
+            if kind == "body" and attribute != "mass" and spec.body(name) is not None:
+                spec.body(name).simple = False
+            if kind == "actuator" and attribute == "delay" and spec.actuator(name) is not None:
+                actuator = spec.actuator(name)
+                # the physics step may be refined to half the model's own
+                actuator.nsample = max(actuator.nsample, math.ceil(2 * parameter.high / timestep) + 2)
+                actuator.interp = _LINEAR_INTERPOLATION
+            owner = {"joint": spec.joint, "actuator": spec.actuator}.get(kind)
+            if (kind, attribute) in LAW_OF and owner is not None and owner(name) is not None:
+                declare(spec, kind, name, LAW_OF[kind, attribute][0])
+    return spec
 
 
 def _mean(values: FloatArray, members: list[int]) -> float:

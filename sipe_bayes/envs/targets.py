@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.envs.inertia import body_frame_inertia
+from sipe_bayes.envs.laws import LAW_OF, Number
 
 Writer = Callable[[mujoco.MjModel, float], None]
 Maker = Callable[[mujoco.MjModel, str, int], "Target"]
@@ -35,7 +36,6 @@ _OBJECTS = {
 }
 _COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nactuator", "geom": "ngeom", "sensor": "nsensor"}
 _AXES = ("x", "y", "z")
-_ROUNDING = 1e-9  # relative, of principal moments that diagonalising leaves
 
 
 class TargetError(ValueError):
@@ -252,14 +252,6 @@ def _body_mass(model: mujoco.MjModel, spec: str, body: int) -> Target:
     return Target(spec, "kg", mass, write, constants=True, minimum=0.0)
 
 
-def body_frame_inertia(model: mujoco.MjModel, body: int) -> FloatArray:
-    """Inertia (3, 3) in kg m^2 about the centre of mass, in the axes of the body's frame."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, model.body_iquat[body])
-    rotation = matrix.reshape(3, 3)
-    return rotation @ np.diag(model.body_inertia[body]) @ rotation.T
-
-
 def _body_inertia(row: int, column: int) -> Maker:
     def make(model: mujoco.MjModel, spec: str, body: int) -> Target:
         def write(other: mujoco.MjModel, value: float) -> None:
@@ -277,18 +269,6 @@ def _body_inertia(row: int, column: int) -> Maker:
     return make
 
 
-def restore_inertia(model: mujoco.MjModel, original: mujoco.MjModel, bodies: list[int]) -> None:
-    """Give the bodies the inertia that they have in the model ``original``."""
-    model.body_inertia[bodies] = original.body_inertia[bodies]
-    model.body_iquat[bodies] = original.body_iquat[bodies]
-
-
-def check_inertia(model: mujoco.MjModel, bodies: list[int]) -> bool:
-    """Whether the principal moments of the bodies are ones a rigid body can have: positive, A + B >= C."""
-    moments = np.sort(model.body_inertia[bodies], axis=1)
-    return bool((moments[:, 0] >= 0).all() and (moments[:, 2] <= moments[:, :2].sum(1) * (1 + _ROUNDING)).all())
-
-
 def _option(field: str, slot: int | None, unit: str) -> Maker:
     def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
         def write(other: mujoco.MjModel, value: float) -> None:
@@ -303,6 +283,57 @@ def _option(field: str, slot: int | None, unit: str) -> Maker:
     return make
 
 
+def _joint_polynomial(field: str, slot: int, power: int) -> Maker:
+    """A coefficient of damping (of v |v|, v^3) or stiffness (of x^2, x^3); see MuJoCo's polynomial forces."""
+
+    def make(model: mujoco.MjModel, spec: str, joint: int) -> Target:
+        motion = ("rad" if _hinge(model, joint) else "m") + ("/s" if field == "dof_dampingpoly" else "")
+        unit = f"{'N m' if _hinge(model, joint) else 'N'}/({motion})^{power}"
+        index = int(model.jnt_dofadr[joint]) if field == "dof_dampingpoly" else joint
+        minimum = 0.0 if field == "dof_dampingpoly" else -np.inf
+        return _entry(field, unit, slot, minimum=minimum)(model, spec, index)
+
+    return make
+
+
+def _force_limit(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+    """The largest force either way; without one in the model its value is endless."""
+
+    def write(other: mujoco.MjModel, value: float) -> None:
+        other.actuator_forcelimited[actuator] = True
+        other.actuator_forcerange[actuator] = -value, value
+
+    limited = bool(model.actuator_forcelimited[actuator])
+    present = float(np.abs(model.actuator_forcerange[actuator]).max()) if limited else np.inf
+    return Target(spec, "force", present, write, minimum=0.0)
+
+
+def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+    if int(model.actuator_dyntype[actuator]) != int(mujoco.mjtDyn.mjDYN_FILTEREXACT):
+        raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact"')
+    return _entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
+
+
+def _law(number: Number, label: str, slot: int) -> Maker:
+    """A number of a law (``envs.laws``), which stands among the model's numerics."""
+
+    def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
+        numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{spec.rpartition('.')[0]}.{label}")
+        at = int(model.numeric_adr[numeric]) + slot
+
+        def write(other: mujoco.MjModel, value: float) -> None:
+            other.numeric_data[at] = value
+
+        return Target(spec, number.unit, float(model.numeric_data[at]), write, minimum=number.minimum)
+
+    return make
+
+
+def _laws(kind: str) -> dict[str, Maker]:
+    rows = ((attribute, *of) for (at, attribute), of in LAW_OF.items() if at == kind)
+    return {attribute: _law(law.numbers[slot], law.name, slot) for attribute, law, slot in rows}
+
+
 ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds it
     "body": {
         "mass": _body_mass,
@@ -315,6 +346,11 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         "armature": _dof("dof_armature", "kg m^2", "kg", constants=True),
         "stiffness": _joint_stiffness,
         "springref": _joint_springref,
+        "damping_quadratic": _joint_polynomial("dof_dampingpoly", 0, 2),
+        "damping_cubic": _joint_polynomial("dof_dampingpoly", 1, 3),
+        "stiffness_quadratic": _joint_polynomial("jnt_stiffnesspoly", 0, 2),
+        "stiffness_cubic": _joint_polynomial("jnt_stiffnesspoly", 1, 3),
+        **_laws("joint"),
     },
     "actuator": {
         "gear": _entry("actuator_gear", "1", 0, constants=True),
@@ -326,6 +362,9 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         "bias_velocity": _actuator_bias(2, "force/velocity"),
         "offset": _actuator_offset,
         "delay": _actuator_delay,
+        "force_limit": _force_limit,
+        "lag": _lag,
+        **_laws("actuator"),
     },
     "geom": {
         "friction": _entry("geom_friction", "1", 0, minimum=0.0),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -76,7 +77,8 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
             f"parameter {parameter.name!r}: bounds from {parameter.low:g} {parameter.unit or units[0]}, but "
             f"{parameter.targets[0]} cannot be below {least:g}; raise the lower one"
         )
-    return replace(parameter, unit=parameter.unit or units[0], default=values[0])
+    default = parameter.high if math.isinf(values[0]) else values[0]  # a limit that the model has not
+    return replace(parameter, unit=parameter.unit or units[0], default=default)
 
 
 def _shifted_unit(parameter: Parameter, target: str, channels: Sequence[Channel], shifted: Sequence[int]) -> str:

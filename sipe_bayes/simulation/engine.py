@@ -17,6 +17,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.simulation.law_steps import LawSteps
 from sipe_bayes.simulation.mjdata import Fields
 
 _TIME_TOLERANCE = 0.5  # of a physics step: a reset or a repeated sample is a whole one off
@@ -95,6 +96,7 @@ class Engine:
         self.physics_size = int(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._threads = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
+        self.laws = LawSteps(model, environment.control_spec)
         self._fields = Fields(environment.data_fields, self._datas) if environment.data_fields else None
 
     @property
@@ -106,6 +108,11 @@ class Engine:
     def reads_sensors(self) -> bool:
         """Whether sensordata is wanted with the states."""
         return self.environment.needs_derived or self.environment.stepwise
+
+    @property
+    def own_models(self) -> bool:
+        """Whether each simulation needs a written model of its own, because laws write to it in every step."""
+        return bool(self.laws.rubbing)
 
     def advance(self, run: Run, first: bool = True) -> Motion:
         """Simulate; without ``first`` the derived quantities of sample 0 may be missing."""
@@ -184,15 +191,29 @@ class Engine:
         self, models: Sequence[mujoco.MjModel], start: FloatArray, controls: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """States (B, P, S) and sensordata (B, P, D) of P physics steps, with controls (B, P, U)."""
+        reads = self.reads_sensors
+        if self.laws:
+            return self.laws.advance(self._steps, models, start, controls, reads)
+        return self._steps(models, start, controls, self.environment.control_spec, reads)
+
+    def _steps(
+        self,
+        models: Sequence[mujoco.MjModel],
+        start: FloatArray,
+        controls: FloatArray,
+        control_spec: int,
+        reads_sensors: bool,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``_native``, by ``mujoco.rollout`` alone."""
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
-        sensors = np.empty((batch, steps, self.model.nsensordata)) if self.reads_sensors else None
+        sensors = np.empty((batch, steps, self.model.nsensordata)) if reads_sensors else None
         self._threads.rollout(
             models,
             self._datas,
             np.ascontiguousarray(start),
             np.ascontiguousarray(controls),
-            control_spec=self.environment.control_spec,
+            control_spec=control_spec,
             skip_checks=True,
             nstep=steps,
             state=out,

@@ -37,25 +37,26 @@ class ModelPool:
     model: mujoco.MjModel
     slots: list[_Slot] = field(default_factory=list)
 
-    def take(self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]) -> IntArray:
+    def take(self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None], own: bool = False) -> IntArray:
         """Write what B simulations need; those that follow their like cost nothing.
 
         Args:
             theta: (B, N).
             timesteps: (B,) seconds of their physics steps.
             logs: B names of the logs that they belong to.
+            own: whether each simulation has a model to itself.
 
         Returns:
             The slot of each, (B,).
         """
         named = np.array(logs, object)
         differs = (theta[1:] != theta[:-1]).any(1) | (timesteps[1:] != timesteps[:-1]) | (named[1:] != named[:-1])
-        first = np.flatnonzero(np.concatenate([[True], differs]))
+        first = np.flatnonzero(np.concatenate([[True], differs | own]))
         index: dict[bytes, int] = {}
         slots = np.empty(len(first), int)
         for i, at in enumerate(first):
             timestep, log = float(timesteps[at]), logs[int(at)]
-            key = theta[at].tobytes() + timestep.hex().encode() + str(log).encode()
+            key = theta[at].tobytes() + timestep.hex().encode() + str(log).encode() + str(i if own else "").encode()
             if key not in index:
                 index[key] = len(index)
                 self._fill(index[key], key, theta[at], timestep, log)

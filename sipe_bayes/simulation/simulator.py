@@ -95,7 +95,9 @@ class Simulator(Simulated):
         motion = _Recorded.empty(batch, horizon, self)
         with quiet:
             for skip, chunk in self._chunks(steps, horizon):
-                slots = self.pool.take(theta[chunk], timesteps[chunk], [names[i] for i in chunk])
+                slots = self.pool.take(
+                    theta[chunk], timesteps[chunk], [names[i] for i in chunk], self.engine.own_models
+                )
                 targets = None if goals is None else goals[chunk]
                 self._run(motion, chunk, skip, slots, timesteps[chunk], actions[chunk], initial_state[chunk], targets)
         valid = np.logical_and.accumulate(motion.valid, axis=1)

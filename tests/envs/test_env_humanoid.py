@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sipe_bayes.envs.assets import gymnasium_asset
+from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.envs.targets import body_frame_inertia
 from sipe_bayes.envs.tasks.humanoid import Humanoid
 from sipe_bayes.simulation.engine import Run
 from sipe_bayes.simulation.simulator import Simulator

@@ -1,0 +1,145 @@
+"""Which extensions a fit asks for: score tests against the residuals, all else free to follow.
+
+At the estimate, with parameters and windows' starts free to follow (linearised), the effect of an extension along its
+probes has a best amplitude and a gain in log-likelihood (C. R. Rao 1948,
+https://doi.org/10.1017/S0305004100023987). What a model lacks has made the noise larger and slower than it is, so the
+noise is estimated anew with each extension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.structure.extension import Placed
+from sipe_bayes.structure.probes import Effect, effects
+
+_FAINT = 1e-6  # of a probe's information, of its prior: what theta and the starts imitate to within that has no size
+_SHAPED = 0.1  # of a parameter's range: a probe that goes further gives a shape, not a size
+_INSIDE = 0.02, 0.98  # of a range, where a fit may start
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An extension with what it promises.
+
+    Args:
+        placed: which.
+        gain: log-likelihood that it is to gain, in nats.
+        theta: (P,) its parameters where a fit is to start.
+        amplitude: (K,) of its probes.
+    """
+
+    placed: Placed
+    gain: float
+    theta: FloatArray
+    amplitude: FloatArray
+
+
+def candidates(
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    noise: Noise,
+    prior: QuadraticPrior,
+    placed: Sequence[Placed],
+) -> list[Candidate]:
+    """Extensions ranked by what they promise, best first; costs a linearisation and a rollout for each probe.
+
+    Args:
+        windows: the logs.
+        theta: (N,), the estimate.
+        starts: (W, D), there.
+        noise: (C,), there.
+        prior: of theta.
+        placed: the extensions.
+    """
+    linearisation = windows.linearise(theta, starts)
+    around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
+    plain = around.fitted(np.zeros((*linearisation.residual.shape, 0)))
+    seen = effects(windows, theta, starts, placed)
+    return sorted((around.candidate(effect, plain) for effect in seen), key=lambda candidate: -candidate.gain)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """The linear model with K probes at its best noise: log-likelihood, amplitudes (K,), whitened squares."""
+
+    level: float
+    amplitude: FloatArray
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class _Around:
+    """The logs linearised at an estimate: residual (W, L, C) and jacobian (W, L, C, N + D)."""
+
+    windows: Windows
+    theta: FloatArray
+    starts: FloatArray
+    noise: Noise
+    prior: QuadraticPrior
+    residual: FloatArray
+    jacobian: FloatArray
+
+    def candidate(self, effect: Effect, plain: _Fitted) -> Candidate:
+        """What an extension promises, within its bounds, beside the linear model without it."""
+        at, probes = effect.placed.plain, effect.probes
+        low, high = _bounds(at, probes)
+        use = np.ones(len(probes), bool)
+        amplitude, level = np.zeros(len(probes)), plain.level
+        while use.any():
+            fitted = self.fitted(effect.change[..., use])
+            amplitude[:] = 0.0
+            amplitude[use] = fitted.amplitude
+            wrong = use & ((amplitude < 0) & (low >= 0) | (amplitude > 0) & (high <= 0))
+            if not wrong.any():
+                level = fitted.level
+                break
+            use &= ~wrong
+            amplitude[:] = 0.0
+        amplitude = np.clip(amplitude, low, high)
+        size = np.abs(amplitude).sum()
+        value = at + amplitude @ (probes - at)
+        shaped = np.abs(probes - at).max(0) > _SHAPED  # what a probe had beside its size
+        if size > 0:
+            value = np.where(shaped, np.abs(amplitude) / size @ probes, value)
+        return Candidate(effect.placed, level - plain.level, np.clip(value, *_INSIDE), amplitude)
+
+    def fitted(self, change: FloatArray) -> _Fitted:
+        """The best noise, and what the probes' changes (W, L, C, K) amount to with all else following."""
+        n, k, windows = len(self.theta), change.shape[-1], self.windows
+        columns = np.concatenate([self.jacobian[..., :n], change, self.jacobian[..., n:]], axis=-1)
+        moments = Moments(self.residual, columns, n + k, windows.sequences)
+        precision, pull = np.zeros((n + k, n + k)), np.zeros(n + k)
+        precision[:n, :n], pull[:n] = self.prior.precision + FLAT_PRECISION * np.eye(n), self.prior.pull(self.theta)
+        normal = moments.normal(self.noise)
+        # probes of no size of their own, so that the information exists
+        precision[n:, n:] = _FAINT * np.diag(np.diag(normal.sum(0))[n : n + k])
+        start_pull = -windows.start_precision * self.starts
+        pulls = Pulls(precision, pull, windows.start_precision, start_pull, np.ones(n + k, bool))
+        span = float(windows.dt.min()), windows.trajectories.longest
+        noise = estimate_noise(moments, self.noise, pulls, windows.fixed_sd, True, *span)
+        normal = moments.normal(noise)
+        arrow = eliminate_starts(normal, n + k, windows.start_precision, start_pull)
+        total = arrow.gradient + pull
+        step = np.linalg.solve(arrow.precision + precision, total)
+        square = float(normal[:, -1, -1].sum()) - arrow.explained - float(total @ step)
+        return _Fitted(-0.5 * (moments.log_determinant(noise) + square), np.asarray(step[n:], float), noise)
+
+
+def _bounds(plain: FloatArray, probes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far (K,) each probe can be followed, backwards and forwards, within the cube."""
+    direction = probes - plain
+    with np.errstate(divide="ignore", invalid="ignore"):
+        up = np.where(direction > 0, (1 - plain) / direction, np.where(direction < 0, -plain / direction, np.inf))
+        down = np.where(direction > 0, -plain / direction, np.where(direction < 0, (1 - plain) / direction, -np.inf))
+    return np.minimum(down.max(1), 0.0), np.maximum(up.min(1), 0.0)

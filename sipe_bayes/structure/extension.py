@@ -1,0 +1,145 @@
+"""What a model may get: an extension is a piece of physics with parameters of its own, placed at a joint or elsewhere.
+
+It reduces to the plain model where its parameters have the model's own values, their defaults. To add one, write a file
+with a subclass of ``Extension`` and a line in ``structure.registry.EXTENSIONS``; one of your own, outside this package,
+is named by its import path. The simplest::
+
+    from sipe_bayes.core.parameters import Parameter
+    from sipe_bayes.structure.extension import Extension
+
+    class DryFriction(Extension):
+        name, kind = "dry_friction", "joint"
+        reference = "C. A. Coulomb 1785"
+
+        def sentence(self, site):
+            return f"dry friction at {site}"
+
+        def parameters(self, machine, site):
+            target = f"joint:{site}.frictionloss"
+            return (Parameter(f"{site}.dry_friction", 0.0, machine.joints[site].force, targets=(target,)),)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
+from sipe_bayes.structure.machine import Machine
+
+Kind = Literal["joint", "actuator", "channel", "world"]
+PROBE = 0.03  # of a parameter's range, how far a probe goes: an effect that is still about linear
+WORLD = "world"  # the one site of an extension of the world
+
+
+class Extension(ABC):
+    """A piece of physics that a model may lack.
+
+    ``kind`` says what it is placed at. ``reference`` says where it is described.
+    """
+
+    name: ClassVar[str]
+    kind: ClassVar[Kind]
+    reference: ClassVar[str]
+    native: ClassVar[bool] = True  # MJCF has an element for it
+    last_resort: ClassVar[bool] = False  # tried only where nothing else helps
+
+    @abstractmethod
+    def sentence(self, site: str) -> str:
+        """What it is, in a report: such as "dry friction at elbow"."""
+
+    @abstractmethod
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Its unknowns, their bounds in SI from the sizes of the machine's motion; none where it does not apply."""
+
+    def edit(self, machine: Machine, site: str) -> Edit | None:
+        """What is changed in the MJCF, where parameters of it are not enough."""
+        return None
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """Theta (K, P) of its P parameters at which it is tried: directions away from the plain model, their defaults.
+
+        By default a small step of each parameter by itself; where the others are to have other values meanwhile, as the
+        shape of a force whose size is tried, override this.
+        """
+        plain = plain_theta(parameters)
+        return plain + np.diag(np.where(plain > 1 - 2 * PROBE, -PROBE, PROBE))
+
+
+def plain_theta(parameters: Sequence[Parameter]) -> FloatArray:
+    """Theta (P,) where parameters have their defaults, or the cube's middle of those without one."""
+    return np.array([0.5 if p.default is None else float(p.normalise(p.default)) for p in parameters])
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An extension at a site.
+
+    Args:
+        extension: which.
+        site: name of the joint, actuator or channel; ``WORLD``.
+        parameters: its unknowns, with the model's own values as defaults.
+        edit: what it changes in the MJCF.
+        probes: theta (K, P) at which it is tried.
+    """
+
+    extension: Extension
+    site: str
+    parameters: tuple[Parameter, ...]
+    edit: Edit | None
+    probes: FloatArray
+
+    @property
+    def label(self) -> str:
+        """What tells it from others."""
+        return f"{self.extension.name}:{self.site}"
+
+    @property
+    def sentence(self) -> str:
+        """What it is."""
+        return self.extension.sentence(self.site)
+
+    @property
+    def plain(self) -> FloatArray:
+        """Theta (P,) where it changes nothing."""
+        return plain_theta(self.parameters)
+
+
+def extended(environment: MjcfEnvironment, placed: Sequence[Placed]) -> MjcfEnvironment:
+    """The environment with extensions, whose parameters follow its own.
+
+    Raises:
+        TargetError: where two write the same number.
+        ModelError: where an edit breaks the model.
+    """
+    edits = [*environment.edits, *(p.edit for p in placed if p.edit is not None)]
+    parameters = [*environment.parameters, *(q for p in placed for q in p.parameters)]
+    return MjcfEnvironment.build(environment.source, parameters, environment.actuators, environment.measurements, edits)
+
+
+def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
+    """The extension wherever the machine has a place for it."""
+    sites = {
+        "joint": tuple(machine.joints),
+        "actuator": machine.environment.actuators,
+        "channel": machine.environment.channels,
+        "world": (WORLD,),
+    }
+    taken, count = machine.written(), len(machine.environment.parameters)
+    for site in sites[extension.kind]:
+        parameters = extension.parameters(machine, site)
+        if not parameters or any(t in taken for p in parameters for t in p.targets):
+            continue
+        draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, len(parameters))))
+        try:
+            space = extended(machine.environment, [draft]).space
+        except ValueError:
+            continue  # the model has no place for it, or a value of its own beyond these bounds
+        own = tuple(space)[count:]
+        yield Placed(extension, site, own, draft.edit, extension.probes(machine, own))

@@ -1,0 +1,1 @@
+"""Extensions: one file each, by what they are placed at."""

@@ -1,0 +1,46 @@
+"""A torque that goes round with the rotor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.structure.extension import PROBE, Extension
+from sipe_bayes.structure.machine import Machine
+
+
+class Cogging(Extension):
+    """A torque that goes round with the rotor."""
+
+    name, kind = "cogging", "actuator"
+    reference = "MuJoCo documentation, actuator/dcmotor, cogging"
+    native = False
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"cogging at the joint of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a third of the usual force, with 1 to 60 poles."""
+        joint = machine.joint_of(site)
+        if joint is None or not machine.is_hinge(joint):
+            return ()
+        most, at = machine.joints[joint].force / 3, f"joint:{joint}"
+        return (
+            Parameter(f"{site}.cogging_sin", -most, most, targets=(f"{at}.cogging_sin",), description="sine part"),
+            Parameter(f"{site}.cogging_cos", -most, most, targets=(f"{at}.cogging_cos",), description="cosine part"),
+            Parameter(
+                f"{site}.cogging_poles",
+                1.0,
+                60.0,
+                scale="log",
+                targets=(f"{at}.cogging_poles",),
+                description="periods in a turn",
+            ),
+        )
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """A little of either phase, for numbers of poles that the position's range resolves."""
+        poles = np.log([4.0, 7.0, 12.0, 24.0]) / np.log(60.0)
+        return np.array([[0.5 + a, 0.5 + b, n] for n in poles for a, b in ((PROBE, 0.0), (0.0, PROBE))])

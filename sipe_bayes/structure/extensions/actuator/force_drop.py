@@ -1,0 +1,32 @@
+"""A force that falls short the more of it is asked for."""
+
+from __future__ import annotations
+
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.machine import Machine
+
+
+class ForceDrop(Extension):
+    """A force that falls short the more of it is asked for."""
+
+    name, kind = "force_drop", "actuator"
+    reference = "-"
+    native = False
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a gain of {site} that falls with its force"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a half at twice the usual force."""
+        most = 0.25 / machine.forces[site]
+        return (
+            Parameter(
+                f"{site}.force_drop",
+                -most,
+                most,
+                targets=(f"actuator:{site}.force_drop",),
+                description="relative loss per force",
+            ),
+        )

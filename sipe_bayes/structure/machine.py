@@ -1,0 +1,162 @@
+"""The machine that extensions are placed at: its model, and the sizes of its motion, from which their priors come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.envs.laws import driven_joint
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
+
+_SAMPLES = 400  # of the logs, of which forces are computed
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclass(frozen=True)
+class JointSizes:
+    """Root-mean-squares along the logs of one joint, in SI.
+
+    Args:
+        position: rad or m.
+        velocity: rad/s or m/s.
+        force: N m or N, the largest of what drives, carries and accelerates it.
+        inertia: kg m^2 or kg, that it moves.
+    """
+
+    position: float
+    velocity: float
+    force: float
+    inertia: float
+
+
+@dataclass(frozen=True)
+class Machine:
+    """An environment with the sizes of its motion along the logs.
+
+    Args:
+        environment: the user's model.
+        joints: of each hinge and slide joint.
+        forces: root-mean-square of each commanded actuator's force.
+        commands: largest size of each command.
+        channels: spread of each measured channel.
+        logs: names of the logs.
+        dt: shortest time between samples, in seconds.
+    """
+
+    environment: MjcfEnvironment
+    joints: dict[str, JointSizes]
+    forces: dict[str, float]
+    commands: dict[str, float]
+    channels: dict[str, float]
+    logs: tuple[str, ...]
+    dt: float
+
+    @property
+    def timestep(self) -> float:
+        """Seconds of a physics step."""
+        return float(self.model.opt.timestep)
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The environment's model, as it is compiled; not to be written to."""
+        return self.environment.compile()
+
+    def is_hinge(self, joint: str) -> bool:
+        """Whether it turns."""
+        return int(self.model.joint(joint).type[0]) == _SINGLE[0]
+
+    def joint_of(self, actuator: str) -> str | None:
+        """The hinge or slide joint that an actuator drives by itself."""
+        model = self.model
+        joint = driven_joint(model, model.actuator(actuator).id)
+        return str(model.joint(joint).name) if joint >= 0 and model.joint(joint).name in self.joints else None
+
+    def is_position(self, actuator: str) -> bool:
+        """Whether its command is a set-point: its force falls with the position or the velocity."""
+        index = self.model.actuator(actuator).id
+        return bool((self.model.actuator_biasprm[index, 1:3] != 0).any())
+
+    def written(self) -> frozenset[str]:
+        """Targets that the user's parameters write."""
+        return frozenset(t for p in self.environment.parameters for t in p.targets)
+
+
+def machine_of(windows: Windows, theta: FloatArray, starts: FloatArray) -> Machine:
+    """The machine as it moves at an estimate.
+
+    Args:
+        windows: the logs, of an ``MjcfEnvironment``.
+        theta: (N,).
+        starts: (W, D).
+
+    Raises:
+        ValueError: for another environment.
+    """
+    simulator = windows.simulator
+    environment = simulator.environment
+    if not isinstance(environment, MjcfEnvironment):
+        raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
+    model = simulator.written(theta)
+    states, controls = _motion(simulator, windows, theta, starts)
+    driving, own = _forces(model, states, controls)
+    labels = {a: model.actuator(a).id for a in environment.actuators}
+    commands = {a: float(np.abs(windows.actions[..., k]).max()) for k, a in enumerate(environment.actuators)}
+    joints = {}
+    for joint in range(model.njnt):
+        if int(model.jnt_type[joint]) in _SINGLE and model.joint(joint).name:
+            dof, address = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+            inertia = float(own.inertia[dof])
+            sizes = (_rms(states[:, 1 + address]), _rms(states[:, 1 + model.nq + dof]), own.size[dof], inertia)
+            joints[str(model.joint(joint).name)] = JointSizes(*(max(float(s), 1e-9) for s in sizes))
+    forces = {a: max(_rms(driving[:, index]), 1e-9) for a, index in labels.items()}
+    spread = np.nanstd(windows.trajectories.observations, axis=(0, 1))
+    channels = dict(zip(environment.channels, np.maximum(spread, 1e-9).tolist(), strict=True))
+    names = tuple(str(name) for name in windows.trajectories.names)
+    return Machine(environment, joints, forces, commands, channels, names, float(windows.dt.min()))
+
+
+@dataclass(frozen=True)
+class _Own:
+    """Of each dof: the size of its forces (nv,) and its inertia (nv,)."""
+
+    size: FloatArray
+    inertia: FloatArray
+
+
+def _motion(
+    simulator: Simulator, windows: Windows, theta: FloatArray, starts: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """States (n, S) and controls (n, U) spread over the windows."""
+    run = simulator.rollout(theta[None], windows.actions, windows.states(starts), windows.dt, windows.names)
+    assert run.states is not None
+    states = run.states[:, :-1].reshape(-1, run.states.shape[-1])
+    controls = simulator.environment.control(simulator.model, states, windows.actions.reshape(len(states), -1))
+    inside = (np.arange(windows.actions.shape[1]) < windows.steps[:, None]).ravel() & np.isfinite(states).all(1)
+    rows = np.flatnonzero(inside)
+    rows = rows[np.linspace(0, len(rows) - 1, min(_SAMPLES, len(rows))).astype(int)]
+    return states[rows], controls[rows]
+
+
+def _forces(model: mujoco.MjModel, states: FloatArray, controls: FloatArray) -> tuple[FloatArray, _Own]:
+    """Actuator forces (n, nu) along a motion, and the dofs' sizes."""
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    driving, parts, diagonals = [], [], []
+    for state, control in zip(states, controls, strict=True):
+        mujoco.mj_setState(model, data, np.ascontiguousarray(state), mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        data.ctrl[:] = control
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        driving.append(data.actuator_force.copy())
+        diagonals.append(np.diag(inertia).copy())
+        parts.append(np.abs([data.qfrc_actuator, data.qfrc_bias, inertia @ data.qacc]).max(0))
+    return np.array(driving), _Own(np.sqrt((np.array(parts) ** 2).mean(0)), np.mean(diagonals, axis=0))
+
+
+def _rms(x: FloatArray) -> float:
+    return float(np.sqrt((x**2).mean()))

@@ -1,0 +1,72 @@
+"""The only list of extensions, and how one of the user's own is found."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+
+from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.structure.extension import Extension
+
+_PACKAGE = "sipe_bayes.structure.extensions"
+EXTENSIONS: dict[str, str] = {  # name: module and class
+    "viscous_friction": "joint.viscous_friction:ViscousFriction",
+    "dry_friction": "joint.dry_friction:DryFriction",
+    "armature": "joint.armature:Armature",
+    "quadratic_damping": "joint.quadratic_damping:QuadraticDamping",
+    "cubic_damping": "joint.cubic_damping:CubicDamping",
+    "spring": "joint.spring:Spring",
+    "hardening_spring": "joint.hardening_spring:HardeningSpring",
+    "direction_friction": "joint.direction_friction:DirectionFriction",
+    "stribeck": "joint.stribeck:Stribeck",
+    "load_friction": "joint.load_friction:LoadFriction",
+    "delay": "actuator.delay:Delay",
+    "offset": "actuator.offset:Offset",
+    "back_emf": "actuator.back_emf:BackEmf",
+    "force_limit": "actuator.force_limit:ForceLimit",
+    "force_drop": "actuator.force_drop:ForceDrop",
+    "cogging": "actuator.cogging:Cogging",
+    "sensor_offset": "world.sensor_offset:SensorOffset",
+    "gravity_tilt": "world.gravity_tilt:GravityTilt",
+    "residual": "world.residual:Residual",
+}
+
+
+def get_extension(name: str) -> Extension:
+    """One of the registry's, or the user's own: ``package.module:Class`` or ``path/to/file.py:Class``.
+
+    Raises:
+        ValueError: for a name that is neither; one line with the remedy.
+    """
+    if name in EXTENSIONS:
+        module, _, kind = EXTENSIONS[name].partition(":")
+        return _made(f"{_PACKAGE}.{module}", kind, name)
+    module, _, kind = name.rpartition(":")
+    if not module:
+        hint = nearest_name(name, EXTENSIONS) or f"; known are {', '.join(EXTENSIONS)}"
+        raise ValueError(f"structure: no extension {name!r}{hint}; one of your own is package.module:Class")
+    return _made(module, kind, name)
+
+
+def _made(module: str, kind: str, name: str) -> Extension:
+    try:
+        loaded = _from_file(Path(module)) if module.endswith(".py") else importlib.import_module(module)
+        made = getattr(loaded, kind)()
+    except Exception as error:  # the user's own code may raise anything
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"structure: extension {name!r} cannot be loaded ({reason}); correct it") from None
+    if not isinstance(made, Extension):
+        raise ValueError(f"structure: {name!r} is no Extension; make it a subclass of sipe_bayes.structure.Extension")
+    return made
+
+
+def _from_file(path: Path) -> object:
+    spec = importlib.util.spec_from_file_location(f"sipe_extension_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FileNotFoundError(f"no file {path}")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
