@@ -14,8 +14,8 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs import targets
 from sipe_bayes.envs.export import write_identified
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.inertia import body_frame_inertia, check_inertia
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import TargetError, bind
 
 XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worldbody>

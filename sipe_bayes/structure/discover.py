@@ -1,0 +1,159 @@
+"""From logs to a distribution over structures, with budget, checkpoint, resume and progress as every fit has them."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.validation import cores, nearest_name, whole
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.recorded import Progress, digest
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.fitted import Fitting
+from sipe_bayes.structure.registry import EXTENSIONS, get_extension
+from sipe_bayes.structure.search import DiscoverOptions, DiscoverState, StructureSearch
+from sipe_bayes.structure.structures import Structures
+
+_SAVE_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Restriction:
+    """Which extensions may be tried, and where.
+
+    Args:
+        only: names of extensions, or import paths of the user's own; default all of the registry.
+        without: names that are left out.
+        extra: import paths of the user's own, beside the registry's.
+        sites: joints, actuators and channels where they may be placed; default all.
+
+    Raises:
+        ValueError: for names that do not exist; one line with the remedy.
+    """
+
+    only: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()
+    extra: tuple[str, ...] = ()
+    sites: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.without:
+            if name not in EXTENSIONS:
+                hint = nearest_name(name, EXTENSIONS) or f"; known are {', '.join(EXTENSIONS)}"
+                raise ValueError(f"structure.without: no extension {name!r}{hint}")
+
+    @property
+    def names(self) -> list[str]:
+        """Those that may be tried."""
+        chosen = [*(EXTENSIONS if self.only is None else self.only), *self.extra]
+        return [name for name in dict.fromkeys(chosen) if name not in self.without]
+
+
+def discover(
+    simulator: Simulator,
+    trajectories: Trajectories,
+    *,
+    prior: Posterior | None = None,
+    likelihood: Segments | None = None,
+    restriction: Restriction | None = None,
+    options: DiscoverOptions | None = None,
+    budget: int = 20000,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Structures:
+    """Search the physics that a model lacks.
+
+    Args:
+        simulator: of an ``MjcfEnvironment``, the user's model with its unknowns.
+        trajectories: the logs.
+        prior: of the unknowns; default their own.
+        likelihood: how logs are cut into windows; the noise is coloured whatever it says.
+        restriction: which extensions may be tried, and where.
+        options: of the search.
+        budget: rollouts of all fits.
+        seed: of the searches.
+        checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits.
+        progress: called along the way.
+
+    Raises:
+        ValueError: for a simulator of anything but an MJCF, unknown extensions, or sites that the model does not have.
+        CheckpointError: for a checkpoint that is damaged or of another run.
+    """
+    search = _search(simulator, trajectories, prior, likelihood, restriction, options, budget, seed)
+    fingerprint = _fingerprint(search, simulator, restriction or Restriction())
+    state = DiscoverState()
+    if checkpoint is not None and checkpoint.exists():
+        state = load_state(checkpoint, DiscoverState, fingerprint)
+    saved = -_SAVE_SECONDS
+    while not state.done:
+        if progress is not None:
+            progress(search.describe(state), state.rollouts, search.budget)
+        state = search.step(state)
+        if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
+            save_state(checkpoint, state, fingerprint)
+            saved = time.monotonic()
+    search.place(state)
+    return Structures(search, state)
+
+
+def _search(
+    simulator: Simulator,
+    trajectories: Trajectories,
+    prior: Posterior | None,
+    likelihood: Segments | None,
+    restriction: Restriction | None,
+    options: DiscoverOptions | None,
+    budget: int,
+    seed: int,
+) -> StructureSearch:
+    environment = simulator.environment
+    if not isinstance(environment, MjcfEnvironment):
+        raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
+    restriction = restriction or Restriction()
+    _check_sites(environment, restriction.sites)
+    fitting = Fitting(
+        environment,
+        trajectories,
+        replace(likelihood or Segments(), noise="ar1"),
+        default_prior(environment.space) if prior is None else prior,
+        whole("seed", seed, 0),
+        simulator.num_threads or cores(),
+    )
+    extensions = [get_extension(name) for name in restriction.names]
+    return StructureSearch(fitting, extensions, restriction.sites, options, whole("budget", budget, 1, "rollout"))
+
+
+def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:
+    model = environment.compile()
+    known = [model.joint(j).name for j in range(model.njnt)]
+    known = [name for name in (*known, *environment.actuators, *environment.channels) if name]
+    for site in sites or ():
+        if site not in known:
+            hint = nearest_name(site, known) or f"; the model has {', '.join(known)}"
+            raise ValueError(f"structure.sites: no joint, actuator or channel {site!r}{hint}")
+
+
+def _fingerprint(search: StructureSearch, simulator: Simulator, restriction: Restriction) -> str:
+    """What tells searches apart."""
+    fitting = search.fitting
+    settings = {
+        "model": simulator.checksum(),
+        "space": fitting.environment.space.to_dict(),
+        "prior": [x.tolist() for x in fitting.prior.gaussian_moments()],
+        "likelihood": repr(fitting.likelihood),
+        "seed": fitting.seed,
+        "budget": search.budget,
+        "options": search.options.plain(),
+        "restriction": repr(restriction),
+        "extensions": list(EXTENSIONS),
+    }
+    return hashlib.sha256(f"{settings!r}{digest(fitting.trajectories)}".encode()).hexdigest()

@@ -1,0 +1,144 @@
+"""One structure fitted: the plain model with some extensions, where ``laplace`` found its optimum, and its scores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.strategy import distinct
+from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import GaussianMixture, Posterior
+from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.extension import Placed, extended
+from sipe_bayes.structure.scores import scores
+
+_FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
+
+
+@dataclass(frozen=True)
+class FittedStructure:
+    """Where the fit of a structure ended.
+
+    Args:
+        labels: of its extensions, none for the plain model.
+        theta: (N + P,), the optimum: the user's parameters, then those of the extensions in this order.
+        mean: (N + P,), of the posterior's normal before truncation.
+        covariance: (N + P, N + P), likewise.
+        sd: (C,), of the noise.
+        tau: (C,), its correlation time in seconds.
+        starts: (W, D), of the windows.
+        evidence: log p(y) in nats.
+        held_out: log score of held-out pieces in nats; None where there are no pieces.
+        rollouts: that the fit took.
+        settled: whether the search had come to rest.
+    """
+
+    labels: tuple[str, ...]
+    theta: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    sd: FloatArray
+    tau: FloatArray
+    starts: FloatArray
+    evidence: float
+    held_out: float | None
+    rollouts: int
+    settled: bool
+
+    @property
+    def noise(self) -> Noise:
+        """Of the residuals."""
+        return Noise(self.sd, self.tau)
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What every structure is fitted to.
+
+    Args:
+        environment: the user's model.
+        trajectories: the logs.
+        likelihood: windows with coloured noise.
+        prior: of the user's parameters.
+        seed: of the searches.
+        num_threads: native ones.
+    """
+
+    environment: MjcfEnvironment
+    trajectories: Trajectories
+    likelihood: Segments
+    prior: Posterior
+    seed: int
+    num_threads: int
+
+    def simulator(self, placed: Sequence[Placed]) -> Simulator:
+        """Of the model with extensions."""
+        return Simulator(extended(self.environment, placed) if placed else self.environment, self.num_threads)
+
+    def windows(self, simulator: Simulator) -> Windows:
+        """The logs bound to a model."""
+        return Windows(self.likelihood, simulator, self.trajectories)
+
+    def prior_of(self, simulator: Simulator) -> Posterior:
+        """The user's prior beside those of the extensions."""
+        space, n = simulator.space, len(self.prior.space)
+        own = default_prior(space)
+        mine = default_prior(self.prior.space)
+        same = zip(mine.gaussian_moments(), self.prior.gaussian_moments(), strict=True)
+        if len(space) == n or all(torch.equal(a, b) for a, b in same):
+            return own if len(space) > n else self.prior
+        mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
+        covariance[np.isinf(covariance)] = _FLAT_SD**2
+        mean[:n], covariance[:n, :n] = (x.numpy() for x in self.prior.gaussian_moments())
+        return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
+
+    def fit(self, placed: Sequence[Placed], initial: FloatArray | None, budget: int) -> FittedStructure:
+        """The best optimum of a structure, and its scores.
+
+        Args:
+            placed: its extensions.
+            initial: (N + P,), where the search begins; default as ``laplace`` does.
+            budget: rollouts at most.
+
+        Raises:
+            BudgetTooSmall: where it ends before there is an optimum.
+        """
+        simulator = self.simulator(placed)
+        prior = self.prior_of(simulator)
+        given = None if initial is None else initial[None]
+        laplace = Laplace(
+            simulator, prior=prior, budget=budget, seed=self.seed, likelihood=self.likelihood, initial=given
+        )
+        laplace.fit(self.trajectories)
+        assert laplace.state is not None
+        best = distinct(laplace.state.search.optima)[0]
+        assert isinstance(best, WindowOptimum)
+        windows, noise = self.windows(simulator), Noise(best.sd, best.tau)
+        both = scores(windows, best.theta, best.starts, noise, QuadraticPrior.of(prior))
+        labels = tuple(one.label for one in placed)
+        rollouts, settled = laplace.rollouts + windows.rollouts, best.finding is None
+        return FittedStructure(
+            labels,
+            best.theta,
+            best.mean,
+            best.covariance,
+            best.sd,
+            best.tau,
+            best.starts,
+            both.evidence,
+            both.held_out,
+            rollouts,
+            settled,
+        )

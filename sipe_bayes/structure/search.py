@@ -1,0 +1,296 @@
+r"""The search over structures: what promises most is fitted, the best is kept, again; then each kept piece is left out.
+
+**Steps** (``StructureSearch``), one of them a call of ``step``::
+
+    PLAIN   the model as it is
+      v
+    RANK    score tests of all extensions at the present structure (``candidates``)
+      |  something promises more than it costs          nothing does
+      v                                                      v
+    FIT     the best few, one a step ------------------>  PRUNE   each kept piece left out once
+      |  the best of them is better: it is kept               v
+      +--> RANK                                            RESIDUAL  a force without a name, as the yardstick
+                                                              v
+                                                            DONE
+
+**Judgement.** A structure S of K extensions out of n has
+
+.. math:: \log p(S \mid y) = \log p(y \mid S) - K (\log n + c) + const,
+
+and it counts only where the log score of held-out pieces has become better with it as well. Structures that are about
+equally good are not decided between: ``Structures.posterior`` averages over them.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.settings import BudgetTooSmall
+from sipe_bayes.structure.candidates import Candidate, candidates
+from sipe_bayes.structure.extension import Extension, Placed, placements
+from sipe_bayes.structure.fitted import FittedStructure, Fitting
+from sipe_bayes.structure.machine import Machine, machine_of
+
+
+class Phase(enum.Enum):
+    """What the next step does."""
+
+    PLAIN = "plain"
+    RANK = "rank"
+    FIT = "fit"
+    PRUNE = "prune"
+    RESIDUAL = "residual"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class DiscoverOptions(Options):
+    """How structures are searched."""
+
+    width: int = option(3, "candidates that are fitted in a round", least=1)
+    most: int = option(5, "extensions that a structure may have", least=1)
+    least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
+    sparsity: float = option(3.0, "against any extension: one model in twenty lacks a given kind", "nats", least=0)
+    fit_budget: int = option(2000, "rollouts of one fit", least=1)
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What an extension promised at a structure.
+
+    Args:
+        at: labels of the structure.
+        label: of the extension.
+        gain: promised log-likelihood in nats.
+        theta: (P,), where its parameters are to start.
+    """
+
+    at: tuple[str, ...]
+    label: str
+    gain: float
+    theta: FloatArray
+
+
+@dataclass(frozen=True)
+class DiscoverState:
+    """Where a search over structures stands.
+
+    Args:
+        phase: what comes next.
+        fitted: structures, the plain model first.
+        present: labels of the structure that is gone on from.
+        offers: all that was promised until now.
+        queue: labels of the extensions that this round still has to fit.
+        failed: labels of structures that could not be fitted.
+    """
+
+    phase: Phase = Phase.PLAIN
+    fitted: tuple[FittedStructure, ...] = ()
+    present: tuple[str, ...] = ()
+    offers: tuple[Offer, ...] = ()
+    queue: tuple[str, ...] = ()
+    failed: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def done(self) -> bool:
+        """Whether the search has ended."""
+        return self.phase is Phase.DONE
+
+    @property
+    def rollouts(self) -> int:
+        """Of all fits."""
+        return sum(one.rollouts for one in self.fitted)
+
+    def of(self, labels: Sequence[str]) -> FittedStructure | None:
+        """The fit of a structure, whatever the order of its extensions."""
+        return next((one for one in self.fitted if set(one.labels) == set(labels)), None)
+
+    @property
+    def here(self) -> FittedStructure:
+        """The fit of the present structure."""
+        here = self.of(self.present)
+        assert here is not None
+        return here
+
+
+class StructureSearch:
+    """A search over structures, step by step.
+
+    Args:
+        fitting: what structures are fitted to.
+        extensions: that may be used.
+        joints: names of joints, actuators and channels at which they may be placed; default all.
+        options: of the search.
+        budget: rollouts of all fits.
+    """
+
+    def __init__(
+        self,
+        fitting: Fitting,
+        extensions: Sequence[Extension],
+        joints: Sequence[str] | None = None,
+        options: DiscoverOptions | None = None,
+        budget: int = 20000,
+    ) -> None:
+        self.fitting, self.extensions, self.joints = fitting, tuple(extensions), joints
+        self.options, self.budget = options or DiscoverOptions(), budget
+        self._machine: Machine | None = None
+        self._placed: dict[str, Placed] = {}
+
+    def step(self, state: DiscoverState) -> DiscoverState:
+        """One fit or one ranking further."""
+        self.place(state)
+        if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
+            return replace(state, phase=Phase.DONE)
+        return {
+            Phase.PLAIN: self._plain,
+            Phase.RANK: self._rank,
+            Phase.FIT: self._fit,
+            Phase.PRUNE: self._prune,
+            Phase.RESIDUAL: self._residual,
+            Phase.DONE: lambda state: state,
+        }[state.phase](state)
+
+    def describe(self, state: DiscoverState) -> str:
+        """What comes next, for the progress bar."""
+        having = f" beside {' and '.join(state.present)}" if state.present else ""
+        return {
+            Phase.PLAIN: "fitting the model as it is",
+            Phase.RANK: f"testing {len(self._placed)} extensions{having}",
+            Phase.FIT: f"fitting {state.queue[0] if state.queue else ''}{having}",
+            Phase.PRUNE: "leaving out each piece once",
+            Phase.RESIDUAL: "fitting a force without a name",
+            Phase.DONE: "done",
+        }[state.phase]
+
+    @property
+    def placed(self) -> dict[str, Placed]:
+        """The extensions wherever the machine has a place for them, after the first step."""
+        return self._placed
+
+    @cached_property
+    def cost(self) -> float:
+        """Nats that an extension has to gain because there were so many to choose from."""
+        named = len([p for p in self._placed.values() if not p.extension.last_resort])
+        return math.log(max(named, 1)) + self.options.sparsity
+
+    def total(self, one: FittedStructure) -> float:
+        """Log posterior of a structure up to a constant."""
+        return one.evidence - self.cost * len(one.labels)
+
+    def better(self, one: FittedStructure, other: FittedStructure) -> bool:
+        """Whether both scores speak for a structure rather than for a smaller one."""
+        foretells = one.held_out is None or other.held_out is None or one.held_out > other.held_out
+        return self.total(one) > self.total(other) and foretells
+
+    def structure(self, labels: Sequence[str]) -> list[Placed]:
+        """The extensions of a structure."""
+        return [self._placed[label] for label in labels]
+
+    def place(self, state: DiscoverState) -> None:
+        """Place the extensions, once the plain model is fitted."""
+        if self._placed or not state.fitted:
+            return
+        plain = state.fitted[0]
+        windows = self.fitting.windows(self.fitting.simulator([]))
+        self._machine = machine_of(windows, plain.theta, plain.starts)
+        every = (p for e in self.extensions for p in placements(e, self._machine))
+        allowed = None if self.joints is None else set(self.joints)
+        self._placed = {p.label: p for p in every if allowed is None or p.site in allowed}
+
+    def _plain(self, state: DiscoverState) -> DiscoverState:
+        plain = self.fitting.fit([], None, self.options.fit_budget)
+        return replace(state, fitted=(plain,), phase=Phase.RANK)
+
+    def _rank(self, state: DiscoverState) -> DiscoverState:
+        here = state.here
+        if len(state.present) >= self.options.most:
+            return replace(state, phase=Phase.PRUNE)
+        ranked = self._ranked(here, last_resort=False)
+        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
+        promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
+        tried = [c.placed.label for c in promising if state.of([*state.present, c.placed.label]) is None]
+        queue = tuple(tried[: self.options.width])
+        phase = Phase.FIT if queue else Phase.PRUNE
+        return replace(state, offers=state.offers + offers, queue=queue, phase=phase)
+
+    def _ranked(self, here: FittedStructure, last_resort: bool) -> list[Candidate]:
+        fitting, own = self.fitting, self.structure(here.labels)
+        simulator = fitting.simulator(own)
+        windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
+        targets = {t for p in own for q in p.parameters for t in q.targets}
+        rest = [
+            p
+            for p in self._placed.values()
+            if p.label not in here.labels
+            and p.extension.last_resort == last_resort
+            and not targets & {t for q in p.parameters for t in q.targets}
+        ]
+        return candidates(windows, here.theta, here.starts, here.noise, prior, rest)
+
+    def _fit(self, state: DiscoverState) -> DiscoverState:
+        label, *rest = state.queue
+        offer = next(o for o in reversed(state.offers) if o.label == label and o.at == state.present)
+        state = self._fitted(state, (*state.present, label), np.concatenate([state.here.theta, offer.theta]))
+        state = replace(state, queue=tuple(rest))
+        if rest:
+            return state
+        return self._settled(state)
+
+    def _settled(self, state: DiscoverState) -> DiscoverState:
+        """The round's best is kept, or the search for more ends."""
+        here = state.here
+        grown = [o for o in state.fitted if len(o.labels) == len(here.labels) + 1 and set(here.labels) < set(o.labels)]
+        good = [one for one in grown if self.better(one, here)]
+        if not good:
+            return replace(state, phase=Phase.PRUNE)
+        best = max(good, key=self.total)
+        return replace(state, present=best.labels, phase=Phase.RANK)
+
+    def _prune(self, state: DiscoverState) -> DiscoverState:
+        """One smaller structure fitted, or all of them compared."""
+        here = state.here
+        if len(here.labels) < 2:
+            return replace(state, phase=Phase.RESIDUAL)
+        smaller = [tuple(x for x in here.labels if x != label) for label in here.labels]
+        for labels in smaller:
+            if state.of(labels) is None and labels not in state.failed:
+                keep = [i for i, label in enumerate(self._owners(here)) if label in (None, *labels)]
+                return self._fitted(state, labels, here.theta[keep])
+        known = [one for labels in smaller if (one := state.of(labels)) is not None]
+        without = [one for one in known if not self.better(here, one)]
+        if without:
+            return replace(state, present=max(without, key=self.total).labels)
+        return replace(state, phase=Phase.RESIDUAL)
+
+    def _residual(self, state: DiscoverState) -> DiscoverState:
+        ranked = self._ranked(state.here, last_resort=True)
+        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
+        state = replace(state, offers=state.offers + offers, phase=Phase.DONE)
+        if not ranked or ranked[0].gain <= self.cost + self.options.least_gain:
+            return state
+        best = ranked[0]
+        return self._fitted(state, (*state.present, best.placed.label), np.concatenate([state.here.theta, best.theta]))
+
+    def _owners(self, one: FittedStructure) -> list[str | None]:
+        """Whose each parameter of a structure is: None for the user's own."""
+        count = len(one.theta) - sum(len(self._placed[label].parameters) for label in one.labels)
+        own: list[str | None] = [None] * count
+        return own + [label for label in one.labels for _ in self._placed[label].parameters]
+
+    def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
+        left = min(self.options.fit_budget, self.budget - state.rollouts)
+        try:
+            one = self.fitting.fit(self.structure(labels), initial, max(left, 1))
+        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
+            return replace(state, failed=(*state.failed, labels))
+        return replace(state, fitted=(*state.fitted, one))

@@ -1,0 +1,150 @@
+"""What a search over structures has to say: a distribution over structures, and the posterior averaged over it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.extension import Placed
+from sipe_bayes.structure.fitted import FittedStructure
+from sipe_bayes.structure.search import DiscoverState, Offer, StructureSearch
+
+_NEGLIGIBLE = 1e-3  # probability below which a structure is left out of the average
+
+
+@dataclass(frozen=True)
+class StructureRow:
+    """A line of the table.
+
+    Args:
+        sentences: what the structure has beyond the plain model; empty for it.
+        labels: of its extensions.
+        evidence: nats over the plain model.
+        held_out: nats of held-out pieces over the plain model; None where there are no pieces.
+        probability: of the structure, given the logs.
+        rollouts: that its fit took.
+    """
+
+    sentences: tuple[str, ...]
+    labels: tuple[str, ...]
+    evidence: float
+    held_out: float | None
+    probability: float
+    rollouts: int
+
+
+@dataclass(frozen=True)
+class Structures:
+    """Structures that were fitted, the plain model first.
+
+    Args:
+        search: that fitted them.
+        state: where it ended.
+    """
+
+    search: StructureSearch
+    state: DiscoverState
+
+    @property
+    def fitted(self) -> tuple[FittedStructure, ...]:
+        """All of them."""
+        return self.state.fitted
+
+    @property
+    def rollouts(self) -> int:
+        """Of all fits."""
+        return self.state.rollouts
+
+    @property
+    def settled(self) -> bool:
+        """Whether every fit that matters came to rest and the budget was enough."""
+        return self.state.done and all(one.settled for p, one in zip(self.probabilities, self.fitted, strict=True) if p)
+
+    @cached_property
+    def probabilities(self) -> FloatArray:
+        """(S,) of the fitted structures; zero where held-out pieces speak against one, or a piece has no name."""
+        totals = np.array([self.search.total(one) if self._counts(one) else -np.inf for one in self.fitted])
+        weight = np.exp(totals - totals.max())
+        return weight / weight.sum()
+
+    def _counts(self, one: FittedStructure) -> bool:
+        """Whether a structure of named pieces foretells held-out pieces better than every smaller one tried."""
+        if any(self.search.placed[label].extension.last_resort for label in one.labels):
+            return False
+        smaller = [o for o in self.fitted if set(o.labels) < set(one.labels)]
+        return all(one.held_out is None or o.held_out is None or one.held_out > o.held_out for o in smaller)
+
+    @property
+    def best(self) -> FittedStructure:
+        """The most probable structure."""
+        return self.fitted[int(self.probabilities.argmax())]
+
+    @property
+    def plain(self) -> FittedStructure:
+        """The model as it was."""
+        return self.fitted[0]
+
+    def placed(self, one: FittedStructure) -> list[Placed]:
+        """The extensions of a structure."""
+        return self.search.structure(one.labels)
+
+    def simulator(self, one: FittedStructure) -> Simulator:
+        """Of a structure."""
+        return self.search.fitting.simulator(self.placed(one))
+
+    def inclusion(self) -> dict[str, float]:
+        """Probability of each extension that was tried, most probable first."""
+        labels = {label for one in self.fitted for label in one.labels}
+        sums = {
+            label: float(sum(p for p, o in zip(self.probabilities, self.fitted, strict=True) if label in o.labels))
+            for label in labels
+        }
+        return dict(sorted(sums.items(), key=lambda item: (-item[1], item[0])))
+
+    def offers(self, at: Sequence[str] = ()) -> list[Offer]:
+        """What was promised at a structure, best first."""
+        return sorted((o for o in self.state.offers if set(o.at) == set(at)), key=lambda o: -o.gain)
+
+    def table(self) -> list[StructureRow]:
+        """All that was fitted, most probable first."""
+        plain, rows = self.plain, []
+        for p, one in zip(self.probabilities.tolist(), self.fitted, strict=True):
+            held_out = None
+            if one.held_out is not None and plain.held_out is not None:
+                held_out = one.held_out - plain.held_out
+            sentences = tuple(x.sentence for x in self.placed(one))
+            rows.append(StructureRow(sentences, one.labels, one.evidence - plain.evidence, held_out, p, one.rollouts))
+        return sorted(rows, key=lambda row: (-row.probability, -row.evidence))
+
+    @property
+    def named_share(self) -> float | None:
+        """Of the evidence that a force without a name could explain beside the best structure, what named pieces do.
+
+        None where no such force was fitted.
+        """
+        for one in self.fitted:
+            if any(self.search.placed[label].extension.last_resort for label in one.labels):
+                whole = max(one.evidence, self.best.evidence) - self.plain.evidence
+                return (self.best.evidence - self.plain.evidence) / whole if whole > 0 else None
+        return None
+
+    @property
+    def posterior(self) -> GaussianMixture:
+        """Of the user's parameters, averaged over the structures."""
+        space = self.search.fitting.prior.space
+        n = len(space)
+        kept = [(p, o) for p, o in zip(self.probabilities, self.fitted, strict=True) if p > _NEGLIGIBLE]
+        weights = np.log([p for p, _ in kept])
+        means = np.stack([o.mean[:n] for _, o in kept])
+        covariances = np.stack([o.covariance[:n, :n] for _, o in kept])
+        return GaussianMixture(weights, means, covariances, space)
+
+    def posterior_of(self, one: FittedStructure) -> GaussianMixture:
+        """Of all parameters of one structure, the extensions' behind the user's."""
+        return GaussianMixture(np.zeros(1), one.mean[None], one.covariance[None], self.simulator(one).space)
