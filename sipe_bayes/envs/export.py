@@ -14,6 +14,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.envs.laws import LAW_OF
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
 
@@ -95,7 +96,9 @@ def _absolute_assets(spec: mujoco.MjSpec, source: str) -> None:
 
 def _copy(spec: mujoco.MjSpec, model: mujoco.MjModel, target: str) -> None:
     kind, name, attribute = split(target)
-    if kind == "body":
+    if (kind, attribute) in LAW_OF:
+        _copy_numeric(spec, model, f"{kind}:{name}.{LAW_OF[kind, attribute][0].name}")
+    elif kind == "body":
         _copy_inertial(spec, model, name)
     elif kind == "joint":
         _copy_joint(spec, model, name, attribute)
@@ -124,13 +127,19 @@ def _copy_inertial(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Non
             body.fullinertia[:] = np.nan
 
 
+def _copy_numeric(spec: mujoco.MjSpec, model: mujoco.MjModel, label: str) -> None:
+    numeric, index = next(n for n in spec.numerics if n.name == label), model.numeric(label).id
+    first = int(model.numeric_adr[index])
+    numeric.data = model.numeric_data[first : first + int(model.numeric_size[index])]
+
+
 def _copy_joint(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str, attribute: str) -> None:
     joint, index = spec.joint(name), model.joint(name).id
     dof = int(model.jnt_dofadr[index])
-    if attribute == "damping":
-        joint.damping[0] = model.dof_damping[dof]
-    elif attribute == "stiffness":
-        joint.stiffness[0] = model.jnt_stiffness[index]
+    if attribute.startswith("damping"):
+        joint.damping[:] = [model.dof_damping[dof], *model.dof_dampingpoly[dof]]
+    elif attribute.startswith("stiffness"):
+        joint.stiffness[:] = [model.jnt_stiffness[index], *model.jnt_stiffnesspoly[index]]
     elif attribute == "springref":
         value = float(model.qpos_spring[int(model.jnt_qposadr[index])])
         hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -145,4 +154,7 @@ def _copy_actuator(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Non
     actuator.gainprm[:] = model.actuator_gainprm[index]
     actuator.biasprm[:] = model.actuator_biasprm[index]
     actuator.biastype = mujoco.mjtBias(int(model.actuator_biastype[index]))
+    actuator.dynprm[:] = model.actuator_dynprm[index]
     actuator.delay = float(model.actuator_delay[index])
+    if model.actuator_forcelimited[index]:
+        actuator.forcelimited, actuator.forcerange[:] = True, model.actuator_forcerange[index]

@@ -179,7 +179,9 @@ class Residual(Law):
     def value(self, now: Now) -> FloatArray:
         """Sum over k of w_k cos(omega_k . (q / l_q, v / l_v, u / l_u) + b_k)."""
         inputs = np.stack([now.position, now.velocity, now.command], axis=1) / now.numbers[:, :3]
-        features = np.cos(inputs @ self.frequencies + self.phases) * np.sqrt(2 / _FEATURES)
+        # a column at a time: the last bit of a matrix product depends on the batch
+        angles = sum((inputs[:, i, None] * row for i, row in enumerate(self.frequencies)), self.phases)
+        features = np.cos(angles) * np.sqrt(2 / _FEATURES)
         return (now.numbers[:, 3:] * features).sum(1)
 
 

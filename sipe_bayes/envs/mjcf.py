@@ -21,7 +21,7 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import Channel, Reader, check_sensors, reader_of, state_column
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
-from sipe_bayes.envs.laws import LAW_OF, declare
+from sipe_bayes.envs.laws import LAW_OF, LawError, declare, laws_of
 from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
 from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, shifted_channels, with_model_values
 
@@ -106,7 +106,11 @@ class MjcfEnvironment(Environment):
         """
         channels = tuple(c if isinstance(c, Channel) else Channel(c) for c in measurements)
         parameters = tuple(parameters)
-        model = compile_spec(_prepared(str(source), parameters, edits), str(source))
+        try:
+            model = compile_spec(_prepared(str(source), parameters, edits), str(source))
+            laws_of(model)
+        except LawError as error:
+            raise TargetError(str(error)) from None
         for actuator in actuators:
             _single_control(model, actuator)
         channels = tuple(replace(c, name=c.label, unit=reader_of(model, c).unit) for c in channels)

@@ -319,6 +319,8 @@ def _law(number: Number, label: str, slot: int) -> Maker:
 
     def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
         numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{spec.rpartition('.')[0]}.{label}")
+        if numeric < 0:
+            raise TargetError(f"target {spec!r}: the model does not declare this law; build an MjcfEnvironment of it")
         at = int(model.numeric_adr[numeric]) + slot
 
         def write(other: mujoco.MjModel, value: float) -> None:

@@ -15,6 +15,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs import targets
 from sipe_bayes.envs.export import write_identified
 from sipe_bayes.envs.inertia import body_frame_inertia, check_inertia
+from sipe_bayes.envs.laws import LAW_OF, LAWS, declare
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import TargetError, bind
 
@@ -37,7 +38,9 @@ XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><world
   <general name="general" joint="hinge2" gainprm="4" biastype="affine" biasprm=".1 -3 -.2"
     dyntype="filter" dynprm=".1"/>
   <velocity name="velocity" joint="hinge" kv="3"/>
-  <motor name="late" joint="hinge2" nsample="10" delay=".004"/></actuator></mujoco>"""
+  <motor name="late" joint="hinge2" nsample="10" delay=".004"/>
+  <motor name="weak" joint="hinge2" forcerange="-3 3"/>
+  <general name="slow" joint="hinge2" dyntype="filterexact" dynprm=".02" actearly="true"/></actuator></mujoco>"""
 
 Edit = Callable[[Any, float], None]
 
@@ -78,6 +81,10 @@ def offset(element: Any, value: float) -> None:
     actuator(0)(element, element.biasprm[0] + element.gainprm[0] * value)
 
 
+def limit(element: Any, value: float) -> None:
+    element.forcelimited, element.forcerange = True, [-value, value]
+
+
 def mass(element: Any, value: float) -> None:
     element.inertia = np.array(element.inertia) * value / element.mass
     element.mass = value
@@ -99,6 +106,7 @@ def inertia(row: int, column: int) -> Edit:
     return edit
 
 
+LAW_AT = {"joint": "joint:hinge", "actuator": "actuator:motor"}
 # (target, value, unit, how the spec is edited)
 CASES: list[tuple[str, float, str, Edit]] = [
     ("body:rod.mass", 1.7, "kg", mass),
@@ -127,6 +135,10 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("joint:slide.stiffness", 2.0, "N/m", vector("stiffness", 0)),
     ("joint:hinge.springref", 0.3, "rad", springref),
     ("joint:slide.springref", 0.03, "m", scalar("springref")),
+    ("joint:hinge.damping_quadratic", 0.2, "N m/(rad/s)^2", vector("damping", 1)),
+    ("joint:slide.damping_cubic", 0.2, "N/(m/s)^3", vector("damping", 2)),
+    ("joint:slide.stiffness_quadratic", -4.0, "N/(m)^2", vector("stiffness", 1)),
+    ("joint:hinge.stiffness_cubic", 4.0, "N m/(rad)^3", vector("stiffness", 2)),
     ("actuator:motor.gear", 3.0, "1", vector("gear", 0)),
     ("actuator:position.gear", 1.5, "1", vector("gear", 0)),
     ("actuator:motor.gain", 2.5, "force/command", vector("gainprm", 0)),
@@ -139,6 +151,8 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("actuator:motor.offset", 0.2, "command", offset),
     ("actuator:general.offset", -0.2, "command", offset),
     ("actuator:late.delay", 0.01, "s", scalar("delay")),
+    ("actuator:weak.force_limit", 2.0, "force", limit),
+    ("actuator:slow.lag", 0.05, "s", vector("dynprm", 0)),
     ("geom:box.friction", 0.3, "1", vector("friction", 0)),
     ("geom:box.friction_torsional", 0.01, "m", vector("friction", 1)),
     ("geom:floor.friction_rolling", 0.002, "m", vector("friction", 2)),
@@ -147,12 +161,18 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("option.wind_y", 0.5, "m/s", vector("wind", 1)),
     ("option.density", 2.0, "kg/m^3", scalar("density")),
     ("option.viscosity", 1e-3, "Pa s", scalar("viscosity")),
+    *(
+        (f"{LAW_AT[kind]}.{attribute}", 0.3, law.numbers[slot].unit, vector("data", slot))
+        for (kind, attribute), (law, slot) in LAW_OF.items()
+    ),
 ]
 
 
 def frozen_spec() -> Any:
-    """The spec with its bodies' inertia written out, so that it may be edited."""
+    """The spec with its bodies' inertia written out, so that it may be edited, and every law."""
     spec = mujoco.MjSpec.from_string(XML)
+    for law in LAWS.values():
+        declare(spec, law.kind, LAW_AT[law.kind].partition(":")[2], law)
     model = spec.compile()
     for body in spec.bodies[1:]:
         body.explicitinertial, body.simple = True, False
@@ -163,7 +183,10 @@ def frozen_spec() -> Any:
 
 
 def element(spec: Any, target: str) -> Any:
-    kind, name, _ = targets.split(target)
+    kind, name, attribute = targets.split(target)
+    if (kind, attribute) in LAW_OF:
+        label = f"{kind}:{name}.{LAW_OF[kind, attribute][0].name}"
+        return next(numeric for numeric in spec.numerics if numeric.name == label)
     return spec.option if kind == "option" else getattr(spec, kind)(name)
 
 
@@ -241,7 +264,7 @@ def test_repeated_writes_do_not_drift(target: str) -> None:
 @pytest.mark.parametrize(("target", "value"), [c[:2] for c in CASES], ids=[c[0] for c in CASES])
 def test_an_exported_model_has_the_value(target: str, value: float, tmp_path: Path) -> None:
     """The writing of the file compares every field of the model; a target that nothing copies is refused."""
-    model = mujoco.MjModel.from_xml_string(XML)
+    model = frozen_spec().compile()
     low, high = sorted((bind(model, target).value, value))
     environment = MjcfEnvironment.build(
         XML, [Parameter("p", low, high, targets=(target,))], [], ["joint:hinge.position"]
@@ -288,6 +311,16 @@ def test_offset_is_gain_times_command() -> None:
         torque.append(data.actuator_force[model.actuator("motor").id])
     assert torque[0] == pytest.approx(2.1, rel=1e-14)
     assert torque[1] == pytest.approx(torque[0], rel=1e-14)
+
+
+def test_a_limit_that_the_model_has_not_is_endless(tmp_path: Path) -> None:
+    target, model = "actuator:motor.force_limit", frozen_spec().compile()
+    assert bind(model, target).value == np.inf
+    assert bind(written(model, (target, 1.5)), target).value == 1.5
+    environment = MjcfEnvironment.build(XML, [Parameter("p", 1, 5, targets=(target,))], [], ["joint:hinge.position"])
+    assert environment.space[0].default == 5.0
+    assert write_identified(environment, np.array([1.5]), tmp_path / "identified.xml") == []
+    assert bind(mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")), target).value == 1.5
 
 
 @pytest.mark.parametrize(

@@ -170,9 +170,18 @@ def rows(heading: str) -> dict[str, str]:
     section = README.split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
     found = {}
     for line in section.splitlines():
-        if match := re.match(r"\|\s*`([^`]+)`\s*\|", line):
-            found[match[1]] = line
+        if match := re.match(r"\|\s*`([^`]+)`(?: to `([^`]+)`)?\s*\|", line):
+            found.update(dict.fromkeys(numbered(match[1], match[2]), line))
     return found
+
+
+def numbered(first: str, last: str | None) -> list[str]:
+    """All from one word to another that differs in the number at its end."""
+    if last is None:
+        return [first]
+    stem = first.rstrip("0123456789")
+    assert last.rstrip("0123456789") == stem
+    return [f"{stem}{k}" for k in range(int(first[len(stem) :]), int(last[len(stem) :]) + 1)]
 
 
 def target_words() -> list[str]:
