@@ -5,9 +5,9 @@
 
 Machines: a pendulum with a motor, a double pendulum with a motor at each joint, and a horizontal slide with a drive;
 mass and damping of each body unknown, positions measured (5 s, 100 Hz) with noise of half a percent of their
-root-mean-square, white or AR(1) with rho 0.9; commands are sums of sines. Planted is one extension of the library at one
-joint, in three sizes: what its force (or what it does to the command) is of the joint's usual force, 5, 10 and 20 %;
-delays of 1, 2 and 4 samples. The null is the right model.
+root-mean-square, white or AR(1) with rho 0.9; commands are sums of sines. Planted is one extension of the library at
+one joint, in three sizes: what its force (or what it does to the command) is of the joint's usual force, 5, 10 and 20
+%; delays of 1, 2 and 4 samples. The null is the right model.
 
 A cause is named where the most probable structure holds the planted extension, and at the right joint where it holds it
 there. Coverage is that of 90 % intervals of the masses, without the search and averaged over its structures. Every
@@ -61,8 +61,7 @@ MACHINES = {
         (("upper", "shoulder", "drive1", 2.0), ("lower", "elbow", "drive2", 0.8)),
     ),
     "slide": (
-        HEAD
-        + '<body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="2"/>'
+        HEAD + '<body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="2"/>'
         '<geom type="box" size="0.1 0.1 0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>'
         '<actuator><motor name="drive" joint="rail"/></actuator></mujoco>',
         (("cart", "rail", "drive", 6.0),),
@@ -84,7 +83,9 @@ EFFECTS = (
     "force_drop",
     "cogging",
 )
-ALIKE = {"sensor_offset": ("offset", "gravity_tilt", "spring")}  # of a pendulum: the same motion but for the second order
+ALIKE = {
+    "sensor_offset": ("offset", "gravity_tilt", "spring")
+}  # of a pendulum: the same motion but for the second order
 
 
 def plain(machine: str) -> sipe.Simulator:
@@ -205,7 +206,9 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
         out["cells"]["/".join(key)] = {
             "searches": len(mine),
             "named": float(np.mean(kind)) if key[1] != "null" else None,
-            "at the right place": float(np.mean([r["planted"] in r["named"] for r in mine])) if key[1] != "null" else None,
+            "at the right place": float(np.mean([r["planted"] in r["named"] for r in mine]))
+            if key[1] != "null"
+            else None,
             "something named": float(np.mean([bool(r["named"]) for r in mine])),
             "coverage before": float(np.mean([x for r in mine for x in r["inside"]["before"]])),
             "coverage after": float(np.mean([x for r in mine for x in r["inside"]["after"]])),
@@ -235,8 +238,11 @@ def main() -> None:
                 continue
             row = keep(given.out, searched(name, effect, size, noise, seed))
             rows.append(row)
-            print(f"{name:9s} {row['planted'] or 'null':28s} {size:6s} {noise:5s} {row['named']} "
-                  f"{row['evidence']:.1f} {row['seconds']:.0f} s", flush=True)
+            print(
+                f"{name:9s} {row['planted'] or 'null':28s} {size:6s} {noise:5s} {row['named']} "
+                f"{row['evidence']:.1f} {row['seconds']:.0f} s",
+                flush=True,
+            )
     write_text(HERE / "results" / "discover.json", json.dumps(tables(rows), indent=1) + "\n")
 
 

@@ -3,9 +3,10 @@
 At the estimate, with parameters and windows' starts free to follow (linearised, but for parameters that the log presses
 against a bound) and autoregressive noise, two kinds of statistics are looked at.
 
-- *Probes* (``diagnostics.probes``): a force that the model may lack, as a change of an actuator's command by b phi(t).
-  The score statistic of b, all else projected out, is chi-square with one degree of freedom (C. R. Rao 1948,
-  https://doi.org/10.1017/S0305004100023987): the simulation answers what such a force would have done to every sample.
+- *Probes*: a small step of each extension that ``structure`` has a place for, away from the model as it is. The score
+  statistic of its size b, all else projected out, is chi-square with one degree of freedom (C. R. Rao 1948,
+  https://doi.org/10.1017/S0305004100023987): the simulation answers what such physics would have done to every sample.
+  A size that may not be negative counts as none where it would be.
 - *Whiteness* of each channel's whitened residuals: the sum of squared autocorrelations over lags 1, 2, 3, 5, 8, ...
   (G. Box, D. Pierce 1970, https://doi.org/10.1080/01621459.1970.10481180), and the largest mean square of ten pieces of
   time.
@@ -21,10 +22,11 @@ Deviations:
 
 - The log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
   estimates.
-- A probe acts through an actuator, so what is wrong at a joint that none drives is left to whiteness, which slow misfit
-  passes as slow noise.
+- Probes are of a user's MJCF; of other environments only whiteness is asked, which slow misfit passes as slow noise.
+- Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.
 - Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is named even if
-  whiteness is odder, since it says more. A cause that is named is the one that fits best, not one that is proven.
+  whiteness is odder, since it says more. Causes whose statistics are about as large are named together; one that is
+  named fits best, it is not proven (``sipe discover`` fits them and compares).
 """
 
 from __future__ import annotations
@@ -38,7 +40,6 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import best_starts
-from sipe_bayes.diagnostics.probes import probe_effects
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
@@ -46,6 +47,7 @@ from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.structure.probes import Probe, probes
 
 _FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
 _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
@@ -58,6 +60,8 @@ class MisfitOptions(Options):
     simulated: int = option(199, "draws of the null: p resolves half a percent", least=1)
     pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
+    alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
+    causes: int = option(3, "that are named at most", least=1)
     batch: int = option(16, "draws of the null whose products are formed together", least=1)
 
 
@@ -133,7 +137,7 @@ class _Residuals:
         linearisation = windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        self.probes, effects = probe_effects(windows, theta, starts)
+        self.probes, effects, self.one_sided = probes(windows, theta, starts)
         n = windows.num_theta
         parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
         self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
@@ -230,7 +234,7 @@ class _Residuals:
         gradient = arrow.gradient[n:] - inner[n:, :n] @ base
         information = np.diag(inner)[n:] - np.einsum("ik,ik->k", inner[:n, n:], cross)
         usable = information > 1e-6 * np.diag(inner)[n:] + 2 * _FLAT_PRECISION
-        information = np.where(usable, information, np.inf)
+        information = np.where(usable & ~(self.one_sided & (gradient < 0)), information, np.inf)
         # what theta and starts leave, whitened by channel
         base = np.concatenate([base, np.zeros(self.count - n)])
         left = self._left(residual, base, arrow.blocks(base))
@@ -264,8 +268,18 @@ class _Residuals:
         share = np.clip(1 - after / np.maximum(before, 1e-300), 0, 1)
         sd = np.sqrt(seen.variance) if sd is None else sd
         shift = (np.clip(self.theta + step[:n] - seen.step[:n], 0, 1) - self.theta) / np.maximum(sd, 1e-12)
-        named = self.probes[probe]
-        return self._placed(p, named.name, named.remedy, gains, share, dict(zip(names, shift.tolist(), strict=True)))
+        causes = self._alike(probe, seen)
+        cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
+        return self._placed(
+            p, cause, f"{remedy}; or run sipe discover", gains, share, dict(zip(names, shift.tolist(), strict=True))
+        )
+
+    def _alike(self, probe: int, seen: _Solved) -> list[Probe]:
+        """The best probe and those of other causes that explain about as much, best first."""
+        square = seen.score**2 / seen.information
+        close = [k for k in np.argsort(-square) if square[k] >= MISFIT.alike * square[probe]]
+        named = {self.probes[k].name: self.probes[k] for k in [probe, *close]}
+        return list(named.values())[: MISFIT.causes]
 
     def _colour_named(self, p: float, statistic: int, seen: _Solved) -> Misfit:
         """statistic: of 2 C, autocorrelations first."""

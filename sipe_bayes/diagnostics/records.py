@@ -209,11 +209,15 @@ class Misfit:
 
     @property
     def finding(self) -> Finding:
-        """It as a finding: about the parameters that move, or about all where that cannot be told."""
+        """It as a finding: about all parameters where it explains much, else about those that move.
+
+        A cause that explains much may have the wrong name, and then other parameters move.
+        """
+        small = max(self.share.values(), default=0.0) < THRESHOLDS.small_misfit
         code = Code.MISFIT_SHIFTS if self.moved else Code.MISFIT if self.matters else Code.SMALL_MISFIT
         return finding(
             code if self.alarm else Code.NO_MISFIT,
-            parameters=self.moved if self.matters else (),
+            parameters=self.moved if self.matters and small else (),
             log=self.log,
             p=self.p,
             cause=self.cause,

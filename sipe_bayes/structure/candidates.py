@@ -20,7 +20,7 @@ from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure.extension import Placed
-from sipe_bayes.structure.probes import Effect, effects
+from sipe_bayes.structure.probes import Effect, bounds, effects
 
 _FAINT = 1e-6  # of a probe's information, of its prior: what theta and the starts imitate to within that has no size
 _SHAPED = 0.1  # of a parameter's range: a probe that goes further gives a shape, not a size
@@ -93,7 +93,7 @@ class _Around:
     def candidate(self, effect: Effect, plain: _Fitted) -> Candidate:
         """What an extension promises, within its bounds, beside the linear model without it."""
         at, probes = effect.placed.plain, effect.probes
-        low, high = _bounds(at, probes)
+        low, high = bounds(at, probes)
         use = np.ones(len(probes), bool)
         amplitude, level = np.zeros(len(probes)), plain.level
         while use.any():
@@ -134,12 +134,3 @@ class _Around:
         step = np.linalg.solve(arrow.precision + precision, total)
         square = float(normal[:, -1, -1].sum()) - arrow.explained - float(total @ step)
         return _Fitted(-0.5 * (moments.log_determinant(noise) + square), np.asarray(step[n:], float), noise)
-
-
-def _bounds(plain: FloatArray, probes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far (K,) each probe can be followed, backwards and forwards, within the cube."""
-    direction = probes - plain
-    with np.errstate(divide="ignore", invalid="ignore"):
-        up = np.where(direction > 0, (1 - plain) / direction, np.where(direction < 0, -plain / direction, np.inf))
-        down = np.where(direction > 0, -plain / direction, np.where(direction < 0, (1 - plain) / direction, -np.inf))
-    return np.minimum(down.max(1), 0.0), np.maximum(up.min(1), 0.0)

@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Placed, extended
+from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.machine import machine_of
+from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,58 @@ class Effect:
     placed: Placed
     change: FloatArray
     probes: FloatArray
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A cause that a model may lack: what it is, and what to do about it, in words."""
+
+    name: str
+    remedy: str
+
+
+def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[Probe], FloatArray, BoolArray]:
+    """Probes of all extensions that the registry has; none where the environment is no user's MJCF.
+
+    Args:
+        windows: the logs, W windows of L samples and C channels.
+        theta: (N,) where the model stands.
+        starts: (W, D) of the windows.
+
+    Returns:
+        The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size of
+        each (K,) may not be negative.
+    """
+    if not isinstance(windows.simulator.environment, MjcfEnvironment):
+        return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
+    machine = machine_of(windows, theta, starts)
+    every = [p for name in EXTENSIONS for p in placements(get_extension(name), machine)]
+    seen = effects(windows, theta, starts, [p for p in every if not p.extension.last_resort])
+    named = [_named(effect.placed) for effect in seen for _ in effect.probes]
+    one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
+    nothing = np.zeros((*windows.observed.shape, 0))
+    changes = np.concatenate([nothing, *(_unit(effect.change) for effect in seen)], axis=-1)
+    return named, changes, np.concatenate([np.zeros(0, bool), *one_sided])
+
+
+def _unit(change: FloatArray) -> FloatArray:
+    """Changes (W, L, C, K) in units of their root-mean-square."""
+    return change / np.sqrt((change**2).mean((0, 1, 2)))
+
+
+def _named(placed: Placed) -> Probe:
+    targets = [target for parameter in placed.parameters for target in parameter.targets]
+    what = "a parameter" if len(targets) == 1 else "parameters"
+    return Probe(placed.sentence, f"make {' and '.join(targets)} {what}, or widen its bounds")
+
+
+def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far probes (K, P) can be followed from the plain model (P,) within the cube, backwards and forwards: (K,)."""
+    direction = tried - plain
+    with np.errstate(divide="ignore", invalid="ignore"):
+        up = np.where(direction > 0, (1 - plain) / direction, np.where(direction < 0, -plain / direction, np.inf))
+        down = np.where(direction > 0, -plain / direction, np.where(direction < 0, (1 - plain) / direction, -np.inf))
+    return np.minimum(down.max(1), 0.0), np.maximum(up.min(1), 0.0)
 
 
 def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Sequence[Placed]) -> list[Effect]:
