@@ -47,12 +47,21 @@ class LawError(ValueError):
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a law: the attribute that writes it, its unit, its value where the law does nothing, its least."""
+    """One number of a law.
+
+    Args:
+        attribute: of the target that writes it.
+        unit: of its value.
+        neutral: where the law does nothing; of a shape, where a model has it until a parameter writes it.
+        minimum: the smallest value.
+        shape: whether it is the shape of a force, not its size: then no value of it stands for the plain model.
+    """
 
     attribute: str
     unit: str
     neutral: float = 0.0
     minimum: float = -np.inf
+    shape: bool = False
 
 
 @dataclass(frozen=True)
@@ -129,7 +138,10 @@ class Stribeck(Law):
     """Dry friction that is larger at low speed."""
 
     name = "stribeck"
-    numbers = (Number("stribeck_friction", "force", minimum=0.0), Number("stribeck_velocity", "velocity", 1.0, 1e-12))
+    numbers = (
+        Number("stribeck_friction", "force", minimum=0.0),
+        Number("stribeck_velocity", "velocity", 1.0, 1e-12, shape=True),
+    )
 
     def value(self, now: Now) -> FloatArray:
         """P exp(-(v / v_s)^2)."""
@@ -141,7 +153,11 @@ class Cogging(Law):
     """A torque that goes round with the position."""
 
     name, friction = "cogging", False
-    numbers = (Number("cogging_sin", "force"), Number("cogging_cos", "force"), Number("cogging_poles", "1", 1.0))
+    numbers = (
+        Number("cogging_sin", "force"),
+        Number("cogging_cos", "force"),
+        Number("cogging_poles", "1", 1.0, shape=True),
+    )
 
     def value(self, now: Now) -> FloatArray:
         """A sin(n q) + b cos(n q)."""
@@ -171,7 +187,7 @@ class Residual(Law):
     name, friction = "residual", False
     scales = ("residual_position", "residual_velocity", "residual_command")
     numbers = (
-        *(Number(scale, "", 1.0, 1e-12) for scale in scales),
+        *(Number(scale, "", 1.0, 1e-12, shape=True) for scale in scales),
         *(Number(f"residual_{k}", "force") for k in range(_FEATURES)),
     )
     frequencies, phases = _frequencies()

@@ -56,6 +56,7 @@ class Target:
         minimum: the smallest physical value.
         physical: whether it is a property of the machine that a report may compare with the model's.
         step: the least change that a finite difference can be taken over, from values below it.
+        shape: whether its value in the model says nothing, as that of a force's shape while its size is zero.
     """
 
     spec: str
@@ -67,6 +68,7 @@ class Target:
     minimum: float = -np.inf
     physical: bool = True
     step: float = 0.0
+    shape: bool = False
 
 
 def named(model: mujoco.MjModel, kind: str, name: str, where: str) -> int:
@@ -326,7 +328,8 @@ def _law(number: Number, label: str, slot: int) -> Maker:
         def write(other: mujoco.MjModel, value: float) -> None:
             other.numeric_data[at] = value
 
-        return Target(spec, number.unit, float(model.numeric_data[at]), write, minimum=number.minimum)
+        value = float(model.numeric_data[at])
+        return Target(spec, number.unit, value, write, minimum=number.minimum, shape=number.shape)
 
     return make
 

@@ -56,7 +56,7 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
     """The parameter with the unit and the default that the model gives it; raises TargetError where it gives none."""
     if not parameter.targets:
         raise TargetError(f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass")
-    units, values, least = [], [], -np.inf
+    units, values, least, shape = [], [], -np.inf, False
     for spec in parameter.targets:
         shifted = shifted_channels(spec, channels)
         if shifted is not None:
@@ -69,7 +69,7 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
             raise TargetError(f"parameter {parameter.name!r}: {error}") from None
         units.append(target.unit)
         values.append(target.value)
-        least = max(least, target.minimum)
+        least, shape = max(least, target.minimum), shape or target.shape
     if parameter.relative and parameter.default is None:
         parameter = _absolute(parameter, values[0])
     if parameter.low < least:
@@ -77,7 +77,9 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
             f"parameter {parameter.name!r}: bounds from {parameter.low:g} {parameter.unit or units[0]}, but "
             f"{parameter.targets[0]} cannot be below {least:g}; raise the lower one"
         )
-    default = parameter.high if math.isinf(values[0]) else values[0]  # a limit that the model has not
+    default: float | None = parameter.high if math.isinf(values[0]) else values[0]  # a limit that the model has not
+    if shape:
+        default = parameter.default
     return replace(parameter, unit=parameter.unit or units[0], default=default)
 
 

@@ -54,8 +54,8 @@ def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[lis
         starts: (W, D) of the windows.
 
     Returns:
-        The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size of
-        each (K,) may not be negative.
+        The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
+        of each (K,) may not be negative.
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
