@@ -282,6 +282,31 @@ def declare(spec: mujoco.MjSpec, kind: str, name: str, law: Law) -> None:
         spec.add_sensor(name=label, type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=label)
 
 
+@dataclass(frozen=True)
+class LawNumbers:
+    """An edit that declares a law, some of its numbers at other values than the neutral ones.
+
+    Args:
+        owner: ``joint:NAME`` or ``actuator:NAME``.
+        law: its name.
+        values: (attribute, value) of the numbers that a law keeps where it does nothing.
+    """
+
+    owner: str
+    law: str
+    values: tuple[tuple[str, float], ...]
+
+    def __call__(self, spec: mujoco.MjSpec) -> None:
+        """Declare it."""
+        kind, _, name = self.owner.partition(":")
+        declare(spec, kind, name, LAWS[self.law])
+        numeric = next(n for n in spec.numerics if n.name == f"{self.owner}.{self.law}")
+        data = np.array(numeric.data, float)
+        for attribute, value in self.values:
+            data[LAW_OF[kind, attribute][1]] = value
+        numeric.data = data
+
+
 def laws_of(model: mujoco.MjModel) -> tuple[BoundLaw, ...]:
     """The laws that a compiled model's numerics declare."""
     found = []

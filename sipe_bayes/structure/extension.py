@@ -21,9 +21,10 @@ is named by its import path. The simplest::
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -31,6 +32,8 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
+from sipe_bayes.envs.targets import TargetError, bind
+from sipe_bayes.envs.unknowns import physical_targets
 from sipe_bayes.structure.machine import Machine
 
 Kind = Literal["joint", "actuator", "channel", "world"]
@@ -133,7 +136,7 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     }
     taken, count = machine.written(), len(machine.environment.parameters)
     for site in sites[extension.kind]:
-        parameters = extension.parameters(machine, site)
+        parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
         if not parameters or any(t in taken for p in parameters for t in p.targets):
             continue
         draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, len(parameters))))
@@ -143,3 +146,16 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
             continue  # the model has no place for it, or a value of its own beyond these bounds
         own = tuple(space)[count:]
         yield Placed(extension, site, own, draft.edit, extension.probes(machine, own))
+
+
+def _with_own(machine: Machine, parameter: Parameter) -> Parameter:
+    """A parameter whose bounds hold the model's own values and as much again."""
+    low, high = parameter.low, parameter.high
+    for target in physical_targets(parameter.targets):
+        try:
+            own = bind(machine.model, target).value
+        except TargetError:  # what the extension itself brings
+            continue
+        if math.isfinite(own) and not low <= own <= high:
+            low, high = min(low, 2 * own), max(high, 2 * own)
+    return replace(parameter, low=low, high=high)

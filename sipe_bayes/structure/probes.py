@@ -109,11 +109,18 @@ def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: li
     environment = windows.simulator.environment
     assert isinstance(environment, MjcfEnvironment)
     batches = [group]
+    if not _possible(environment, group):  # two of them write the same number
+        batches = [[one] for one in group if _possible(environment, [one])]
+    return [effect for batch in batches for effect in _simulated(windows, theta, starts, batch, environment)]
+
+
+def _possible(environment: MjcfEnvironment, group: list[Placed]) -> bool:
+    """Whether the model can have them all, beside the extensions that it has."""
     try:
         extended(environment, group)
-    except ValueError:  # two of them write the same number
-        batches = [[one] for one in group]
-    return [effect for batch in batches for effect in _simulated(windows, theta, starts, batch, environment)]
+    except ValueError:
+        return False
+    return True
 
 
 def _simulated(

@@ -28,8 +28,10 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "force_limit": "actuator.force_limit:ForceLimit",
     "force_drop": "actuator.force_drop:ForceDrop",
     "cogging": "actuator.cogging:Cogging",
+    "log_gain": "actuator.log_gain:LogGain",
     "sensor_offset": "world.sensor_offset:SensorOffset",
     "gravity_tilt": "world.gravity_tilt:GravityTilt",
+    "medium_drag": "world.medium_drag:MediumDrag",
     "residual": "world.residual:Residual",
 }
 

@@ -2,29 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.laws import LAWS, declare
+from sipe_bayes.envs.laws import LAWS, LawNumbers
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
-
-if TYPE_CHECKING:
-    import mujoco
-
-
-@dataclass(frozen=True)
-class _Scales:
-    """Declares the law with the lengths over which it changes."""
-
-    joint: str
-    lengths: tuple[float, float, float]
-
-    def __call__(self, spec: mujoco.MjSpec) -> None:
-        declare(spec, "joint", self.joint, LAWS["residual"])
-        numeric = next(n for n in spec.numerics if n.name == f"joint:{self.joint}.residual")
-        numeric.data = [*self.lengths, *list(numeric.data)[3:]]
 
 
 class Residual(Extension):
@@ -33,6 +14,7 @@ class Residual(Extension):
     name, kind = "residual", "joint"
     reference = "A. Rahimi, B. Recht 2007, Random Features for Large-Scale Kernel Machines"
     native, last_resort = False, True
+    scales = ("residual_position", "residual_velocity", "residual_command")
 
     def sentence(self, site: str) -> str:
         """What it is."""
@@ -55,9 +37,10 @@ class Residual(Extension):
             for number in weights
         )
 
-    def edit(self, machine: Machine, site: str) -> _Scales:
+    def edit(self, machine: Machine, site: str) -> LawNumbers:
         """The usual position, velocity and command are the lengths."""
         sizes = machine.joints[site]
         driving = [a for a in machine.environment.actuators if machine.joint_of(a) == site]
         command = machine.commands[driving[0]] / 2 if driving else 1.0
-        return _Scales(site, (sizes.position, sizes.velocity, command or 1.0))
+        lengths = (sizes.position, sizes.velocity, command or 1.0)
+        return LawNumbers(f"joint:{site}", "residual", tuple(zip(Residual.scales, lengths, strict=True)))
