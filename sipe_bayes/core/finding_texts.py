@@ -224,7 +224,7 @@ class Code(Enum):
     )
     NOT_EXPORTED = caution("{reason}")
     BIAS_NOT_EXPORTED = caution(
-        "identified.xml has no place for the sensor bias {parameters!r}; subtract it from the measurement"
+        "identified.xml has no place for what a sensor does, {parameters!r}; take it off the measurement"
     )
 
     # amortised: methods that learn from simulations of the prior

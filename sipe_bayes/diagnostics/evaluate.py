@@ -28,18 +28,22 @@ _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of
 
 
 def measured_starts(windows: Windows, theta: FloatArray) -> FloatArray:
-    """Starts (B, W, D) of theta (B, N): what was measured there, less the sensor bias that theta claims."""
+    """Starts (B, W, D) of theta (B, N): what was measured there, as theta claims the sensors' bias and scale."""
     simulator, model = windows.simulator, windows.simulator.model
     starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
     states, tangent = simulator.environment.state_columns(model), _tangents(model)
     columns = {channel: tangent[column] for channel, column in enumerate(states) if column in tangent}
     for b, values in enumerate(simulator.space.values(theta)):
         for name in set(windows.names):
-            bias = simulator.environment.bias(values, name)
+            sensing = simulator.environment.sensing(values, name)
             mine = [w for w, log in enumerate(windows.names) if log == name]
             for channel, column in columns.items():
-                if bias[channel]:
-                    starts[b, mine, column] = -bias[channel]
+                bias, scale, place = sensing.bias[channel], sensing.scale[channel], states[channel]
+                if scale != 1.0 and scale:
+                    measured = windows.reference[mine, place]
+                    starts[b, mine, column] = (measured - bias) / scale - measured
+                elif bias:
+                    starts[b, mine, column] = -bias
     return starts
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.envs.sensing import Sensing
 
 if TYPE_CHECKING:
     import mujoco
@@ -137,6 +138,14 @@ class Environment(ABC):
     def bias(self, values: FloatArray, log: str | None = None) -> FloatArray:
         """Sensor bias (O,) added to every observation, of parameters (N,) in physical units as they hold in ``log``."""
         return np.zeros(len(self.channels))
+
+    def sensing(self, values: FloatArray, log: str | None = None) -> Sensing:
+        """What sensors make of what is observed, of parameters (N,) in physical units as they hold in ``log``.
+
+        A pure function of a rollout's observations; one that remembers earlier samples is not Markov, and takes the
+        first two samples of a window to go on what came before.
+        """
+        return Sensing.of_bias(self.bias(values, log))
 
     @abstractmethod
     def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:

@@ -22,8 +22,9 @@ from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import Channel, Reader, check_sensors, reader_of, state_column
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
 from sipe_bayes.envs.laws import LAW_OF, LawError, declare, laws_of
+from sipe_bayes.envs.sensing import Sensing, sensed_channels
 from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
-from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, shifted_channels, with_model_values
+from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, with_model_values
 
 _LONGEST_STEP = 0.25  # of the cube: a finite difference of what is not smooth
 _LINEAR_INTERPOLATION = 1
@@ -253,19 +254,23 @@ class MjcfEnvironment(Environment):
 
     def bias(self, values: FloatArray, log: str | None = None) -> FloatArray:
         """The sensor biases among the parameters, as they hold in ``log``."""
-        bias, table = np.zeros(len(self.measurements)), self._resolve(log)
-        for j, channels in self._biases:
-            if j in table:
-                bias[channels] += _mean(values, table[j])
-        return bias
+        return self.sensing(values, log).bias
+
+    def sensing(self, values: FloatArray, log: str | None = None) -> Sensing:
+        """What of the sensors is among the parameters, as it holds in ``log``; see ``Environment.sensing``."""
+        out, table = Sensing.of_bias(np.zeros(len(self.measurements))), self._resolve(log)
+        for j, attribute, channels in self._sensed:
+            if j in table and attribute == "scale":
+                out.scale[channels] *= _mean(values, table[j])
+            elif j in table:
+                getattr(out, attribute)[channels] += _mean(values, table[j])
+        return out
 
     @cached_property
-    def _biases(self) -> list[tuple[int, list[int]]]:
-        """(parameter, channels that it shifts) of all sensor biases."""
-        shifted = [
-            (j, shifted_channels(t, self.measurements)) for j, p in enumerate(self.parameters) for t in p.targets
-        ]
-        return [(j, channels) for j, channels in shifted if channels is not None]
+    def _sensed(self) -> list[tuple[int, str, list[int]]]:
+        """(parameter, what it writes of sensors, channels that it concerns)."""
+        sensed = [(j, sensed_channels(t, self.measurements)) for j, p in enumerate(self.parameters) for t in p.targets]
+        return [(j, *one) for j, one in sensed if one is not None]
 
     @cached_property
     def _controls(self) -> list[int]:

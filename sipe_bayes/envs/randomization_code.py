@@ -241,9 +241,9 @@ def _remarks(environment: MjcfEnvironment) -> list[str]:
     for parameter in environment.parameters:
         if any(target.startswith("sensor:") for target in parameter.targets):
             remarks.append(
-                f"{parameter.name} is a sensor's bias and no number of the model: add it to the observation."
+                f"{parameter.name} is what a sensor does and no number of the model: put it on the observation."
             )
-        if any(target.endswith(".delay") for target in parameter.targets):
+        elif any(target.endswith(".delay") for target in parameter.targets):
             remarks.append(
                 f"{parameter.name} is a delay: it counts only where the simulator knows MuJoCo's actuator delay."
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -13,9 +12,9 @@ import numpy as np
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.sensing import LEAST, NEUTRAL, UNITS, of_sensor, sensed_channels
 from sipe_bayes.envs.targets import TargetError, bind
 
-_BIAS = re.compile(r"^sensor:(.+)\.bias$")
 # the numbers that a target writes, where they are not its own
 _WRITES = {"kp": ("gain", "bias_position"), "kv": ("bias_velocity",), "offset": ("bias_force",)}
 
@@ -39,29 +38,19 @@ def check_conflicts(space: ParameterSpace) -> None:
                 owners[f"{head}.{number}"].append((parameter.name, parameter.log))
 
 
-def shifted_channels(target: str, channels: Sequence[Channel]) -> list[int] | None:
-    """Which channels a target ``sensor:NAME.bias`` shifts; None for another kind of target.
-
-    They are those called NAME, or those that read the sensor NAME.
-    """
-    match = _BIAS.match(target)
-    if not match:
-        return None
-    name = match.group(1)
-    sensor = re.compile(rf"^sensor:{re.escape(name)}(\[\d+\])?$")
-    return [k for k, c in enumerate(channels) if c.label == name or sensor.match(c.target)]
-
-
 def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Sequence[Channel]) -> Parameter:
     """The parameter with the unit and the default that the model gives it; raises TargetError where it gives none."""
     if not parameter.targets:
         raise TargetError(f"parameter {parameter.name!r}: names no target; give what it changes, such as body:rod.mass")
     units, values, least, shape = [], [], -np.inf, False
     for spec in parameter.targets:
-        shifted = shifted_channels(spec, channels)
-        if shifted is not None:
-            units.append(_shifted_unit(parameter, spec, channels, shifted))
-            values.append(0.0)
+        sensed = sensed_channels(spec, channels)
+        if sensed is not None:
+            attribute, concerned = sensed
+            unit = _channel_unit(parameter, spec, channels, concerned)
+            units.append(UNITS.get(attribute, unit))
+            values.append(NEUTRAL[attribute])
+            least = max(least, LEAST.get(attribute, -np.inf))
             continue
         try:
             target = bind(model, spec)
@@ -83,11 +72,11 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
     return replace(parameter, unit=parameter.unit or units[0], default=default)
 
 
-def _shifted_unit(parameter: Parameter, target: str, channels: Sequence[Channel], shifted: Sequence[int]) -> str:
-    if shifted:
-        return channels[shifted[0]].unit
+def _channel_unit(parameter: Parameter, target: str, channels: Sequence[Channel], concerned: Sequence[int]) -> str:
+    if concerned:
+        return channels[concerned[0]].unit
     names = [c.label for c in channels]
-    hint = nearest_name(target.removeprefix("sensor:").removesuffix(".bias"), names) or f"; measured are {names}"
+    hint = nearest_name(of_sensor(target) or "", names) or f"; measured are {names}"
     raise TargetError(f"parameter {parameter.name!r}: target {target!r} names no measured sensor or channel{hint}")
 
 
@@ -106,5 +95,5 @@ def _absolute(parameter: Parameter, value: float) -> Parameter:
 
 
 def physical_targets(targets: Iterable[str]) -> list[str]:
-    """Those that write a number of the model; a sensor's bias does not."""
-    return [target for target in targets if not _BIAS.match(target)]
+    """Those that write a number of the model; a sensor's bias and its like do not."""
+    return [target for target in targets if of_sensor(target) is None]

@@ -12,14 +12,15 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.envs.sensing import Sensing
 
 
 @dataclass
 class _Slot:
-    """A model of the pool, and what it holds: ``key`` tells theta, timestep and log; bias (O,) of its sensors."""
+    """A model of the pool, and what it holds: ``key`` tells theta, timestep and log; what its O sensors do."""
 
     model: mujoco.MjModel
-    bias: FloatArray
+    sensing: Sensing
     key: bytes = b""
     physical: bool = False
 
@@ -71,9 +72,9 @@ class ModelPool:
         """(B,): whether the parameters in ``slots`` (B,) are ones that a model can have."""
         return np.array([self.slots[k].physical for k in slots], bool)
 
-    def biases(self, slots: IntArray) -> FloatArray:
-        """Sensor biases (B, O) of ``slots`` (B,)."""
-        return np.stack([self.slots[k].bias for k in slots])
+    def sensing(self, slots: IntArray) -> Sensing:
+        """What the sensors (B, O) of ``slots`` (B,) do."""
+        return Sensing.stack([self.slots[k].sensing for k in slots])
 
     def check_physical(self, theta: FloatArray) -> None:
         """Raises ValueError for theta (N,) that no model can have."""
@@ -100,13 +101,13 @@ class ModelPool:
 
     def _fill(self, index: int, key: bytes, theta: FloatArray, timestep: float, log: str | None) -> None:
         if index == len(self.slots):
-            self.slots.append(_Slot(copy.copy(self.model), np.zeros(len(self.environment.channels))))
+            self.slots.append(_Slot(copy.copy(self.model), Sensing.of_bias(np.zeros(len(self.environment.channels)))))
         slot = self.slots[index]
         if slot.key == key:
             return
         slot.key = b""
         slot.physical = self._write(slot.model, theta, timestep, log)
-        slot.bias = self.environment.bias(self._values(theta), log)
+        slot.sensing = self.environment.sensing(self._values(theta), log)
         slot.key = key
 
     def _values(self, theta: FloatArray) -> FloatArray:

@@ -267,8 +267,8 @@ class Simulator(Simulated):
         )
         targets = None if goals is None else goals[run, None]
         observations = self.environment.observe(self.model, states, derived, targets)
-        biases = self.pool.biases(slots[run])[:, None]
-        motion.states[at], motion.observations[at], motion.valid[at] = states, observations + biases, valid
+        seen = self.pool.sensing(slots[run]).seen(observations, skip * timesteps[run])
+        motion.states[at], motion.observations[at], motion.valid[at] = states, seen, valid
         if derived is not None and motion.derived is not None:
             motion.derived[at] = derived
 

@@ -161,7 +161,7 @@ def test_files_are_python_and_name_what_has_no_place(case: tuple[MjcfEnvironment
     assert {path.name for path in paths} == FILES
     for path in paths:
         tree = ast.parse(path.read_text())
-        assert "bias is a sensor's bias" in (ast.get_docstring(tree) or "")
+        assert "bias is what a sensor does" in (ast.get_docstring(tree) or "")
         assert "12 posterior draws" in (ast.get_docstring(tree) or "")
     isaac = (tmp_path / "randomization" / "isaac_lab_events.py").read_text()
     calls = [node for node in ast.walk(ast.parse(isaac)) if isinstance(node, ast.Call)]

@@ -32,6 +32,7 @@ from sipe_bayes.calibration.config_tables import (
 from sipe_bayes.calibration.tables import READERS
 from sipe_bayes.core.units import UNITS
 from sipe_bayes.diagnostics.catalogue import tasks
+from sipe_bayes.envs.sensing import NEUTRAL
 from sipe_bayes.envs.targets import ATTRIBUTES
 from sipe_bayes.inference import ESTIMATORS, estimator_class
 
@@ -193,7 +194,7 @@ def target_words() -> list[str]:
 
 
 def test_readme_lists_every_target() -> None:
-    differing = set(rows("Targets")) ^ {*target_words(), "sensor:NAME.bias"}
+    differing = set(rows("Targets")) ^ {*target_words(), *(f"sensor:NAME.{attribute}" for attribute in NEUTRAL)}
     assert not differing, "README, Targets: a row for each, and for no other"
 
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.laws import LawNumbers
 from sipe_bayes.structure.extension import PROBE, Extension
 from sipe_bayes.structure.machine import Machine
 
@@ -42,10 +41,6 @@ class Stribeck(Extension):
                 description="speed at which it has mostly gone",
             ),
         )
-
-    def edit(self, machine: Machine, site: str) -> LawNumbers:
-        """The model's own speed is a tenth of the usual one."""
-        return LawNumbers(f"joint:{site}", "stribeck", (("stribeck_velocity", 0.1 * machine.joints[site].velocity),))
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """A little of it, at a tenth of the usual speed and at a third."""

@@ -1,0 +1,34 @@
+"""A measurement that comes late."""
+
+from __future__ import annotations
+
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.machine import Machine
+
+
+class SensorDelay(Extension):
+    """A measurement that comes late.
+
+    MuJoCo knows no such sensor: sipe_bayes does it to what is simulated.
+    """
+
+    name, kind = "sensor_delay", "channel"
+    reference = "-"
+    native = False
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a delay of the measurement {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a tenth of a second, or twenty samples."""
+        return (
+            Parameter(
+                f"{site}.delay",
+                0.0,
+                min(0.1, 20 * machine.dt),
+                targets=(f"sensor:{site}.delay",),
+                description="age of the measurement",
+            ),
+        )
