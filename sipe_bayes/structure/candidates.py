@@ -66,7 +66,12 @@ def candidates(
     around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
     plain = around.fitted(np.zeros((*linearisation.residual.shape, 0)))
     seen = effects(windows, theta, starts, placed)
-    return sorted((around.candidate(effect, plain) for effect in seen), key=lambda candidate: -candidate.gain)
+    ranked: dict[str, Candidate] = {}
+    for candidate in (around.candidate(effect, plain) for effect in seen):
+        label = candidate.placed.label
+        if label not in ranked or candidate.gain > ranked[label].gain:  # the best of its shapes
+            ranked[label] = candidate
+    return sorted(ranked.values(), key=lambda candidate: -candidate.gain)
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,7 @@ class _Around:
         size = np.abs(amplitude).sum()
         value = at + amplitude @ (probes - at)
         shaped = np.abs(probes - at).max(0) > _SHAPED  # what a probe had beside its size
+        shaped |= (len(probes) > 1) & (np.ptp(probes, axis=0) == 0)
         if size > 0:
             value = np.where(shaped, np.abs(amplitude) / size @ probes, value)
         return Candidate(effect.placed, level - plain.level, np.clip(value, *_INSIDE), amplitude)

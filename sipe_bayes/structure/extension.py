@@ -68,6 +68,7 @@ class Extension(ABC):
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """Theta (K, P) of its P parameters at which it is tried: directions away from the plain model, their defaults.
 
+        (G, K, P) where there are G shapes, of which one is to be chosen: several speeds, or numbers of poles.
         By default a small step of each parameter by itself; where the others are to have other values meanwhile, as the
         shape of a force whose size is tried, override this.
         """
@@ -89,7 +90,7 @@ class Placed:
         site: name of the joint, actuator or channel; ``WORLD``.
         parameters: its unknowns, with the model's own values as defaults.
         edit: what it changes in the MJCF.
-        probes: theta (K, P) at which it is tried.
+        probes: theta (G, K, P) at which it is tried, for each of G shapes.
     """
 
     extension: Extension
@@ -139,13 +140,13 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
         parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
         if not parameters or any(t in taken for p in parameters for t in p.targets):
             continue
-        draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, len(parameters))))
+        draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, 0, len(parameters))))
         try:
             space = extended(machine.environment, [draft]).space
         except ValueError:
             continue  # the model has no place for it, or a value of its own beyond these bounds
         own = tuple(space)[count:]
-        yield Placed(extension, site, own, draft.edit, extension.probes(machine, own))
+        yield Placed(extension, site, own, draft.edit, _shapes(extension.probes(machine, own)))
 
 
 def _with_own(machine: Machine, parameter: Parameter) -> Parameter:
@@ -159,3 +160,8 @@ def _with_own(machine: Machine, parameter: Parameter) -> Parameter:
         if math.isfinite(own) and not low <= own <= high:
             low, high = min(low, 2 * own), max(high, 2 * own)
     return replace(parameter, low=low, high=high)
+
+
+def _shapes(probes: FloatArray) -> FloatArray:
+    """Probes (G, K, P), of one shape where they are (K, P)."""
+    return probes if probes.ndim == 3 else probes[None]

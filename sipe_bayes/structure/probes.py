@@ -24,7 +24,7 @@ from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 @dataclass(frozen=True)
 class Effect:
-    """What an extension does to the predictions.
+    """What an extension of one shape does to the predictions.
 
     Args:
         placed: which.
@@ -131,7 +131,7 @@ def _simulated(
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
     for one in group:
-        for probe in one.probes:
+        for probe in one.probes.reshape(-1, len(one.plain)):
             row = plain.copy()
             row[first : first + len(probe)] = probe
             rows.append(row)
@@ -141,13 +141,14 @@ def _simulated(
     windows.rollouts += bound.rollouts
     out, at = [], 1
     for one in group:
-        mine = np.arange(at, at + len(one.probes))
-        at += len(one.probes)
-        with np.errstate(invalid="ignore"):
-            change = np.where(windows.observed, predicted[mine] - predicted[0], 0.0)
-        use = valid[mine] & np.isfinite(change).all((1, 2, 3)) & (np.abs(change).max((1, 2, 3)) > 0)
-        if valid[0] and use.any():
-            out.append(Effect(one, np.moveaxis(change[use], 0, -1), one.probes[use]))
+        for shape in one.probes:
+            mine = np.arange(at, at + len(shape))
+            at += len(shape)
+            with np.errstate(invalid="ignore"):
+                change = np.where(windows.observed, predicted[mine] - predicted[0], 0.0)
+            use = valid[mine] & np.isfinite(change).all((1, 2, 3)) & (np.abs(change).max((1, 2, 3)) > 0)
+            if valid[0] and use.any():
+                out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use]))
     return out
 
 

@@ -14,6 +14,7 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.export import write_identified
+from sipe_bayes.envs.laws import LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
@@ -76,6 +77,9 @@ def test_every_extension_has_a_place() -> None:
         assert any(placed(name, each) for each in MACHINES), name
 
 
+SHAPES = {number.attribute for law in LAWS.values() for number in law.numbers if number.shape}
+
+
 @pytest.mark.parametrize(("name", "where"), PLACES)
 def test_at_its_plain_value_it_is_the_plain_model(name: str, where: str) -> None:
     plain = motion(bound(where).simulator.environment, THETA, where)
@@ -89,7 +93,7 @@ def test_at_its_plain_value_it_is_the_plain_model(name: str, where: str) -> None
 def test_its_probes_change_what_is_observed(name: str, where: str) -> None:
     windows = bound(where)
     seen = effects(windows, THETA, windows.no_starts(), placed(name, where))
-    assert [effect.placed.label for effect in seen] == [one.label for one in placed(name, where)]
+    assert {effect.placed.label for effect in seen} == {one.label for one in placed(name, where)}
     for effect in seen:
         assert np.isfinite(effect.change).all()
         assert (np.abs(effect.change).max((0, 1, 2)) > 1e-7).all(), effect.placed.label
@@ -100,10 +104,15 @@ def test_its_parameters_have_bounds_in_si_and_a_sentence(name: str, where: str) 
     for one in placed(name, where):
         assert one.sentence
         assert one.extension.reference
-        assert one.probes.shape[1] == len(one.parameters) == len(one.plain)
+        assert one.probes.shape[2] == len(one.parameters) == len(one.plain)
         assert ((one.probes >= 0) & (one.probes <= 1)).all()
         for parameter in one.parameters:
             assert 1e-12 < max(abs(parameter.low), abs(parameter.high)) < 1e6, parameter.name
+<<<<<<< Updated upstream
+=======
+            shape = parameter.targets[0].rpartition(".")[2] in SHAPES
+            assert (parameter.default is None) == shape, parameter.name
+>>>>>>> Stashed changes
             assert parameter.unit, parameter.name
             assert parameter.description, parameter.name
 

@@ -9,6 +9,8 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.structure.extension import PROBE, Extension
 from sipe_bayes.structure.machine import Machine
 
+_MOST_SHAPES = 24  # numbers of poles that are tried
+
 
 class Cogging(Extension):
     """A torque that goes round with the rotor."""
@@ -41,6 +43,9 @@ class Cogging(Extension):
         )
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
-        """A little of either phase, for numbers of poles that the position's range resolves."""
-        poles = np.log([4.0, 7.0, 12.0, 24.0]) / np.log(60.0)
-        return np.array([[0.5 + a, 0.5 + b, n] for n in poles for a, b in ((PROBE, 0.0), (0.0, PROBE))])
+        """A little of either phase, for numbers of poles that the motion's range tells apart."""
+        range_of = 2 * machine.joints[parameters[0].targets[0].removeprefix("joint:").rpartition(".")[0]].position
+        apart = max(np.pi / max(range_of, 0.1) / 1.5, 1.0)
+        poles = np.log(np.arange(1.0, 60.0, max(apart, 60.0 / _MOST_SHAPES))) / np.log(60.0)
+        phases = ((PROBE, 0.0), (0.0, PROBE))
+        return np.array([[[0.5 + a, 0.5 + b, n] for a, b in phases] for n in poles])

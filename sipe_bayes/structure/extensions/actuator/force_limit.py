@@ -35,4 +35,4 @@ class ForceLimit(Extension):
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """At the usual force and a third above: a limit that is never met has no effect."""
-        return np.array([[0.143], [0.214], [0.3]])
+        return np.array([[[0.143]], [[0.214]], [[0.3]]])

@@ -43,5 +43,5 @@ class Stribeck(Extension):
         )
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
-        """A little of it, at a tenth of the usual speed and at a third."""
-        return np.array([[PROBE, 0.5], [PROBE, 0.75]])
+        """A little of it, at three shares of the usual speed."""
+        return np.array([[[PROBE, 0.25]], [[PROBE, 0.5]], [[PROBE, 0.75]]])
