@@ -108,11 +108,8 @@ def test_its_parameters_have_bounds_in_si_and_a_sentence(name: str, where: str) 
         assert ((one.probes >= 0) & (one.probes <= 1)).all()
         for parameter in one.parameters:
             assert 1e-12 < max(abs(parameter.low), abs(parameter.high)) < 1e6, parameter.name
-<<<<<<< Updated upstream
-=======
             shape = parameter.targets[0].rpartition(".")[2] in SHAPES
             assert (parameter.default is None) == shape, parameter.name
->>>>>>> Stashed changes
             assert parameter.unit, parameter.name
             assert parameter.description, parameter.name
 

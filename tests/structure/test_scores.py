@@ -26,12 +26,7 @@ from sipe_bayes.structure.scores import scores
 from tests.problems.pendulums import log, pendulum
 
 XML = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody>
-<<<<<<< Updated upstream
-<body><joint name="rail" type="slide" axis="1 0 0"/>
-<geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
-=======
 <body><joint name="rail" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body></worldbody>
->>>>>>> Stashed changes
 <actuator><motor name="drive" joint="rail"/></actuator></mujoco>"""
 OFFSET = Parameter("offset", -1.0, 1.0, targets=("actuator:drive.offset",))
 WIND = Parameter("gravity", -1.0, 1.0, targets=("option.gravity_x",), prior_mean=0.1, prior_sd=0.2)
@@ -123,11 +118,7 @@ def test_held_out_pieces_are_foretold_as_by_refitting(logs: int) -> None:
 
 
 def test_importance_sampling_gives_the_evidence_of_a_pendulum_with_friction() -> None:
-<<<<<<< Updated upstream
-    """400 draws about the optimum, starts integrated out at each: half a nat, what friction's kink changes."""
-=======
     """400 draws about the optimum, starts integrated out: what is not normal, friction's kink, is half a nat."""
->>>>>>> Stashed changes
     simulator = pendulum(Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",)))
     recorded = Trajectories.stack([log(simulator, [0.6, 0.08, 0.05], 1, steps=200)])
     prior, likelihood = default_prior(simulator.space), Segments(0.5, "ar1")
