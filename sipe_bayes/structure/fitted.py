@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.scores import scores
 
@@ -86,6 +87,13 @@ class Fitting:
     def simulator(self, placed: Sequence[Placed]) -> Simulator:
         """Of the model with extensions."""
         return Simulator(extended(self.environment, placed) if placed else self.environment, self.num_threads)
+
+    def corrected(self, columns: Sequence[Column]) -> Fitting:
+        """The same with columns of the logs multiplied."""
+        if not columns:
+            return self
+        logs = corrected(self.trajectories, columns, self.environment.actuators)
+        return replace(self, trajectories=logs)
 
     def windows(self, simulator: Simulator) -> Windows:
         """The logs bound to a model."""

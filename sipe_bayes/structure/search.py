@@ -4,6 +4,8 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
 
     PLAIN   the model as it is
       v
+    COLUMNS where much is left: signs and units of the logs' columns
+      v
     RANK    score tests of all extensions at the present structure (``candidates``)
       |  something promises more than it costs          nothing does
       v                                                      v
@@ -36,6 +38,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates
+from sipe_bayes.structure.columns import Column, choices, log_jacobian, unexplained
 from sipe_bayes.structure.extension import Extension, Placed, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -45,6 +48,7 @@ class Phase(enum.Enum):
     """What the next step does."""
 
     PLAIN = "plain"
+    COLUMNS = "columns"
     RANK = "rank"
     FIT = "fit"
     PRUNE = "prune"
@@ -60,6 +64,9 @@ class DiscoverOptions(Options):
     most: int = option(5, "extensions that a structure may have", least=1)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
     sparsity: float = option(3.0, "against any extension: one model in twenty lacks a given kind", "nats", least=0)
+    gross: float = option(0.25, "of a channel's spread left from which signs and units are tried", least=0)
+    column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
+    column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
     fit_budget: int = option(2000, "rollouts of one fit", least=1)
 
 
@@ -91,6 +98,7 @@ class DiscoverState:
         offers: all that was promised until now.
         queue: labels of the extensions that this round still has to fit.
         failed: labels of structures that could not be fitted.
+        columns: of the logs that are multiplied, since then the plain model fits far better.
     """
 
     phase: Phase = Phase.PLAIN
@@ -99,6 +107,7 @@ class DiscoverState:
     offers: tuple[Offer, ...] = ()
     queue: tuple[str, ...] = ()
     failed: tuple[tuple[str, ...], ...] = ()
+    columns: tuple[Column, ...] = ()
 
     @property
     def done(self) -> bool:
@@ -141,7 +150,8 @@ class StructureSearch:
         options: DiscoverOptions | None = None,
         budget: int = 20000,
     ) -> None:
-        self.fitting, self.extensions, self.joints = fitting, tuple(extensions), joints
+        self.given = self.fitting = fitting
+        self.extensions, self.joints = tuple(extensions), joints
         self.options, self.budget = options or DiscoverOptions(), budget
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
@@ -153,6 +163,7 @@ class StructureSearch:
             return replace(state, phase=Phase.DONE)
         return {
             Phase.PLAIN: self._plain,
+            Phase.COLUMNS: self._columns,
             Phase.RANK: self._rank,
             Phase.FIT: self._fit,
             Phase.PRUNE: self._prune,
@@ -165,6 +176,7 @@ class StructureSearch:
         having = f" beside {' and '.join(state.present)}" if state.present else ""
         return {
             Phase.PLAIN: "fitting the model as it is",
+            Phase.COLUMNS: "trying signs and units of the logs' columns",
             Phase.RANK: f"testing {len(self._placed)} extensions{having}",
             Phase.FIT: f"fitting {state.queue[0] if state.queue else ''}{having}",
             Phase.PRUNE: "leaving out each piece once",
@@ -200,6 +212,7 @@ class StructureSearch:
         """Place the extensions, once the plain model is fitted."""
         if self._placed or not state.fitted:
             return
+        self.fitting = self.given.corrected(state.columns)
         plain = state.fitted[0]
         windows = self.fitting.windows(self.fitting.simulator([]))
         self._machine = machine_of(windows, plain.theta, plain.starts)
@@ -208,8 +221,40 @@ class StructureSearch:
         self._placed = {p.label: p for p in every if allowed is None or p.site in allowed}
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
-        plain = self.fitting.fit([], None, self.options.fit_budget)
-        return replace(state, fitted=(plain,), phase=Phase.RANK)
+        """The plain model, where it can be fitted at all."""
+        plain = self._try([])
+        return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS)
+
+    def _columns(self, state: DiscoverState) -> DiscoverState:
+        """The column whose factor makes the plain model fit far better, if any does."""
+        given, plain = self.given, state.fitted[0] if state.fitted else None
+        state = replace(state, phase=Phase.RANK)
+        if plain is not None and unexplained(given.windows(given.simulator([])), plain.sd) < self.options.gross:
+            return state
+        columns = list(choices(given.environment.channels, given.environment.actuators))
+        fits = [(column, self._try([column])) for column in columns]
+        tried = [(self._of_given(one, [column]), column, one) for column, one in fits if one is not None]
+        if plain is None and not tried:
+            given.fit([], None, self.options.fit_budget)  # raises what keeps the plain model from being fitted
+        best = max(tried, key=lambda item: item[0], default=None)
+        if best is None or (plain is not None and best[0] < plain.evidence + self.options.column_gain):
+            return state
+        rollouts = sum(one.rollouts for _, _, one in tried) + (0 if plain is None else plain.rollouts)
+        self._placed = {}
+        # evidences are in the corrected logs' units from here on
+        return replace(state, fitted=(replace(best[2], rollouts=rollouts),), columns=(best[1],))
+
+    def _try(self, columns: Sequence[Column]) -> FittedStructure | None:
+        """The plain model fitted to logs with columns multiplied; None where it cannot be."""
+        budget = self.options.column_budget if columns else self.options.fit_budget
+        try:
+            return self.given.corrected(columns).fit([], None, budget)
+        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
+            return None
+
+    def _of_given(self, one: FittedStructure, columns: Sequence[Column]) -> float:
+        """The evidence of logs as they were given."""
+        return one.evidence + log_jacobian(self.given.trajectories, columns)
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
         here = state.here

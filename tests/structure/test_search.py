@@ -1,0 +1,107 @@
+"""The search over structures: what is planted is named, a right model is left as it is, wrong columns are found.
+
+One log each at fixed seeds; rates over many are measured by examples/studies/discover.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.structure import Extension, Restriction, Structures, discover
+from sipe_bayes.structure.machine import Machine
+from tests.problems.pendulums import log, pendulum
+
+FRICTION = Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",))
+DRAG = Parameter("drag", 0.0, 0.3, targets=("joint:hinge.damping_quadratic",))
+NAMES = ("dry_friction", "quadratic_damping", "delay", "offset", "spring")
+
+
+def searched(*recorded: Trajectory, names: tuple[str, ...] = NAMES) -> Structures:
+    """Of the plain pendulum, whose mass and damping are unknown."""
+    return discover(pendulum(), Trajectories.stack(list(recorded)), restriction=Restriction(only=names))
+
+
+def test_a_right_model_is_left_as_it_is() -> None:
+    structures = searched(log(pendulum(), [0.6, 0.08], 4))
+    print(structures.table())
+    assert structures.best.labels == ()
+    assert structures.probabilities[0] > 0.9
+    assert structures.settled
+
+
+def test_planted_friction_is_named_and_the_mass_is_right_with_it() -> None:
+    """Without it the damping takes its part and lies; averaged over the structures it is what it was."""
+    recorded = log(pendulum(FRICTION), [0.6, 0.08, 0.05], 5)
+    structures = searched(recorded)
+    rows = structures.table()
+    print(rows)
+    assert structures.best.labels == ("dry_friction:hinge",)
+    assert rows[0].sentences == ("dry friction at hinge",)
+    assert rows[0].evidence > 20
+    assert rows[0].held_out is not None
+    assert rows[0].held_out > 0
+    truth = pendulum().space.normalise(np.array([0.6, 0.08]))
+    plain, after = structures.posterior_of(structures.plain), structures.posterior
+    assert abs(plain.mean[1] - truth[1]) > 3 * plain.stddev[1]
+    assert (np.abs(after.mean.numpy() - truth) < 4 * after.stddev.numpy()).all()
+    (value,) = structures.posterior_of(structures.best).values(1000).numpy().mean(0)[2:]
+    assert value == pytest.approx(0.05, rel=0.2)
+
+
+def test_two_effects_are_found_one_after_the_other() -> None:
+    recorded = log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.05, 0.06], 6)
+    structures = searched(recorded)
+    print(structures.table())
+    assert set(structures.best.labels) == {"dry_friction:hinge", "quadratic_damping:hinge"}
+
+
+def test_what_the_same_motion_has_is_not_decided() -> None:
+    """A constant force by the motor's zero error or by its bias: two names of one number."""
+    offset = Parameter("offset", -0.3, 0.3, targets=("actuator:motor.offset",))
+    recorded = log(pendulum(offset), [0.6, 0.08, 0.05], 2)
+    structures = searched(recorded, names=("offset", "dry_friction"))
+    twin = discover(
+        pendulum(),
+        Trajectories.stack([recorded]),
+        restriction=Restriction(only=("offset",), extra=(f"{__file__}:Bias",)),
+    )
+    print(twin.table())
+    assert structures.inclusion()["offset:motor"] > 0.99
+    both = twin.inclusion()
+    assert both["offset:motor"] == pytest.approx(0.5, abs=0.1)
+    assert both["bias:motor"] == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(("factor", "command", "words"), [(-1.0, False, "opposite sign"), (1000.0, True, "thousand")])
+def test_a_wrong_column_is_found_before_any_physics_is_blamed(factor: float, command: bool, words: str) -> None:
+    recorded = log(pendulum(), [0.6, 0.08], 4)
+    channels = tuple(pendulum().environment.channels)
+    wrong = replace(recorded, actions=recorded.actions * factor, channels=channels)
+    if not command:
+        wrong = replace(recorded, observations=recorded.observations * factor, channels=channels)
+    structures = searched(wrong)
+    (column,) = structures.state.columns
+    print(column.sentence, structures.table())
+    assert column.factor == pytest.approx(1 / factor)
+    assert words in column.sentence
+    assert structures.best.labels == ()
+
+
+class Bias(Extension):
+    """The same constant force as an offset's, by another number."""
+
+    name, kind, reference = "bias", "actuator", "-"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a bias of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """As wide as the offset's."""
+        size = machine.commands[site]
+        return (Parameter(f"{site}.bias", -size, size, targets=(f"actuator:{site}.bias_force",)),)
