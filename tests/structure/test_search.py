@@ -36,7 +36,7 @@ def test_a_right_model_is_left_as_it_is() -> None:
 
 def test_planted_friction_is_named_and_the_mass_is_right_with_it() -> None:
     """Without it the damping takes its part and lies; averaged over the structures it is what it was."""
-    recorded = log(pendulum(FRICTION), [0.6, 0.08, 0.05], 5)
+    recorded = log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)
     structures = searched(recorded)
     rows = structures.table()
     print(rows)
@@ -49,12 +49,12 @@ def test_planted_friction_is_named_and_the_mass_is_right_with_it() -> None:
     plain, after = structures.posterior_of(structures.plain), structures.posterior
     assert abs(plain.mean[1] - truth[1]) > 3 * plain.stddev[1]
     assert (np.abs(after.mean.numpy() - truth) < 4 * after.stddev.numpy()).all()
-    (value,) = structures.posterior_of(structures.best).values(1000).numpy().mean(0)[2:]
-    assert value == pytest.approx(0.05, rel=0.2)
+    (value,) = structures.posterior_of(structures.best).values(1000).mean(0)[2:]
+    assert value == pytest.approx(0.1, rel=0.2)
 
 
 def test_two_effects_are_found_one_after_the_other() -> None:
-    recorded = log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.05, 0.06], 6)
+    recorded = log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.15, 0.06], 6)
     structures = searched(recorded)
     print(structures.table())
     assert set(structures.best.labels) == {"dry_friction:hinge", "quadratic_damping:hinge"}
