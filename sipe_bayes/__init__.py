@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sipe_bayes.calibration.config import load_config as load_config
+    from sipe_bayes.calibration.discover import discover as discover
     from sipe_bayes.calibration.problem import prepare as prepare
     from sipe_bayes.calibration.run import calibrate as calibrate
     from sipe_bayes.core.parameters import Parameter as Parameter

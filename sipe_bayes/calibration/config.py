@@ -34,6 +34,7 @@ from sipe_bayes.calibration.config_tables import (
     PriorSource,
     Resample,
     Search,
+    Structure,
     Use,
     overlap,
 )
@@ -61,6 +62,7 @@ class Config(Table):
     parameters: Annotated[tuple[ParameterEntry, ...], Field(min_length=1)]
     noise: Noise = Noise()
     prior: PriorSource | None = None
+    structure: Structure = Structure()
 
     _path: Path = PrivateAttr(default=Path("CONFIG.toml"))
 

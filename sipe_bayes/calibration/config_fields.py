@@ -23,6 +23,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.inference.registry import ESTIMATORS
+from sipe_bayes.structure.registry import EXTENSIONS
 
 
 class ConfigError(ValueError):
@@ -75,6 +76,26 @@ def _estimator(name: str) -> str:
     if name not in ESTIMATORS:
         raise problem(f"expected one of {', '.join(ESTIMATORS)}, got {name!r}; {nearest(name, ESTIMATORS)}")
     return name
+
+
+def _extension(name: str) -> str:
+    if name not in EXTENSIONS:
+        hint = nearest_name(name, EXTENSIONS).removeprefix("; ") or f"known are {', '.join(EXTENSIONS)}"
+        raise problem(f"no extension {name!r}; {hint}; one of your own goes into `extra`")
+    return name
+
+
+def _own_extension(word: str, info: ValidationInfo) -> str:
+    """``package.module:Class`` as it stands; the path of ``path/to/file.py:Class`` from the TOML's folder."""
+    module, _, kind = word.rpartition(":")
+    if not (module and kind.isidentifier()):
+        raise problem(f"expected 'path/to/file.py:Class' or 'package.module:Class', got {word!r}; name the class")
+    if not module.endswith(".py"):
+        return word
+    path = Path((info.context or {}).get("folder", Path()), module)
+    if not path.is_file():
+        raise problem(f"no such file, got {path}; {nearest_file(path)}")
+    return f"{path}:{kind}"
 
 
 def _checked_sign(value: Any) -> int:
@@ -136,6 +157,8 @@ def _target(word: str) -> str:
 
 
 Text = Annotated[str, Field(min_length=1), Strict()]
+ExtensionName = Annotated[Text, AfterValidator(_extension)]
+OwnExtension = Annotated[Text, AfterValidator(_own_extension)]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
 Pair = tuple[Number, Number]

@@ -8,8 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, Strict, model_validator
 
 from sipe_bayes.calibration.config_fields import (
+    ExtensionName,
     Location,
     Number,
+    OwnExtension,
     Pair,
     Positive,
     Sign,
@@ -199,6 +201,27 @@ class Search(Table):
 
     restarts: Annotated[int, Strict(), Field(gt=0)] = 2
     candidates: Annotated[int, Strict(), Field(ge=0)] = 8
+
+
+class Structure(Table):
+    """What ``sipe discover`` may put into the model.
+
+    only: names of extensions, default all; without: names that are left out; extra: extensions of the user's own beside
+    them; sites: joints, actuators and channels where they may be placed, default all; budget: rollouts of all fits.
+    """
+
+    only: tuple[ExtensionName, ...] | None = None
+    without: tuple[ExtensionName, ...] = ()
+    extra: tuple[OwnExtension, ...] = ()
+    sites: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
+    budget: Annotated[int, Strict(), Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        left = [name for name in self.only or () if name not in self.without]
+        if self.only is not None and not (left or self.extra):
+            raise problem("expected at least one name beside `without`, got none; add one or drop the key", "only")
+        return self
 
 
 def overlap(a: Pair | None, b: Pair | None) -> bool:

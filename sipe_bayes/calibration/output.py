@@ -18,6 +18,7 @@ from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.randomization_code import write_randomization
+from sipe_bayes.posterior import Posterior
 from sipe_bayes.report.page import write_report
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -48,7 +49,7 @@ def _checksum(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
-_IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
+IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
 
 
 def release(folder: Path) -> None:
@@ -59,7 +60,7 @@ def release(folder: Path) -> None:
 
 
 def claim(
-    folder: Path, own: Mapping[str, object], file: str = RUN, keys: Sequence[str] = _IDENTITY, what: str = "run"
+    folder: Path, own: Mapping[str, object], file: str = RUN, keys: Sequence[str] = IDENTITY, what: str = "run"
 ) -> None:
     """Make ``folder`` this run's own; the same run may come back to it.
 
@@ -97,9 +98,7 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
     Returns:
         The result with what was noticed on the way.
     """
-    calibration.posterior.save(folder / "posterior")
-    with replacing(folder / "posterior.nc") as temporary:
-        calibration.posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
+    save_posterior(calibration.posterior, folder)
     values = problem.environment.space.values(calibration.posterior.mode.numpy())
     try:
         noticed = write_identified(problem.environment, values, folder / "identified.xml")
@@ -114,6 +113,13 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
     write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
     write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
     return calibration
+
+
+def save_posterior(posterior: Posterior, folder: Path) -> None:
+    """Write ``posterior.*``: what ``load_posterior`` reads, and its draws for ArviZ."""
+    posterior.save(folder / "posterior")
+    with replacing(folder / "posterior.nc") as temporary:
+        posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
 
 
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, object]:

@@ -11,6 +11,7 @@ import typer
 from sipe_bayes.cli import benchmark as benchmark_commands
 from sipe_bayes.cli import check as check_commands
 from sipe_bayes.cli import data as data_commands
+from sipe_bayes.cli import discover as discover_commands
 from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
@@ -37,6 +38,7 @@ app.add_typer(transfer_commands.app)
 app.command()(benchmark_commands.simulate)
 app.command()(check_commands.check)
 app.command()(suggest_commands.suggest)
+app.command()(discover_commands.discover)
 app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 

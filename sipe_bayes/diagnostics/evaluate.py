@@ -61,8 +61,17 @@ def errors(windows: Windows, theta: FloatArray) -> FloatArray:
 
     Infinite where one of the log's windows diverges, NaN where a channel has no sample.
     """
-    square = _squares(windows, theta)
-    out = np.full((len(theta), len(windows.trajectories), len(windows.channels)), np.nan)
+    return _roots(windows, _squares(windows, theta))
+
+
+def errors_from_best_starts(windows: Windows, theta: FloatArray) -> FloatArray:
+    """As ``errors`` of one theta (N,), from the starts that it fits best: (logs, C)."""
+    return np.asarray(_roots(windows, _best_squares(windows, theta)[None])[0])
+
+
+def _roots(windows: Windows, square: FloatArray) -> FloatArray:
+    """RMSE (B, logs, C) of squared errors (B, W, L, C)."""
+    out = np.full((len(square), len(windows.trajectories), len(windows.channels)), np.nan)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
         count = windows.observed[mine].sum(axis=(0, 1))
@@ -78,13 +87,15 @@ def _squares(windows: Windows, theta: FloatArray) -> FloatArray:
     return np.where(windows.observed, (windows.measured - predicted) ** 2, 0.0)
 
 
-def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
-    """Errors of theta against those of the model as given.
+def compare_errors(
+    windows: Windows, theta: FloatArray, reference: tuple[Windows, FloatArray] | None = None, fit_starts: bool = False
+) -> Comparison | None:
+    """Errors of theta against those of a reference, the model as given if nothing else is named.
 
-    The mean over logs and channels of log(RMSE as given / RMSE of theta), with the jackknife's standard error over
-    tenths of each log, which takes the errors of both models and all channels out together (a paired t-test on pieces
-    of time). It speaks of these logs, not of others that the machine might give; in a log of few windows the pieces of
-    one share its start, and p is too small.
+    The mean over logs and channels of log(RMSE of the reference / RMSE of theta), with the jackknife's standard error
+    over tenths of each log, which takes the errors of both models and all channels out together (a paired t-test on
+    pieces of time). It speaks of these logs, not of others that the machine might give; in a log of few windows the
+    pieces of one share its start, and p is too small.
 
     Where measured starts make nearly all of theta's error (velocities from noisy positions), both models are compared
     from the starts that each fits best.
@@ -92,17 +103,21 @@ def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
     Args:
         windows: the logs.
         theta: (N,).
+        reference: the same windows of another simulator, and its theta (M,).
+        fit_starts: whether both are compared from the starts that each fits best in any case.
 
     Returns:
         None where there is nothing finite to compare.
     """
-    thetas = np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)])
-    square = _squares(windows, thetas)
+    others, at = reference or (windows, np.clip(windows.simulator.space.default_theta, 0, 1))
+    square = np.concatenate([_squares(windows, theta[None]), _squares(others, at[None])])
     fitted = _best_squares(windows, theta)
     share = _share_of_starts(windows, square[0], fitted)
-    if share > THRESHOLDS.starts_rule:
-        other = _best_squares(windows, thetas[1])
-        square, share = (np.stack([fitted, other]), share) if np.isfinite(other).all() else (square, 0.0)
+    by_starts = share > THRESHOLDS.starts_rule
+    if by_starts or fit_starts:
+        fits = np.stack([fitted, _best_squares(others, at)])
+        by_starts &= bool(np.isfinite(fits).all())
+        square = fits if np.isfinite(fits).all() else square
     parts = []  # of each log: sums (2, pieces, C)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
@@ -114,7 +129,7 @@ def compare_errors(windows: Windows, theta: FloatArray) -> Comparison | None:
             parts.append(sums[:, :, usable])
     if not parts:
         return None
-    return replace(_jackknifed(parts), starts=share if share > THRESHOLDS.starts_rule else None)
+    return replace(_jackknifed(parts), starts=share if by_starts else None)
 
 
 def _best_squares(windows: Windows, theta: FloatArray) -> FloatArray:

@@ -28,13 +28,14 @@ class ExportError(RuntimeError):
     """The written model is not the calibrated one."""
 
 
-def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Path) -> list[Finding]:
+def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Path, note: str = "") -> list[Finding]:
     """Write the MJCF at some values of its parameters. Those that differ between logs take their mean.
 
     Args:
         environment: whose MJCF.
         values: (N,), in physical units.
         path: the file.
+        note: a comment at its head.
 
     Returns:
         Sensor biases, which have no place in a model.
@@ -54,18 +55,21 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
     with replacing(path) as temporary:
         try:
             spec.compile()
-            temporary.write_text(spec.to_xml())
+            temporary.write_text(_noted(spec.to_xml(), note), encoding="utf-8")
             written = mujoco.MjModel.from_xml_path(str(temporary))
         except ValueError as error:  # six digits can break A + B >= C of a flat body
             reason = " ".join(str(error).split())
-            raise ExportError(f"identified.xml: the written model does not compile: {reason}") from None
+            raise ExportError(f"{path.name}: the written model does not compile: {reason}") from None
         differing = differing_fields(model, written)
         if differing:
-            raise ExportError(
-                f"identified.xml: the written model differs in {', '.join(differing)}; nothing was written"
-            )
+            raise ExportError(f"{path.name}: the written model differs in {', '.join(differing)}; nothing was written")
     biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
     return [finding(Code.BIAS_NOT_EXPORTED, parameters=[name]) for name in biased]
+
+
+def _noted(xml: str, note: str) -> str:
+    """MJCF with a comment, in which no two dashes may stand together."""
+    return f"<!-- {note.replace('--', '- -')} -->\n{xml}" if note else xml
 
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:

@@ -111,7 +111,7 @@ def _log_row(log: LogReport, use: str) -> dict[str, object]:
     }
 
 
-def _details(run: Mapping[str, object]) -> list[tuple[str, str]]:
+def run_details(run: Mapping[str, object]) -> list[tuple[str, str]]:
     """What the run was made of, each part as text."""
     texts = {
         key: value if isinstance(value, str) else json.dumps(value, indent=1, ensure_ascii=False, default=str)
@@ -203,7 +203,7 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, o
         "noise": [_noise_row(channel, noise) for channel, noise in calibration.noise.items()],
         "mixing": _mixing_rows(calibration.mixing, space.names) if calibration.mixing else None,
         "logs": [_log_row(log, uses.get(log.name, "")) for log in calibration.logs],
-        "details": _details(calibration.run),
+        "details": run_details(calibration.run),
         "limits": {"well": f"{100 * THRESHOLDS.well_determined:.0f} %"},
     }
 
@@ -212,6 +212,14 @@ def render(calibration: Calibration, images: Sequence[Picture]) -> str:
     """The page as HTML."""
     template = html_templates("sipe_bayes.report").get_template("report.html.j2")
     return template.render(**_context(calibration, images))
+
+
+def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) -> None:
+    """Write them into ``figures``."""
+    figures = Path(folder) / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    for image in images:
+        write_bytes(figures / image.file, image.content)
 
 
 def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
@@ -224,10 +232,7 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Pa
     """
     images = pictures(calibration)
     page = render(calibration, images)
-    figures = Path(folder) / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
-    for image in images:
-        write_bytes(figures / image.file, image.content)
+    write_pictures(images, folder)
     path = Path(folder) / "report.html"
     write_bytes(path, page.encode())
     return path

@@ -86,6 +86,26 @@ def error_panel(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
     ticks(ax.yaxis, 2)
 
 
+def two_errors_panel(ax: Axes, signal: Signal, span: tuple[float, float]) -> None:
+    """What is measured less either simulation, ``default`` in orange and ``mode`` in blue.
+
+    Args:
+        ax: the panel.
+        signal: one channel of one log.
+        span: from when to when its limits are taken, s.
+    """
+    ax.axhline(0, color="#555555", lw=0.7)
+    inside, reach = (signal.time >= span[0]) & (signal.time <= span[1]), 0.0
+    for values, colour, width in ((signal.default, DEFAULT, 1.0), (signal.mode, POSTERIOR, STYLE.curve)):
+        error = signal.measured - values
+        ax.plot(*_restarted(signal, error), color=colour, lw=width)
+        reach = max(reach, float(np.nanmax(np.abs(error[inside]), initial=0.0)))
+    _window_marks(ax, signal, 0.1)
+    if reach > 0:
+        ax.set_ylim(-1.1 * reach, 1.1 * reach)
+    ticks(ax.yaxis, 4)
+
+
 def worst_stretch(rows: Sequence[Signal]) -> tuple[float, float]:
     """The part of a log with the largest squared error, relative to each channel's.
 

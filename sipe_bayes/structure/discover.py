@@ -8,16 +8,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.extension import placements
 from sipe_bayes.structure.fitted import Fitting
+from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 from sipe_bayes.structure.search import DiscoverOptions, DiscoverState, StructureSearch
 from sipe_bayes.structure.structures import Structures
@@ -55,6 +60,12 @@ class Restriction:
         """Those that may be tried."""
         chosen = [*(EXTENSIONS if self.only is None else self.only), *self.extra]
         return [name for name in dict.fromkeys(chosen) if name not in self.without]
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of the files that hold the user's own."""
+        files = {name: Path(name.rpartition(":")[0]) for name in self.names}
+        return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in files.items() if f.suffix == ".py"}
 
 
 def discover(
@@ -105,6 +116,41 @@ def discover(
     return Structures(search, state)
 
 
+def check_restriction(
+    simulator: Simulator, trajectories: Trajectories, likelihood: Segments, restriction: Restriction
+) -> None:
+    """See before a search that sites exist, that extensions load, and that each of the user's own finds a place.
+
+    Args:
+        simulator: of the user's model.
+        trajectories: the logs.
+        likelihood: how they are cut into windows.
+        restriction: what is to be checked.
+
+    Raises:
+        ValueError: where it is not so; one line with the remedy.
+    """
+    _check_sites(_environment(simulator), restriction.sites)
+    own = [get_extension(name) for name in restriction.names if name not in EXTENSIONS]
+    if not own:
+        return
+    windows = Windows(likelihood, simulator, trajectories)
+    machine = machine_of(windows, np.clip(simulator.space.default_theta, 0, 1), windows.no_starts())
+    for extension in own:
+        if not list(placements(extension, machine)):
+            raise ValueError(
+                f"structure: extension {extension.name!r} finds no {extension.kind} that it applies to in this model; "
+                "give its parameters targets that the model has, or leave it out"
+            )
+
+
+def _environment(simulator: Simulator) -> MjcfEnvironment:
+    environment = simulator.environment
+    if not isinstance(environment, MjcfEnvironment):
+        raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
+    return environment
+
+
 def _search(
     simulator: Simulator,
     trajectories: Trajectories,
@@ -115,9 +161,7 @@ def _search(
     budget: int,
     seed: int,
 ) -> StructureSearch:
-    environment = simulator.environment
-    if not isinstance(environment, MjcfEnvironment):
-        raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
+    environment = _environment(simulator)
     restriction = restriction or Restriction()
     _check_sites(environment, restriction.sites)
     fitting = Fitting(
@@ -155,5 +199,6 @@ def _fingerprint(search: StructureSearch, simulator: Simulator, restriction: Res
         "options": search.options.plain(),
         "restriction": repr(restriction),
         "extensions": list(EXTENSIONS),
+        "own": restriction.digests,
     }
     return hashlib.sha256(f"{settings!r}{digest(fitting.trajectories)}".encode()).hexdigest()

@@ -25,7 +25,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from sipe_bayes.envs.unknowns import physical_targets
 from sipe_bayes.structure.machine import Machine
 
 Kind = Literal["joint", "actuator", "channel", "world"]
+KINDS: tuple[str, ...] = get_args(Kind)
 PROBE = 0.03  # of a parameter's range, how far a probe goes: an effect that is still about linear
 WORLD = "world"  # the one site of an extension of the world
 
@@ -51,6 +52,7 @@ class Extension(ABC):
     kind: ClassVar[Kind]
     reference: ClassVar[str]
     native: ClassVar[bool] = True  # MJCF has an element for it
+    nearest: ClassVar[str] = ""  # the element of MJCF that comes nearest, where it has none of its own
     last_resort: ClassVar[bool] = False  # tried only where nothing else helps
 
     @abstractmethod
@@ -137,16 +139,24 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     }
     taken, count = machine.written(), len(machine.environment.parameters)
     for site in sites[extension.kind]:
-        parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
-        if not parameters or any(t in taken for p in parameters for t in p.targets):
-            continue
-        draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, 0, len(parameters))))
+        try:
+            parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
+            if not parameters or any(t in taken for p in parameters for t in p.targets):
+                continue
+            draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, 0, len(parameters))))
+            _ = draft.sentence
+        except Exception as error:  # the user's own code may raise anything
+            raise _failed(extension, site, error) from error
         try:
             space = extended(machine.environment, [draft]).space
         except ValueError:
             continue  # the model has no place for it, or a value of its own beyond these bounds
         own = tuple(space)[count:]
-        yield Placed(extension, site, own, draft.edit, _shapes(extension.probes(machine, own)))
+        try:
+            probes = _shapes(np.asarray(extension.probes(machine, own), float))
+        except Exception as error:
+            raise _failed(extension, site, error) from error
+        yield Placed(extension, site, own, draft.edit, probes)
 
 
 def _with_own(machine: Machine, parameter: Parameter) -> Parameter:
@@ -165,3 +175,8 @@ def _with_own(machine: Machine, parameter: Parameter) -> Parameter:
 def _shapes(probes: FloatArray) -> FloatArray:
     """Probes (G, K, P), of one shape where they are (K, P)."""
     return probes if probes.ndim == 3 else probes[None]
+
+
+def _failed(extension: Extension, site: str, error: Exception) -> ValueError:
+    reason = " ".join(f"{type(error).__name__}: {error}".split())
+    return ValueError(f"structure: extension {extension.name!r} fails at {site!r} ({reason}); correct it")

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from sipe_bayes.core.validation import nearest_name
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import KINDS, Extension
 
 _PACKAGE = "sipe_bayes.structure.extensions"
 EXTENSIONS: dict[str, str] = {  # name: module and class
@@ -64,6 +64,10 @@ def _made(module: str, kind: str, name: str) -> Extension:
         raise ValueError(f"structure: extension {name!r} cannot be loaded ({reason}); correct it") from None
     if not isinstance(made, Extension):
         raise ValueError(f"structure: {name!r} is no Extension; make it a subclass of sipe_bayes.structure.Extension")
+    missing = [word for word in ("name", "kind", "reference") if not isinstance(getattr(made, word, None), str)]
+    if missing or made.kind not in KINDS:
+        remedy = f"give it a {missing[0]}" if missing else f"its kind is one of {', '.join(KINDS)}, got {made.kind!r}"
+        raise ValueError(f"structure: extension {name!r} is not complete; {remedy}")
     return made
 
 

@@ -27,6 +27,7 @@ from sipe_bayes.calibration.config_tables import (
     PriorSource,
     Resample,
     Search,
+    Structure,
     TimeColumn,
 )
 from sipe_bayes.calibration.tables import READERS
@@ -225,6 +226,7 @@ TABLES: dict[str, type[Table]] = {
     "parameters.prior.": NormalPrior,
     "noise.": Noise,
     "prior.": PriorSource,
+    "structure.": Structure,
 }
 
 

@@ -32,6 +32,7 @@ RESULTS = [
         "estimator.rollouts",
     ),
     *("sipe.load_posterior('posterior')", "sipe.calibrate(sipe.prepare(Path('config.toml'), 1)).posterior"),
+    "sipe.discover(sipe.prepare(Path('config.toml'), 1)).posterior",
     *("sipe.gym.make('Pendulum')", "trajectories[:2]"),
 ]
 CHECKERS = {

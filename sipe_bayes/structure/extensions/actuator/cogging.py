@@ -18,6 +18,7 @@ class Cogging(Extension):
     name, kind = "cogging", "actuator"
     reference = "MuJoCo documentation, actuator/dcmotor, cogging"
     native = False
+    nearest = "actuator/dcmotor, cogging"
 
     def sentence(self, site: str) -> str:
         """What it is."""

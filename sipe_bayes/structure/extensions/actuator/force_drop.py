@@ -13,6 +13,7 @@ class ForceDrop(Extension):
     name, kind = "force_drop", "actuator"
     reference = "-"
     native = False
+    nearest = "actuator gain, at its mean over the motion"
 
     def sentence(self, site: str) -> str:
         """What it is."""

@@ -13,6 +13,7 @@ class DirectionFriction(Extension):
     name, kind = "direction_friction", "joint"
     reference = "B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit 1994, https://doi.org/10.1016/0005-1098(94)90209-7"
     native = False
+    nearest = "joint frictionloss and damping, alike both ways"
 
     def sentence(self, site: str) -> str:
         """What it is."""

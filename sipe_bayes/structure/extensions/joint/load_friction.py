@@ -13,6 +13,7 @@ class LoadFriction(Extension):
     name, kind = "load_friction", "joint"
     reference = "M. Duclusaud et al. 2024, https://arxiv.org/abs/2410.08650"
     native = False
+    nearest = "joint frictionloss, at its mean over the motion"
 
     def sentence(self, site: str) -> str:
         """What it is."""

@@ -16,6 +16,7 @@ class Stribeck(Extension):
     name, kind = "stribeck", "joint"
     reference = "R. Stribeck 1902; H. Olsson et al. 1998, https://doi.org/10.1016/S0947-3580(98)70113-X"
     native = False
+    nearest = 'actuator/dcmotor with input="none", LuGre friction'
 
     def sentence(self, site: str) -> str:
         """What it is."""

@@ -1,0 +1,149 @@
+"""What ``sipe discover`` does: search the physics that a user's model lacks, and write what was found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from sipe_bayes.calibration.discovered import write_discovery
+from sipe_bayes.calibration.discovery_summary import summarise
+from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claim, describe_run, release
+from sipe_bayes.calibration.problem import Problem, prepare
+from sipe_bayes.calibration.run import run_name
+from sipe_bayes.diagnostics.discovery import Discovery
+from sipe_bayes.inference.recorded import Progress
+from sipe_bayes.structure.discover import Restriction, check_restriction
+from sipe_bayes.structure.discover import discover as search
+from sipe_bayes.structure.search import DiscoverOptions
+from sipe_bayes.structure.structures import Structures
+
+_BUDGET = 20000  # rollouts of all fits
+_KEYS = (*IDENTITY, "only", "without", "extensions_sha256")
+
+
+def discover(
+    problem: Problem | str | Path,
+    *,
+    only: Sequence[str] | None = None,
+    without: Sequence[str] = (),
+    seed: int | None = None,
+    budget: int | None = None,
+    options: DiscoverOptions | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Structures:
+    """Search the physics that a model lacks.
+
+    Args:
+        problem: a configuration read and bound, as ``prepare`` returns it, or the path of one.
+        only: names of the extensions that may be tried; default the configuration's, then all.
+        without: names that are left out, beside the configuration's.
+        seed: default the configuration's.
+        budget: rollouts of all fits; default the configuration's, then 20,000.
+        options: of the search.
+        checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits.
+        progress: called along the way.
+
+    Returns:
+        The structures that were fitted: ``.table()``, ``.best``, ``.posterior`` (averaged over them).
+
+    Raises:
+        ValueError: for input that cannot be used; the message is one line with the remedy.
+    """
+    problem = problem if isinstance(problem, Problem) else prepare(problem)
+    config = problem.config
+    return search(
+        problem.simulator,
+        problem.train,
+        prior=problem.prior,
+        likelihood=problem.segments,
+        restriction=restriction_of(problem, only, without),
+        options=options,
+        budget=_budget(problem, budget),
+        seed=config.seed if seed is None else seed,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+
+
+def restriction_of(problem: Problem, only: Sequence[str] | None = None, without: Sequence[str] = ()) -> Restriction:
+    """Which extensions may be tried, and where: what is given here, then the configuration's ``[structure]``.
+
+    Args:
+        problem: a configuration read and bound.
+        only: in place of the configuration's.
+        without: beside the configuration's.
+
+    Raises:
+        ValueError: for names that do not exist; one line with the remedy.
+    """
+    table = problem.config.structure
+    chosen = table.only if only is None else tuple(only)
+    return Restriction(chosen, (*table.without, *without), table.extra, table.sites)
+
+
+def _budget(problem: Problem, budget: int | None) -> int:
+    return budget or problem.config.structure.budget or _BUDGET
+
+
+def run_discovery(
+    config: Path,
+    out: Path | None = None,
+    seed: int | None = None,
+    budget: int | None = None,
+    only: Sequence[str] | None = None,
+    without: Sequence[str] = (),
+    num_threads: int | None = None,
+    progress: Progress | None = None,
+) -> Discovery:
+    """What the command does: read, claim the output folder, search with a checkpoint, write everything.
+
+    Every input is checked before the folder is touched, the user's own extensions among it. The same call after an
+    interruption goes on.
+
+    Args:
+        config: the TOML file.
+        out: folder of the results; default runs/NAME-discover.
+        seed: default the configuration's.
+        budget: rollouts of all fits; default the configuration's, then 20,000.
+        only: names of the extensions that may be tried.
+        without: names that are left out.
+        num_threads: native ones; default all cores.
+        progress: called along the way.
+
+    Raises:
+        ValueError: for input that cannot be used; the message is one line with the remedy.
+    """
+    began = time.monotonic()
+    problem = prepare(config, num_threads)
+    restriction = restriction_of(problem, only, without)
+    check_restriction(problem.simulator, problem.train, problem.segments, restriction)
+    chosen = problem.config.seed if seed is None else seed
+    name = run_name(problem.config.path)
+    folder = Path("runs") / f"{name}-discover" if out is None else out
+    record = describe_run(problem, "discover", chosen, _budget(problem, budget))
+    record |= {
+        "only": restriction.only and list(restriction.only),
+        "without": list(restriction.without),
+        "extensions_sha256": restriction.digests,
+    }
+    claim(folder, {**record, "status": "started"}, keys=_KEYS)
+    try:
+        structures = discover(
+            problem,
+            only=only,
+            without=without,
+            seed=chosen,
+            budget=budget,
+            checkpoint=folder / CHECKPOINT,
+            progress=progress,
+        )
+    except ValueError:
+        release(folder)
+        raise
+    if progress is not None:
+        progress("comparing before and after", structures.rollouts, structures.rollouts)
+    discovery = summarise(problem, structures, name, chosen, time.monotonic() - began)
+    return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

@@ -1,0 +1,184 @@
+"""What a search over structures says about a problem's logs: before and after, what remains, what to believe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sipe_bayes.calibration.gathered import Marginals
+from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
+from sipe_bayes.diagnostics.evaluate import (
+    compare_errors,
+    errors,
+    errors_from_best_starts,
+    fitted_residuals,
+    fitted_units,
+    signals,
+)
+from sipe_bayes.diagnostics.misspecification import misfit
+from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Signal
+from sipe_bayes.diagnostics.result import ParameterSummary
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.structure.fitted import FittedStructure
+from sipe_bayes.structure.structures import Structures
+
+
+def summarise(problem: Problem, structures: Structures, name: str, seed: int, seconds: float) -> Discovery:
+    """Everything that is told of a search.
+
+    Args:
+        problem: whose logs were searched.
+        structures: that were fitted.
+        name: of the run.
+        seed: of draws.
+        seconds: that the search took.
+    """
+    before, after = _Model(problem, structures, structures.plain), _Model(problem, structures, structures.best)
+    compared, drawn = [], []
+    for use, logs in (("holdout", problem.holdout), ("train", problem.train)):
+        if logs is not None:
+            compared += _errors(use, before, after, logs)
+            drawn += _signals(use, before, after, logs, seed)
+    user, added = len(problem.prior.space), after.summaries(seed)
+    averaged = Marginals.of(structures.posterior, problem.prior, problem.prior.space, seed)
+    return Discovery(
+        name=name,
+        rows=tuple(structures.table()),
+        pieces=_pieces(structures),
+        promises=_promises(structures),
+        posterior=structures.posterior,
+        prior=problem.prior,
+        parameters=tuple(averaged.summaries()),
+        plain_parameters=tuple(before.summaries(seed)),
+        added=tuple(added[user:]),
+        best=after.values,
+        errors=tuple(compared),
+        comparison=_comparison(problem, before, after),
+        before=before.stage(seed),
+        after=after.stage(seed),
+        signals=tuple(drawn),
+        named_share=structures.named_share,
+        settled=structures.settled,
+        rollouts=structures.rollouts,
+        seconds=seconds,
+    )
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A fitted structure bound to the problem's logs."""
+
+    problem: Problem
+    structures: Structures
+    one: FittedStructure
+
+    def windows(self, logs: Trajectories) -> Windows:
+        """By which logs are scored and drawn."""
+        return Windows(replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Its optimum in units."""
+        space = self.structures.simulator(self.one).space
+        return dict(zip(space.names, space.values(self.one.theta).tolist(), strict=True))
+
+    def summaries(self, seed: int) -> list[ParameterSummary]:
+        """All parameters of the structure."""
+        simulator = self.structures.simulator(self.one)
+        prior = self.structures.search.fitting.prior_of(simulator)
+        return Marginals.of(self.structures.posterior_of(self.one), prior, simulator.space, seed).summaries()
+
+    def stage(self, seed: int) -> Stage:
+        """What it leaves of the training logs."""
+        fitting = self.structures.search.fitting
+        simulator = self.structures.simulator(self.one)
+        windows, one = fitting.windows(simulator), self.one
+        rows = zip(one.sd.tolist(), one.tau.tolist(), fitted_units(windows), strict=True)
+        noise = {channel: ChannelNoise(*row) for channel, row in zip(windows.fitted, rows, strict=True)}
+        residuals = fitted_residuals(windows, one.theta, one.noise, one.starts)
+        return Stage(noise, self._misfit(windows, seed), tuple(residuals))
+
+    def _misfit(self, windows: Windows, seed: int) -> Misfit | None:
+        prior = QuadraticPrior.of(self.structures.search.fitting.prior_of(windows.simulator))
+        sd = self.structures.posterior_of(self.one).stddev.numpy()
+        try:
+            return misfit(
+                windows, self.one.theta, self.one.noise, starts=self.one.starts, sd=sd, prior=prior, seed=seed
+            )
+        except ValueError:  # LinAlgError is one
+            return None
+
+
+def _errors(use: str, before: _Model, after: _Model, logs: Trajectories) -> list[ModelErrors]:
+    """Of logs under the plain model and under the structure, from measured starts and from fitted ones."""
+    plain, extended = before.windows(logs), after.windows(logs)
+    default = np.clip(plain.simulator.space.default_theta, 0, 1)
+    old, given = errors(plain, np.stack([before.one.theta, default]))
+    (new,) = errors(extended, after.one.theta[None])
+    fits = (errors_from_best_starts(w, m.one.theta) for w, m in ((plain, before), (extended, after)))
+    kinds = (given, old, new, *fits)
+    return [
+        ModelErrors(log, use, *channel, *(float(rmse[k, c]) for rmse in kinds))
+        for k, log in enumerate(logs.names)
+        for c, channel in enumerate(zip(plain.fitted, fitted_units(plain), strict=True))
+        if not np.isnan(old[k, c])
+    ]
+
+
+def _signals(use: str, before: _Model, after: _Model, logs: Trajectories, seed: int) -> list[Signal]:
+    """Of the structure, with the calibrated plain model in place of the model as given."""
+    new, old = (
+        signals(model.windows(logs), use, model.one.theta, model.structures.posterior_of(model.one), seed)
+        for model in (after, before)
+    )
+    return [replace(line, default=plain.mode) for line, plain in zip(new, old, strict=True)]
+
+
+def _comparison(problem: Problem, before: _Model, after: _Model) -> Comparison | None:
+    if problem.holdout is None or not after.one.labels:
+        return None
+    reference = before.windows(problem.holdout), before.one.theta
+    return compare_errors(after.windows(problem.holdout), after.one.theta, reference, fit_starts=True)
+
+
+def _pieces(structures: Structures) -> tuple[Piece, ...]:
+    """The extensions with a name that were fitted, most probable first."""
+    pieces = []
+    for label, probability in structures.inclusion().items():
+        placed = structures.search.placed[label]
+        extension = placed.extension
+        if extension.last_resort:
+            continue
+        evidence, held_out = _gain(structures, label)
+        kept = label in structures.best.labels
+        told = (label, placed.sentence, extension.reference, probability, evidence, held_out)
+        pieces.append(Piece(*told, kept, extension.native, extension.nearest))
+    return tuple(sorted(pieces, key=lambda piece: not piece.kept))
+
+
+def _gain(structures: Structures, label: str) -> tuple[float | None, float | None]:
+    """What an extension adds to the rest of the most probable structure that has it."""
+    having = [
+        (p, one.evidence, i)
+        for i, (p, one) in enumerate(zip(structures.probabilities.tolist(), structures.fitted, strict=True))
+        if label in one.labels
+    ]
+    one = structures.fitted[max(having)[2]]
+    rest = structures.state.of([other for other in one.labels if other != label])
+    if rest is None:
+        return None, None
+    known = one.held_out is not None and rest.held_out is not None
+    held_out = one.held_out - rest.held_out if known else None  # type: ignore[operator]
+    return one.evidence - rest.evidence, held_out
+
+
+def _promises(structures: Structures) -> tuple[Promise, ...]:
+    tried = {label for one in structures.fitted for label in one.labels}
+    return tuple(
+        Promise(offer.label, structures.search.placed[offer.label].sentence, offer.gain, offer.label in tried)
+        for offer in structures.offers()
+    )

@@ -1,0 +1,125 @@
+"""The page about a search over structures: what the model lacks, what was tried, before and after, what remains."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors
+from sipe_bayes.report import discovery_plots as plots
+from sipe_bayes.report.discovery_words import (
+    alternatives,
+    discovery_verdicts,
+    nats,
+    piece_text,
+    probability_text,
+    residual_lines,
+    value_rows,
+    warnings,
+)
+from sipe_bayes.report.drawing import png
+from sipe_bayes.report.page import Picture, run_details, write_pictures
+from sipe_bayes.report.templates import html_templates
+from sipe_bayes.report.words import error_text, listed, number, times, unit_text
+
+
+def discovery_pictures(discovery: Discovery) -> list[Picture]:
+    """Every figure of the report, rendered."""
+    drawn = []
+    uses = {s.log: s.use for s in discovery.signals}
+    for i, (log, use) in enumerate(uses.items()):
+        slug = re.sub(r"[^A-Za-z0-9]+", "_", log).strip("_")[:40]
+        alt = f"Measured and simulated signals of {log}, before and after"
+        drawn.append((f"signals_{use}", f"before_after_{i + 1}_{slug}", alt, plots.before_and_after(discovery, log)))
+    alt = "Residuals before and after, and their autocorrelation"
+    drawn.append(("residuals", "residuals_before_after", alt, plots.residuals(discovery)))
+    drawn.append(
+        ("values", "values_before_after", "Intervals of the parameters before and after", plots.values(discovery))
+    )
+    return [
+        Picture(section, f"{file}{f'_{k + 1}' if len(figures) > 1 else ''}.png", png(figure), alt)
+        for section, file, alt, figures in drawn
+        for k, figure in enumerate(figures)
+    ]
+
+
+def _error_row(row: ModelErrors) -> dict[str, str]:
+    ratio = row.fitted_before / row.fitted_after if row.fitted_after > 0 else float("nan")
+    return {
+        "log": row.log,
+        "channel": row.channel,
+        "unit": unit_text(row.unit),
+        **{key: error_text(getattr(row, key)) for key in ("given", "before", "after", "fitted_before", "fitted_after")},
+        "ratio": times(ratio),
+        "tone": "good" if ratio >= THRESHOLDS.alike else "bad" if ratio <= 1 / THRESHOLDS.alike else "fair",
+    }
+
+
+def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, object]:
+    sentences = discovery_verdicts(discovery)
+    tones = {v.tone for v in sentences}
+    sections: dict[str, list[Picture]] = {}
+    for image in images:
+        sections.setdefault(image.section, []).append(image)
+    structures = [
+        {
+            "what": listed(row.sentences) or "the model as it was",
+            "evidence": nats(row.evidence),
+            "held_out": nats(row.held_out),
+            "probability": probability_text(row.probability),
+            "rollouts": f"{row.rollouts:,}",
+        }
+        for row in discovery.rows
+    ]
+    rows = value_rows(discovery)
+    return {
+        "name": discovery.name,
+        "rollouts": f"{discovery.rollouts:,}",
+        "seconds": number(discovery.seconds, 2),
+        "tone": "bad" if "bad" in tones else "fair" if "fair" in tones else "good",
+        "headline": sentences[0].text,
+        "sentences": sentences[1:],
+        "warnings": warnings(discovery),
+        "pieces": [piece_text(piece) for piece in discovery.kept],
+        "others": [piece_text(piece) for piece in alternatives(discovery)],
+        "laws": [piece for piece in discovery.kept if not piece.native],
+        "references": {piece.sentence: piece.reference for piece in discovery.kept if len(piece.reference) > 1},
+        "structures": structures,
+        "promises": [
+            {"what": p.sentence, "gain": nats(p.gain), "fitted": "yes" if p.fitted else ""} for p in discovery.promises
+        ],
+        "values": [row for row in rows if not row["added"]],
+        "added": [row for row in rows if row["added"]],
+        "errors": [
+            (title, [_error_row(row) for row in discovery.errors if row.use == use])
+            for title, use in (("Held-out logs", "holdout"), ("Training logs", "train"))
+        ],
+        "residual_lines": residual_lines(discovery),
+        "sections": sections,
+        "details": run_details(discovery.run),
+        "out": discovery.out,
+    }
+
+
+def render_discovery(discovery: Discovery, images: Sequence[Picture]) -> str:
+    """The page as HTML."""
+    template = html_templates("sipe_bayes.report").get_template("discovery.html.j2")
+    return template.render(**_context(discovery, images))
+
+
+def write_discovery_report(discovery: Discovery, folder: str | os.PathLike[str]) -> Path:
+    """Write ``figures/*.png`` and ``report.html``, the report last.
+
+    Returns:
+        The report's path.
+    """
+    images = discovery_pictures(discovery)
+    page = render_discovery(discovery, images)
+    write_pictures(images, folder)
+    path = Path(folder) / "report.html"
+    write_bytes(path, page.encode())
+    return path

@@ -1,0 +1,131 @@
+"""What to think of a search over structures, in sentences: what the model lacks, what it gains, what remains."""
+
+from __future__ import annotations
+
+from sipe_bayes.core.findings import Findings
+from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
+from sipe_bayes.report.verdicts import Verdict
+from sipe_bayes.report.words import error_text, listed, number, significant, unit_text
+
+_SURE = 0.995  # a probability from which no more digits are told
+_OPEN = 0.05  # and below which a piece is no alternative
+
+
+def nats(value: float | None) -> str:
+    """A gain in nats with its sign; a dash where it is not known."""
+    return "–" if value is None else f"{value:+.0f}" if abs(value) >= 10 else f"{value:+.1f}"
+
+
+def probability_text(probability: float) -> str:
+    """A probability to two digits."""
+    if probability > _SURE:
+        return "> 0.99"
+    return f"{probability:.2f}" if probability >= 1 - _SURE else "< 0.01"
+
+
+def piece_text(piece: Piece) -> str:
+    """What is lacking, and how much speaks for it."""
+    held_out = "" if piece.held_out is None else f", held-out pieces {nats(piece.held_out)} nats"
+    scores = f"probability {probability_text(piece.probability)}, evidence {nats(piece.evidence)} nats{held_out}"
+    return f"{piece.sentence}: {scores}"
+
+
+def alternatives(discovery: Discovery) -> tuple[Piece, ...]:
+    """Pieces that the most probable structure does without, and that are not out of the question."""
+    return tuple(piece for piece in discovery.pieces if not piece.kept and piece.probability > _OPEN)
+
+
+def headline(discovery: Discovery) -> Verdict:
+    """What the model lacks."""
+    misfit = discovery.after.misfit
+    passes = misfit is not None and not misfit.alarm
+    kept = [piece.sentence for piece in discovery.kept]
+    if kept:
+        return Verdict("good" if passes else "fair", f"The model lacks {listed(kept)}.")
+    if passes:
+        return Verdict("good", "Nothing is lacking that these logs would show: the residuals pass for noise.")
+    return Verdict("bad", "The residuals are not noise, and nothing that was tried is what the model lacks.")
+
+
+def held_out_verdict(discovery: Discovery) -> Verdict | None:
+    """Whether the extended model foretells held-out logs better than the calibrated plain one."""
+    comparison = discovery.comparison
+    if comparison is None:
+        if not discovery.kept or any(row.use == "holdout" for row in discovery.errors):
+            return None
+        return Verdict("fair", "No log was held out: only pieces of the training logs speak for it.")
+    factor = f"{1 / comparison.ratio:.2f} times"
+    interval = f"95 % interval {1 / comparison.high:.2f} to {1 / comparison.low:.2f}"
+    margin = f"{factor} the calibrated plain model's ({interval})"
+    words = {
+        "better": ("good", f"On held-out logs its error is {margin}."),
+        "worse": ("bad", f"On held-out logs its error is LARGER, {margin}."),
+        "not better": ("fair", f"On held-out logs it is NOT shown to be better: its error is {margin}."),
+    }
+    return Verdict(*words[comparison.verdict])
+
+
+def remains(discovery: Discovery) -> Verdict | None:
+    """Whether what the best structure leaves passes for noise, and what share the pieces with a name have."""
+    misfit, share = discovery.after.misfit, discovery.named_share
+    explained = ""
+    if share is not None and share < 1:
+        explained = f" Pieces with a name explain {100 * share:.0f} % of what a force without one would."
+    if misfit is None:
+        return Verdict("fair", f"Whether the residuals pass for noise cannot be told.{explained}")
+    if not misfit.alarm:
+        return (
+            Verdict("good", f"What remains passes for noise (p = {misfit.p:.2g}).{explained}")
+            if discovery.kept
+            else None
+        )
+    text = f"What remains is not noise (p = {misfit.p:.2g}); it looks most like {misfit.cause}.{explained}"
+    return Verdict("bad", f"{text} Intervals are of these structures alone.")
+
+
+def discovery_verdicts(discovery: Discovery) -> list[Verdict]:
+    """The sentences at the top of the report and of what is printed."""
+    out = [headline(discovery), held_out_verdict(discovery), remains(discovery)]
+    if not discovery.settled:
+        out.append(Verdict("fair", "The search ended before it had settled: give it a larger budget."))
+    return [verdict for verdict in out if verdict is not None]
+
+
+def residual_lines(discovery: Discovery) -> list[str]:
+    """For each channel the size and the correlation time of what remains, before and after."""
+    lines = []
+    for channel, before in discovery.before.noise.items():
+        after = discovery.after.noise[channel]
+        sizes = " to ".join(error_text(noise.sd) for noise in (before, after))
+        times = " to ".join(f"{number(noise.tau)} s" for noise in (before, after))
+        lines.append(f"{channel}: sd from {sizes} {unit_text(after.unit)}, correlation time from {times}")
+    return lines
+
+
+def error_line(row: ModelErrors) -> str:
+    """One log and channel: as given, before, after."""
+    fits = f"{error_text(row.fitted_before)} to {error_text(row.fitted_after)}"
+    measured = f"{error_text(row.before)} to {error_text(row.after)}"
+    unit = unit_text(row.unit)
+    started = f"from measured starts {measured}, {error_text(row.given)} as given"
+    return f"{row.log}, {row.channel}: RMSE {fits} {unit}; {started}"
+
+
+def value_rows(discovery: Discovery) -> list[dict[str, str]]:
+    """The user's parameters averaged over structures, beside those of the plain model; then those that were added."""
+    rows = []
+    plain = {p.name: p for p in discovery.plain_parameters}
+    for p in (*discovery.parameters, *discovery.added):
+        scale = max(abs(p.q05), abs(p.q95))
+        value, low, high = (significant(x, p.sd, scale) for x in (p.q50, p.q05, p.q95))
+        row = {"name": p.name, "unit": unit_text(p.unit), "value": value, "interval": f"{low} to {high}"}
+        old = plain.get(p.name)
+        texts = [] if old is None else [significant(x, old.sd, scale) for x in (old.q50, old.q05, old.q95)]
+        row |= {"before": texts[0] if texts else "", "before_interval": " to ".join(texts[1:])}
+        rows.append(row | {"added": "" if old else "yes", "nuisance": "yes" if p.nuisance else ""})
+    return rows
+
+
+def warnings(discovery: Discovery) -> list[str]:
+    """What was noticed while the results were written."""
+    return Findings(discovery.findings).warnings

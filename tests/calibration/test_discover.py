@@ -1,0 +1,170 @@
+"""``sipe discover``: finds what was planted, keeps to its list, resumes to the same bits, hands back what runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+
+import mujoco
+import pytest
+
+import sipe_bayes as sipe
+from sipe_bayes.calibration.discover import run_discovery
+from sipe_bayes.calibration.output import CHECKPOINT
+from sipe_bayes.calibration.run import run
+from sipe_bayes.core.files import OutputError
+from sipe_bayes.diagnostics.discovery import Discovery
+from tests.problems.interruptions import stop_after
+from tests.problems.lacking import FRICTION, OWN, write_lacking
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Discovery]:
+    """(configuration, what was found), in the folder ``out`` beside the configuration."""
+    config = write_lacking(tmp_path_factory.mktemp("lacking"))
+    return config, run_discovery(config, config.parent / "out", num_threads=1)
+
+
+def test_finds_what_was_planted(case: tuple[Path, Discovery]) -> None:
+    _, found = case
+    (piece,) = found.kept
+    assert piece.label == "dry_friction:hinge"
+    assert piece.probability > 0.9
+    assert piece.evidence is not None
+    assert piece.held_out is not None
+    assert min(piece.evidence, piece.held_out) > 3
+    (friction,) = found.added
+    assert abs(friction.mode - FRICTION) < 5 * friction.sd
+    (held_out,) = [row for row in found.errors if row.use == "holdout"]
+    assert held_out.fitted_after < 0.8 * held_out.fitted_before
+    assert found.after.noise["angle"].sd < found.before.noise["angle"].sd
+    assert found.comparison is not None
+    assert found.comparison.verdict == "better"
+
+
+def test_averaged_values_hold_the_truth(case: tuple[Path, Discovery]) -> None:
+    _, found = case
+    for p, truth in zip(found.parameters, (0.6, 0.05), strict=True):
+        assert abs(p.q50 - truth) < 5 * p.sd, p
+    assert {p.name for p in found.parameters} == set(sipe.load_posterior(Path(found.out) / "posterior").space.names)
+
+
+def test_folder_is_complete(case: tuple[Path, Discovery]) -> None:
+    _, found = case
+    out = Path(found.out)
+    files = {p.name for p in out.iterdir()}
+    wanted = {
+        "discovered.xml",
+        "discovered.toml",
+        "structures.json",
+        "posterior.safetensors",
+        "report.html",
+        "run.json",
+    }
+    assert wanted <= files
+    assert json.loads((out / "run.json").read_text())["status"] == "complete"
+    data = json.loads((out / "structures.json").read_text())
+    assert data["structures"][0]["labels"] == ["dry_friction:hinge"]
+    assert sum(row["probability"] for row in data["structures"]) == pytest.approx(1.0)
+    assert "What the model of" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_discovered_model_has_the_values(case: tuple[Path, Discovery]) -> None:
+    _, found = case
+    model = mujoco.MjModel.from_xml_path(str(Path(found.out) / "discovered.xml"))
+    assert model.dof_frictionloss[0] == pytest.approx(found.added[0].mode, rel=1e-4)
+
+
+def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Discovery]) -> None:
+    config, found = case
+    data = tomllib.loads((Path(found.out) / "discovered.toml").read_text(encoding="utf-8"))
+    assert [p["name"] for p in data["parameters"]] == ["rod_mass", "damping", "hinge.dry_friction"]
+    assert not Path(data["model"]).is_absolute()
+    again = run(Path(found.out) / "discovered.toml", out=config.parent / "again", num_threads=1)
+    best = json.loads((Path(found.out) / "structures.json").read_text())["best"]
+    assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-3)
+
+
+def test_killed_search_goes_on_to_the_same_bits(case: tuple[Path, Discovery], tmp_path: Path) -> None:
+    _, found = case
+    config = write_lacking(tmp_path)
+    for step in (2, 3):
+        with pytest.raises(KeyboardInterrupt):
+            run_discovery(config, tmp_path / "out", num_threads=1, progress=stop_after(step))
+    assert (tmp_path / "out" / CHECKPOINT).exists()
+    resumed = run_discovery(config, tmp_path / "out", num_threads=1)
+    assert resumed.rows == found.rows
+    for name in ("posterior.safetensors", "discovered.xml"):
+        one, other = (hashlib.sha256((f / name).read_bytes()).hexdigest() for f in (Path(found.out), tmp_path / "out"))
+        assert one == other, name
+
+
+def test_folder_of_another_search_is_refused(case: tuple[Path, Discovery]) -> None:
+    config, found = case
+    with pytest.raises(OutputError, match="without"):
+        run_discovery(config, Path(found.out), without=["spring"], num_threads=1)
+
+
+def test_search_keeps_to_its_list(case: tuple[Path, Discovery]) -> None:
+    config, found = case
+    labels = {label for row in found.rows for label in row.labels} | {p.label for p in found.promises}
+    assert {label.partition(":")[0] for label in labels} == {"dry_friction", "spring"}
+    structures = sipe.discover(sipe.prepare(config, 1), only=["spring"], budget=400)
+    assert {label for one in structures.fitted for label in one.labels} <= {"spring:hinge"}
+    assert {offer.label for offer in structures.offers()} == {"spring:hinge"}
+    assert list(structures.search.placed) == ["spring:hinge"]
+
+
+def test_own_extension_by_path(tmp_path: Path) -> None:
+    table = '[structure]\nonly = ["spring"]\nextra = ["own.py:Rub"]\nsites = ["hinge"]\n'
+    found = run_discovery(write_lacking(tmp_path, structure=table), tmp_path / "out", num_threads=1)
+    assert [piece.label for piece in found.kept] == ["rub:hinge"]
+    data = tomllib.loads((tmp_path / "out" / "discovered.toml").read_text(encoding="utf-8"))
+    assert data["structure"]["extra"] == ["../own.py:Rub"]
+
+
+BROKEN = {  # what the file says, and words of the one line
+    "syntax": ("class Rub(:", ["own.py:Rub", "SyntaxError", "correct it"]),
+    "no class": ("x = 1", ["own.py:Rub", "no attribute 'Rub'"]),
+    "another thing": ("class Rub: pass", ["is no Extension", "subclass"]),
+    "abstract": (OWN.replace("def parameters", "def unknowns"), ["abstract", "parameters"]),
+    "no kind": (OWN.replace('name, kind, reference = "rub", "joint", "-"', 'name, reference = "rub", "-"'), ["a kind"]),
+    "wrong kind": (OWN.replace('"joint", "-"', '"joints", "-"'), ["kind is one of", "'joints'"]),
+    "fails": (OWN.replace("machine.joints[site].force", "machine.joint[site]"), ["'rub'", "AttributeError", "'hinge'"]),
+    "no place": (OWN.replace(".frictionloss", ".friction"), ["'rub'", "finds no joint", "targets"]),
+}
+
+
+@pytest.mark.parametrize(("content", "words"), BROKEN.values(), ids=BROKEN)
+def test_broken_extension_is_one_line(content: str, words: list[str], tmp_path: Path) -> None:
+    config = write_lacking(tmp_path, structure='[structure]\nextra = ["own.py:Rub"]\n')
+    (tmp_path / "own.py").write_text(content)
+    with pytest.raises(ValueError, match="structure") as refused:
+        run_discovery(config, tmp_path / "out", num_threads=1)
+    assert "\n" not in str(refused.value)
+    assert [w for w in words if w not in str(refused.value)] == []
+    assert not (tmp_path / "out").exists()
+
+
+WRONG = {  # the table [structure], and words of the one line
+    "unknown": ('only = ["dry_fricton"]', ["structure.only[0]", "'dry_fricton'", "did you mean 'dry_friction'?"]),
+    "unknown left out": ('without = ["dry"]', ["structure.without[0]", "'dry'", "known are", "viscous_friction"]),
+    "nothing left": ('only = ["spring"]\nwithout = ["spring"]', ["structure.only", "at least one"]),
+    "no class": ('extra = ["own.py"]', ["structure.extra[0]", "path/to/file.py:Class"]),
+    "no file": ('extra = ["won.py:Rub"]', ["structure.extra[0]", "no such file", "did you mean 'own.py'?"]),
+    "no site": ('sites = ["hing"]', ["structure.sites", "'hing'", "did you mean 'hinge'?"]),
+    "budget": ("budget = 0", ["structure.budget", "greater than 0"]),
+    "key": ("sites_ = []", ["structure.sites_", "did you mean 'sites'?"]),
+}
+
+
+@pytest.mark.parametrize(("table", "words"), WRONG.values(), ids=WRONG)
+def test_wrong_restriction_is_one_line(table: str, words: list[str], tmp_path: Path) -> None:
+    config = write_lacking(tmp_path, structure=f"[structure]\n{table}\n")
+    with pytest.raises(ValueError, match="structure") as refused:
+        run_discovery(config, tmp_path / "out", num_threads=1)
+    assert "\n" not in str(refused.value)
+    assert [w for w in words if w not in str(refused.value)] == []
+    assert not (tmp_path / "out").exists()
