@@ -143,7 +143,9 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
             parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
             if not parameters or any(t in taken for p in parameters for t in p.targets):
                 continue
-            draft = Placed(extension, site, parameters, extension.edit(machine, site), np.zeros((0, 0, len(parameters))))
+            draft = Placed(
+                extension, site, parameters, extension.edit(machine, site), np.zeros((0, 0, len(parameters)))
+            )
             _ = draft.sentence
         except Exception as error:  # the user's own code may raise anything
             raise _failed(extension, site, error) from error
