@@ -100,7 +100,7 @@ def _own_extension(word: str, info: ValidationInfo) -> str:
 
 def _checked_sign(value: Any) -> int:
     if isinstance(value, bool) or value not in (1, -1):
-        raise problem(f"expected 1 or -1, got {value!r}; a sign only turns the direction, scaling is `unit`")
+        raise problem(f"expected 1 or -1, got {value!r}; a sign only turns the direction, scaling is `factor`")
     return int(value)
 
 

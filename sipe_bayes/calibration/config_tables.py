@@ -49,12 +49,13 @@ class Resample(Table):
 
 
 class Command(Table):
-    """The column that drives one actuator; ``sign`` * column in ``unit``."""
+    """The column that drives one actuator; ``sign`` * ``factor`` * column in ``unit``."""
 
     actuator: Text
     column: Text
     unit: UnitWord
     sign: Sign = 1
+    factor: Positive = 1.0
 
     @property
     def target(self) -> str:
@@ -63,7 +64,7 @@ class Command(Table):
 
 
 class Measurement(Table):
-    """A column that measures a joint or a sensor; ``sign`` * column in ``unit``.
+    """A column that measures a joint or a sensor; ``sign`` * ``factor`` * column in ``unit``.
 
     fit: False keeps it out of the likelihood, for starting windows and plots only. noise_sd: in SI, if known.
     """
@@ -72,6 +73,7 @@ class Measurement(Table):
     target: TargetWord
     unit: UnitWord
     sign: Sign = 1
+    factor: Positive = 1.0
     fit: Annotated[bool, Strict()] = True
     noise_sd: Positive | None = None
     name: Text = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from sipe_bayes.core.toml import to_toml
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.report.discovery_page import write_discovery_report
+from sipe_bayes.report.discovery.page import write_discovery_report
+from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.structures import Structures
 
@@ -40,7 +42,7 @@ def write_discovery(discovery: Discovery, structures: Structures, problem: Probl
     try:
         values = environment.space.values(best.theta)
         noticed += write_identified(environment, values, folder / DISCOVERED_XML, _note(placed))
-        write_configuration(problem, environment, placed, folder, int(str(discovery.run["seed"])))
+        write_configuration(problem, structures, folder, int(str(discovery.run["seed"])))
     except ExportError as error:
         noticed.append(finding(Code.NOT_EXPORTED, reason=error))
     discovery = replace(discovery, findings=(*discovery.findings, *noticed))
@@ -64,34 +66,48 @@ def law_note(placed: Placed) -> str:
     return f" (numbers in <numeric>, simulated by sipe_bayes and not by MuJoCo itself{nearest})"
 
 
-def write_configuration(
-    problem: Problem, environment: MjcfEnvironment, placed: list[Placed], folder: Path, seed: int
-) -> None:
-    """Write ``discovered.toml``, a configuration of the structure that ``sipe calibrate`` runs as it stands.
+def write_configuration(problem: Problem, structures: Structures, folder: Path, seed: int) -> None:
+    """Write ``discovered.toml``, a configuration of the best structure that ``sipe calibrate`` runs as it stands.
 
     Where extensions edit the model, it names ``extended.xml``: the edited MJCF, in which they do nothing yet.
 
     Args:
         problem: whose configuration it continues.
-        environment: of the structure.
-        placed: its extensions.
+        structures: that were fitted.
         folder: that it is written to, and that its paths are relative to.
         seed: of the fit.
 
     Raises:
         ExportError: where the edited model cannot be written.
     """
+    placed, own = structures.placed(structures.best), problem.environment
     data = problem.config.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    data = _relocated(data, folder) | {"seed": seed}
+    data = _set_right(_relocated(data, folder), structures.columns) | {"seed": seed}
     edits = [one.edit for one in placed if one.edit is not None]
     if edits:
-        edited = MjcfEnvironment.build(environment.source, [], environment.actuators, environment.measurements, edits)
+        edited = MjcfEnvironment.build(own.source, [], own.actuators, own.measurements, edits)
         write_identified(edited, np.zeros(0), folder / EXTENDED_XML)
         data["model"] = EXTENDED_XML
     data["parameters"] = [*data["parameters"], *_entries([p for one in placed for p in one.parameters])]
     lines = [f"# {problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]
-    lines += [f"#   sipe calibrate {folder / DISCOVERED_TOML}", *(f"# {one.sentence}" for one in placed)]
+    lines += [f"#   sipe calibrate {folder / DISCOVERED_TOML}", *(f"# {x.sentence}" for x in structures.columns)]
+    lines += [f"# {one.sentence}" for one in placed]
     write_text(folder / DISCOVERED_TOML, "\n".join(lines) + "\n\n" + to_toml(data))
+
+
+def _set_right(data: dict[str, Any], columns: Sequence[Column]) -> dict[str, Any]:
+    """The configuration's data with ``sign`` and ``factor`` of columns that are to be multiplied."""
+    out = {**data}
+    for column in columns:
+        table, key = ("commands", "actuator") if column.command else ("measurements", "name")
+
+        def multiplied(row: dict[str, Any], by: float = column.factor) -> dict[str, Any]:
+            if by < 0:
+                return {**row, "sign": -row.get("sign", 1)}
+            return {**row, "factor": by * row.get("factor", 1.0)}
+
+        out[table] = [multiplied(row) if row.get(key, row["column"]) == column.name else row for row in out[table]]
+    return out
 
 
 def _relocated(data: dict[str, Any], folder: Path) -> dict[str, Any]:

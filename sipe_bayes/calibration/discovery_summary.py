@@ -23,6 +23,7 @@ from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Sig
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.structures import Structures
 
@@ -47,6 +48,7 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
     averaged = Marginals.of(structures.posterior, problem.prior, problem.prior.space, seed)
     return Discovery(
         name=name,
+        columns=tuple(column.sentence for column in structures.columns),
         rows=tuple(structures.table()),
         pieces=_pieces(structures),
         promises=_promises(structures),
@@ -77,7 +79,8 @@ class _Model:
     one: FittedStructure
 
     def windows(self, logs: Trajectories) -> Windows:
-        """By which logs are scored and drawn."""
+        """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
+        logs = corrected(logs, self.structures.columns, self.problem.environment.actuators)
         return Windows(replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs)
 
     @property

@@ -90,7 +90,7 @@ def _read_log(config: Config, log: LogEntry) -> Recording:
 
     def signal(entry: Command | Measurement) -> FloatArray:
         values = _fitted(entry.column, _column(log, table, entry.column), len(time))[part]
-        return entry.sign * convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
+        return entry.sign * entry.factor * convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
 
     commands = [signal(c) for c in config.commands]
     measurements = [signal(m) for m in config.measurements]

@@ -48,7 +48,7 @@ def print_discovery(discovery: Discovery) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from sipe_bayes.report.discovery_words import discovery_verdicts
+    from sipe_bayes.report.discovery.words import discovery_verdicts
 
     console = Console(soft_wrap=True)
     for verdict in discovery_verdicts(discovery):
@@ -59,7 +59,7 @@ def print_discovery(discovery: Discovery) -> None:
 
 def lines_of(discovery: Discovery) -> list[str]:
     """What is printed below the verdicts."""
-    from sipe_bayes.report.discovery_words import (
+    from sipe_bayes.report.discovery.words import (
         alternatives,
         error_line,
         piece_text,

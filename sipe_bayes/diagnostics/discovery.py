@@ -105,6 +105,7 @@ class Discovery:
 
     Args:
         name: of the run.
+        columns: of the logs that have a wrong sign or unit, in words; everything below is of the logs set right.
         rows: structures that were fitted, most probable first.
         pieces: extensions that were fitted, most probable first.
         promises: what extensions promised at the plain model, best first.
@@ -130,6 +131,7 @@ class Discovery:
     """
 
     name: str
+    columns: tuple[str, ...]
     rows: tuple[StructureRow, ...]
     pieces: tuple[Piece, ...]
     promises: tuple[Promise, ...]
@@ -161,6 +163,7 @@ class Discovery:
         """As JSON has it, without signals and residuals."""
         return {
             "name": self.name,
+            "columns": list(self.columns),
             "structures": [asdict(row) for row in self.rows],
             "pieces": [asdict(piece) for piece in self.pieces],
             "promises": [asdict(promise) for promise in self.promises],

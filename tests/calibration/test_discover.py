@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tomllib
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from sipe_bayes.calibration.output import CHECKPOINT
 from sipe_bayes.calibration.run import run
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.discovery import Discovery
+from sipe_bayes.report.discovery.words import discovery_verdicts
 from tests.problems.interruptions import stop_after
 from tests.problems.lacking import FRICTION, OWN, write_lacking
 
@@ -85,6 +87,26 @@ def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Disco
     again = run(Path(found.out) / "discovered.toml", out=config.parent / "again", num_threads=1)
     best = json.loads((Path(found.out) / "structures.json").read_text())["best"]
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "key"), [("torque", -1.0, "sign"), ("angle", 180 / math.pi, "factor")], ids=["sign", "unit"]
+)
+def test_wrong_column_is_said_and_set_right_in_the_configuration(
+    column: str, factor: float, key: str, tmp_path: Path
+) -> None:
+    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\n', factors={column: factor})
+    config.write_text(config.read_text().replace("window = 1.0", 'window = "log"'))
+    found = run_discovery(config, tmp_path / "out", num_threads=1)
+    (sentence,) = found.columns
+    assert sentence in discovery_verdicts(found)[0].text
+    assert sentence in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert [piece.label for piece in found.kept] == ["dry_friction:hinge"]
+    data = tomllib.loads((tmp_path / "out" / "discovered.toml").read_text(encoding="utf-8"))
+    (row,) = [r for r in (*data["commands"], *data["measurements"]) if r["column"] == column]
+    assert row[key] == pytest.approx(1 / factor)
+    again = run(tmp_path / "out" / "discovered.toml", out=tmp_path / "again", num_threads=1)
+    assert {p.name: p.mode for p in again.parameters} == pytest.approx(dict(found.best), rel=1e-3)
 
 
 def test_killed_search_goes_on_to_the_same_bits(case: tuple[Path, Discovery], tmp_path: Path) -> None:

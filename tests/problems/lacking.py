@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -66,13 +67,16 @@ class Rub(Extension):
 """
 
 
-def write_lacking(folder: Path, friction: float = FRICTION, structure: str = "") -> Path:
+def write_lacking(
+    folder: Path, friction: float = FRICTION, structure: str = "", factors: Mapping[str, float] | None = None
+) -> Path:
     """Model, log and configuration in a folder, and ``own.py``; returns the configuration.
 
     Args:
         folder: where they go.
         friction: of the machine, N m.
         structure: the table of that name in place of the configuration's.
+        factors: of columns, of which the configuration says nothing.
     """
     truth = pendulum(Parameter("dry", 0.0, 0.5, targets=("joint:hinge.frictionloss",)))
     recorded = log(truth, [0.6, 0.05, friction], 3, steps=800, sd=0.005)
@@ -83,5 +87,7 @@ def write_lacking(folder: Path, friction: float = FRICTION, structure: str = "")
     (folder / "config.toml").write_text(config)
     torque = np.append(recorded.actions[:, 0], 0.0)
     table = {"time": np.arange(801) * DT, "torque": torque, "angle": recorded.observations[:, 0]}
+    for column, factor in (factors or {}).items():
+        table[column] = factor * table[column]
     pd.DataFrame(table).to_csv(folder / "log.csv", index=False)
     return folder / "config.toml"

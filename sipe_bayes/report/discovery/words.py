@@ -83,9 +83,17 @@ def remains(discovery: Discovery) -> Verdict | None:
     return Verdict("bad", f"{text} Intervals are of these structures alone.")
 
 
+def column_verdict(discovery: Discovery) -> Verdict | None:
+    """Which columns of the logs have a wrong sign or unit."""
+    if not discovery.columns:
+        return None
+    what = f"The logs do not say what the configuration says: {listed(discovery.columns)}."
+    return Verdict("bad", f"{what} discovered.toml has it right, and everything below is of logs set right.")
+
+
 def discovery_verdicts(discovery: Discovery) -> list[Verdict]:
     """The sentences at the top of the report and of what is printed."""
-    out = [headline(discovery), held_out_verdict(discovery), remains(discovery)]
+    out = [column_verdict(discovery), headline(discovery), held_out_verdict(discovery), remains(discovery)]
     if not discovery.settled:
         out.append(Verdict("fair", "The search ended before it had settled: give it a larger budget."))
     return [verdict for verdict in out if verdict is not None]

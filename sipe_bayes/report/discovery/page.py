@@ -10,8 +10,8 @@ from pathlib import Path
 from sipe_bayes.core.files import write_bytes
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors
-from sipe_bayes.report import discovery_plots as plots
-from sipe_bayes.report.discovery_words import (
+from sipe_bayes.report.discovery import plots
+from sipe_bayes.report.discovery.words import (
     alternatives,
     discovery_verdicts,
     nats,
