@@ -10,10 +10,11 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
       |  something promises more than it costs          nothing does
       v                                                      v
     FIT     the best few, one a step ------------------>  PRUNE   each kept piece left out once
-      |  the best of them is better: it is kept               v
-      +--> RANK                                            RESIDUAL  a force without a name, as the yardstick
-                                                              v
-                                                            DONE
+      |  the best of them is better                           v
+      v                                                    RESIDUAL  a force without a name, as the yardstick
+    AGAIN   the present structure, from where the             v
+      |     best one ended: still better, it is kept       DONE
+      +--> RANK
 
 **Judgement.** A structure S of K extensions out of n has
 
@@ -51,6 +52,7 @@ class Phase(enum.Enum):
     COLUMNS = "columns"
     RANK = "rank"
     FIT = "fit"
+    AGAIN = "again"
     PRUNE = "prune"
     RESIDUAL = "residual"
     DONE = "done"
@@ -95,6 +97,7 @@ class DiscoverState:
         phase: what comes next.
         fitted: structures, the plain model first.
         present: labels of the structure that is gone on from.
+        larger: labels of the structure that is better than it, while it is fitted again.
         offers: all that was promised until now.
         queue: labels of the extensions that this round still has to fit.
         failed: labels of structures that could not be fitted.
@@ -104,6 +107,7 @@ class DiscoverState:
     phase: Phase = Phase.PLAIN
     fitted: tuple[FittedStructure, ...] = ()
     present: tuple[str, ...] = ()
+    larger: tuple[str, ...] = ()
     offers: tuple[Offer, ...] = ()
     queue: tuple[str, ...] = ()
     failed: tuple[tuple[str, ...], ...] = ()
@@ -166,6 +170,7 @@ class StructureSearch:
             Phase.COLUMNS: self._columns,
             Phase.RANK: self._rank,
             Phase.FIT: self._fit,
+            Phase.AGAIN: self._again,
             Phase.PRUNE: self._prune,
             Phase.RESIDUAL: self._residual,
             Phase.DONE: lambda state: state,
@@ -179,6 +184,7 @@ class StructureSearch:
             Phase.COLUMNS: "trying signs and units of the logs' columns",
             Phase.RANK: f"testing {len(self._placed)} extensions{having}",
             Phase.FIT: f"fitting {state.queue[0] if state.queue else ''}{having}",
+            Phase.AGAIN: f"fitting without {state.larger[-1] if state.larger else ''} once more",
             Phase.PRUNE: "leaving out each piece once",
             Phase.RESIDUAL: "fitting a force without a name",
             Phase.DONE: "done",
@@ -292,13 +298,33 @@ class StructureSearch:
         return self._settled(state)
 
     def _settled(self, state: DiscoverState) -> DiscoverState:
-        """The round's best is kept, or the search for more ends."""
+        """The round's best is looked at once more, or the search for more ends."""
+        best = self._best_grown(state)
+        if best is None:
+            return replace(state, phase=Phase.PRUNE)
+        return replace(state, larger=best.labels, phase=Phase.AGAIN)
+
+    def _best_grown(self, state: DiscoverState) -> FittedStructure | None:
+        """The best of those with one extension more, where it is better than the present structure."""
         here = state.here
         grown = [o for o in state.fitted if len(o.labels) == len(here.labels) + 1 and set(here.labels) < set(o.labels)]
-        good = [one for one in grown if self.better(one, here)]
-        if not good:
-            return replace(state, phase=Phase.PRUNE)
-        best = max(good, key=self.total)
+        return max((one for one in grown if self.better(one, here)), key=self.total, default=None)
+
+    def _again(self, state: DiscoverState) -> DiscoverState:
+        """The present structure from where the larger one ended, whose gain may be nothing but a better optimum."""
+        here, larger = state.here, state.of(state.larger)
+        assert larger is not None
+        keep = [i for i, label in enumerate(self._owners(larger)) if label in (None, *here.labels)]
+        refitted = self._fitted(state, here.labels, larger.theta[keep])
+        if len(refitted.fitted) > len(state.fitted):
+            *_, once_more = refitted.fitted
+            better = once_more if once_more.evidence > here.evidence else here
+            better = replace(better, rollouts=here.rollouts + once_more.rollouts)
+            state = replace(state, fitted=tuple(better if one is here else one for one in state.fitted))
+        best = self._best_grown(state)
+        state = replace(state, larger=())
+        if best is None:
+            return replace(state, phase=Phase.RANK if state.here is not here else Phase.PRUNE)
         return replace(state, present=best.labels, phase=Phase.RANK)
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
