@@ -98,9 +98,10 @@ def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Seq
         starts: (W, D).
         placed: the extensions.
     """
-    groups: dict[object, list[Placed]] = {}
+    groups: dict[str, list[Placed]] = {}
     for one in placed:
-        key: object = one.label if one.edit is not None else one.extension.native
+        # a law costs steps of its own, an edit the cube's other models: these are simulated by themselves
+        key = "" if one.edit is None and one.extension.native else one.label
         groups.setdefault(key, []).append(one)
     return [effect for group in groups.values() for effect in _of_group(windows, theta, starts, group)]
 
