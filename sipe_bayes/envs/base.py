@@ -25,6 +25,7 @@ from sipe_bayes.envs.sensing import Sensing
 if TYPE_CHECKING:
     import mujoco
 
+START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation: far wider than any measurement
 _CONTROL = 1 << 6  # mjSTATE_CTRL, without importing mujoco here
 
 
@@ -64,6 +65,10 @@ class Environment(ABC):
         Returns:
             Whether they are physical; an unphysical model is never simulated.
         """
+
+    def start_sd(self, model: mujoco.MjModel) -> FloatArray:
+        """Prior sds (2 nv + na,) of where windows start about their reference: positions, velocities, activations."""
+        return np.repeat(START_SD, [model.nv, model.nv, model.na])
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Least changes (N,) of theta (N,) that finite differences can be taken over; zero for all that is smooth."""

@@ -21,6 +21,7 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import Channel, Reader, check_sensors, reader_of, state_column
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
+from sipe_bayes.envs.internal import filtered_commands, start_sd
 from sipe_bayes.envs.laws import LAW_OF, LawError, declare, laws_of
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
 from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
@@ -237,6 +238,10 @@ class MjcfEnvironment(Environment):
                 target.write(model, value)
         return physical and (not bodies or check_inertia(model, bodies))
 
+    def start_sd(self, model: mujoco.MjModel) -> FloatArray:
+        """What the model says of its internal states, and else any state's."""
+        return start_sd(model)
+
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Two physics steps of a delay, as far as they lie in the cube."""
         steps = np.zeros(len(self.parameters))
@@ -301,10 +306,13 @@ class MjcfEnvironment(Environment):
     def history(
         self, model: mujoco.MjModel, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
     ) -> FloatArray:
-        """Fill the history of every delayed actuator; see ``Environment.history``."""
+        """Fill the history of every delayed actuator and begin at rest; see ``Environment.history``."""
+        states, timestep = states.copy(), np.asarray(timestep)
+        for index, column in filtered_commands(model):
+            for row, past in enumerate(actions):
+                states[row, column] = self.control(model, states[row], past[-1])[int(model.actuator_ctrladr[index])]
         if model.nhistory == 0:
             return states
-        states, timestep = states.copy(), np.asarray(timestep)
         start = 1 + model.nq + model.nv + model.na
         for column, actuator in enumerate(self.actuators):
             index = named(model, "actuator", actuator, "actuator")

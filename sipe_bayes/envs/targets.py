@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -313,7 +313,8 @@ def _force_limit(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
 def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     if int(model.actuator_dyntype[actuator]) != int(mujoco.mjtDyn.mjDYN_FILTEREXACT):
         raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact"')
-    return _entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
+    target = _entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
+    return replace(target, step=2 * float(model.opt.timestep))  # shorter ones than a physics step act alike
 
 
 def _law(number: Number, label: str, slot: int) -> Maker:

@@ -6,8 +6,8 @@ window. Long open loops are chaotic and one model error would dominate them; sho
 away the noise of the measurement: both cost coverage. The residuals are white or first-order autoregressive and carry
 on across windows (``sipe_bayes.likelihood.noise``).
 
-A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior whose sd is
-``START_SD``, far wider than any measurement, so that what is never measured does not make the equations singular.
+A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior, far wider
+than any measurement (``Environment.start_sd``), so that what is never measured does not make the equations singular.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.starts import STATE_STEP, estimate_states, moved, past_commands, with_history
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
-
-START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation
 
 
 def chosen_channels(
@@ -140,10 +138,8 @@ class Windows:
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt)
-        model = simulator.model
-        free = np.array([model.nv, model.nv, model.na]) * (self.settings.starts == "estimated")
-        self.num_start = int(free.sum())
-        self.start_precision = np.repeat(START_SD, free) ** -2.0
+        free = environment.start_sd(simulator.model) if self.settings.starts == "estimated" else np.zeros(0)
+        self.num_start, self.start_precision = len(free), free**-2.0
 
     def every_other(self) -> Windows:
         """Every other window, for a rough search; the windows themselves where a log has fewer than four.

@@ -23,6 +23,7 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "stribeck": "joint.stribeck:Stribeck",
     "load_friction": "joint.load_friction:LoadFriction",
     "delay": "actuator.delay:Delay",
+    "lag": "actuator.lag:Lag",
     "offset": "actuator.offset:Offset",
     "back_emf": "actuator.back_emf:BackEmf",
     "force_limit": "actuator.force_limit:ForceLimit",

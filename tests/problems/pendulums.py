@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
 from sipe_bayes.simulation.simulator import Simulator
 
 XML = """
@@ -24,14 +26,14 @@ XML = """
 DT = 0.01
 
 
-def pendulum(*extra: Parameter, num_threads: int = 1) -> Simulator:
+def pendulum(*extra: Parameter, num_threads: int = 1, edits: Sequence[Edit] = ()) -> Simulator:
     """Rod mass and damping unknown, and whatever else is given."""
     parameters = [
         Parameter("rod_mass", 0.3, 1.0, targets=("body:rod.mass",)),
         Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",)),
         *extra,
     ]
-    environment = MjcfEnvironment.build(XML, parameters, ["motor"], ["joint:hinge.position"])
+    environment = MjcfEnvironment.build(XML, parameters, ["motor"], ["joint:hinge.position"], edits)
     return Simulator(environment, num_threads=num_threads)
 
 

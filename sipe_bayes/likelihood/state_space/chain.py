@@ -35,7 +35,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import chosen_sd
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
 from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, with_history
-from sipe_bayes.likelihood.windows import START_SD, check_seen, chosen_channels
+from sipe_bayes.likelihood.windows import check_seen, chosen_channels
 from sipe_bayes.simulation.simulator import Simulator
 
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known, beyond rounding: position, velocity, activation
@@ -82,8 +82,8 @@ class Chain:
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt) if model.nhistory else []
         self.reference = with_history(simulator, reference, past, self.dt)
         self.sizes = (model.nv, model.nv, model.na)
-        start_sd = KNOWN_SD if known else START_SD
-        self.prior_precision = np.where(self.first[:, None], np.repeat(start_sd, self.sizes) ** -2.0, 0.0)
+        start_sd = np.repeat(KNOWN_SD, self.sizes) if known else environment.start_sd(model)
+        self.prior_precision = np.where(self.first[:, None], start_sd**-2.0, 0.0)
 
     def _measure(self, trajectories: Trajectories) -> None:
         """Assign to each state what the simulation that starts there predicts."""

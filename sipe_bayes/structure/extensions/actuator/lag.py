@@ -1,0 +1,71 @@
+"""A command that takes effect little by little."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.internal import declare_start
+from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.machine import Machine
+
+_LONGEST, _SAMPLES = 0.2, 50  # seconds, or so many samples
+_UNSETTLED = 0.3  # of the largest command: how far the filter may be from the last command where a window starts
+
+
+@dataclass(frozen=True)
+class FilteredCommand:
+    """An actuator that follows its command through a first-order lag, exactly integrated, none by default.
+
+    Args:
+        actuator: its name.
+        unsettled: how far a window may start from the command before it.
+    """
+
+    actuator: str
+    unsettled: float
+
+    def __call__(self, spec: mujoco.MjSpec) -> None:
+        """Give it the filter; raises ValueError for one that has dynamics of its own."""
+        actuator = spec.actuator(self.actuator)
+        if int(actuator.dyntype) != int(mujoco.mjtDyn.mjDYN_NONE):
+            raise ValueError(f"actuator {self.actuator!r}: has dynamics of its own; make its lag a parameter")
+        actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+        actuator.dynprm = np.zeros(len(actuator.dynprm))
+        declare_start(spec, f"actuator:{self.actuator}", [self.unsettled])
+
+
+class Lag(Extension):
+    """A command that takes effect little by little: a first-order lag."""
+
+    name, kind = "lag", "actuator"
+    reference = 'MuJoCo documentation, actuator dyntype="filterexact"'
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a first-order lag of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a fifth of a second, or fifty samples."""
+        return (
+            Parameter(
+                f"{site}.lag",
+                0.0,
+                min(_LONGEST, _SAMPLES * machine.dt),
+                targets=(f"actuator:{site}.lag",),
+                description="time constant from command to force",
+            ),
+        )
+
+    def edit(self, machine: Machine, site: str) -> FilteredCommand:
+        """The filter."""
+        return FilteredCommand(site, _UNSETTLED * (machine.commands[site] or 1.0))
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """One sample, and at least two physics steps."""
+        (lag,) = parameters
+        return np.array([[max(machine.dt, 2 * machine.timestep) / lag.high]])

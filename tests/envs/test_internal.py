@@ -1,0 +1,38 @@
+"""States that an extension brings: windows start at rest in them, as far from it as the model says."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.internal import declare_start, filtered_commands, start_sd
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.extensions.actuator.lag import FilteredCommand
+from tests.problems.machines import MACHINES, environment
+
+
+def test_a_models_own_states_have_any_states_prior_and_declared_ones_theirs() -> None:
+    spec = mujoco.MjSpec.from_string(MACHINES["double"].xml)
+    declare_start(spec, "joint:elbow", [0.1, 2.0])
+    FilteredCommand("m2", 0.3)(spec)
+    declare_start(spec, "actuator:m2", [7.0])  # said already
+    model = mujoco.MjModel.from_xml_string(spec.compile() and spec.to_xml())
+    np.testing.assert_allclose(start_sd(model), [10, 0.1, 100, 2.0, 0.3])
+    assert filtered_commands(model) == [(1, 1 + 2 + 2)]
+    plain = mujoco.MjModel.from_xml_string(MACHINES["double"].xml)
+    np.testing.assert_allclose(start_sd(plain), [10, 10, 100, 100])
+
+
+def test_windows_start_at_the_command_before_them() -> None:
+    drive = MACHINES["double"]
+    simulator = Simulator(environment(drive, edits=[FilteredCommand("m2", 0.3)]), 1)
+    actions = np.random.default_rng(0).normal(size=(60, 2))
+    run = simulator.rollout(np.full(1, 0.5), actions, simulator.default_state(), 0.008)
+    channels = simulator.environment.channels
+    recorded = Trajectories.stack([Trajectory(run.observations[0], actions, 0.008, channels=channels)])
+    windows = Windows(Segments(window=0.16), simulator, recorded)
+    np.testing.assert_array_equal(windows.reference[:, 5], actions[[0, 19, 39], 1])
+    np.testing.assert_allclose(windows.start_precision, np.array([10, 10, 100, 100, 0.3]) ** -2.0)
