@@ -307,12 +307,13 @@ class MjcfEnvironment(Environment):
         self, model: mujoco.MjModel, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
     ) -> FloatArray:
         """Fill the history of every delayed actuator and begin at rest; see ``Environment.history``."""
+        filtered = filtered_commands(model)
+        if model.nhistory == 0 and not filtered:
+            return states
         states, timestep = states.copy(), np.asarray(timestep)
-        for index, column in filtered_commands(model):
+        for index, column in filtered:
             for row, past in enumerate(actions):
                 states[row, column] = self.control(model, states[row], past[-1])[int(model.actuator_ctrladr[index])]
-        if model.nhistory == 0:
-            return states
         start = 1 + model.nq + model.nv + model.na
         for column, actuator in enumerate(self.actuators):
             index = named(model, "actuator", actuator, "actuator")

@@ -11,6 +11,7 @@ import torch
 from sipe_bayes.core.arrays import BoolArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.base import START_SD
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.strategy import distinct
@@ -19,7 +20,7 @@ from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import START_SD, Windows
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.scores import scores
