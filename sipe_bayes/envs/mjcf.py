@@ -22,7 +22,9 @@ from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import Channel, Reader, check_sensors, reader_of, state_column
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
 from sipe_bayes.envs.internal import filtered_commands, start_sd
-from sipe_bayes.envs.laws import LAW_OF, LawError, declare, laws_of
+from sipe_bayes.envs.laws.base import LawError
+from sipe_bayes.envs.laws.bound import BoundLaw, declare, laws_of, moving_on
+from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
 from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
 from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, with_model_values
@@ -164,6 +166,10 @@ class MjcfEnvironment(Environment):
     @cached_property
     def _model(self) -> mujoco.MjModel:
         return self.compile()
+
+    @cached_property
+    def _laws(self) -> tuple[BoundLaw, ...]:
+        return laws_of(self._model)
 
     def __getstate__(self) -> dict[str, object]:
         return {f: getattr(self, f) for f in ("source", "actuators", "measurements", "parameters", "edits")}
@@ -308,9 +314,9 @@ class MjcfEnvironment(Environment):
     ) -> FloatArray:
         """Fill the history of every delayed actuator and begin at rest; see ``Environment.history``."""
         filtered = filtered_commands(model)
-        if model.nhistory == 0 and not filtered:
+        if model.nhistory == 0 and not filtered and not self._laws:
             return states
-        states, timestep = states.copy(), np.asarray(timestep)
+        states, timestep = moving_on(self._laws, states), np.asarray(timestep)
         for index, column in filtered:
             for row, past in enumerate(actions):
                 states[row, column] = self.control(model, states[row], past[-1])[int(model.actuator_ctrladr[index])]

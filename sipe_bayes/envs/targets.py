@@ -20,7 +20,8 @@ import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.inertia import body_frame_inertia
-from sipe_bayes.envs.laws import LAW_OF, Number
+from sipe_bayes.envs.laws.base import Number
+from sipe_bayes.envs.laws.registry import LAW_OF
 
 Writer = Callable[[mujoco.MjModel, float], None]
 Maker = Callable[[mujoco.MjModel, str, int], "Target"]

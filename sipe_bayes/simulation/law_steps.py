@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.envs.laws import laws_of
+from sipe_bayes.envs.laws.bound import laws_of
 
 _APPLIED = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
@@ -40,6 +40,7 @@ class LawSteps:
         self.laws = laws_of(model)
         self.rubbing = [bound for bound in self.laws if bound.law.friction]
         self.pushing = [bound for bound in self.laws if not bound.law.friction]
+        self.remembering = [bound for bound in self.laws if bound.law.memory]
         self.dofs = sorted({bound.dof for bound in self.rubbing})
         self.senses = any(bound.sensor >= 0 for bound in self.laws)
         self.control_spec, self.num_dofs = control_spec | _APPLIED, int(model.nv)
@@ -71,13 +72,13 @@ class LawSteps:
             # what the laws sense, in a step that is forgotten
             sensed = steps(models, here, inputs, self.control_spec, True)[1][:, 0] if self.senses else None
             for bound in self.pushing:
-                force = bound.value(numbers, here, command, sensed)
+                force = bound.law.value(bound.now(numbers, here, command, sensed))
                 scale = gears[bound.actuator] if bound.law.kind == "actuator" else 1.0
                 inputs[:, 0, width + bound.dof] += scale * force
             self._rub(friction, self._friction(dry, numbers, here, command, sensed))
             moved, seen = steps(models, here, inputs, self.control_spec, reads)
             self._rub(friction, dry)
-            here = moved[:, 0]
+            here = self._remembered(moved[:, 0], here, numbers, command, sensed)
             states.append(here)
             sensors.append(seen[:, 0])
         return np.stack(states, axis=1), np.stack(sensors, axis=1)
@@ -93,8 +94,22 @@ class LawSteps:
         """Dry friction (B, nv) with that of the laws, never below zero."""
         total = dry.copy()
         for bound in self.rubbing:
-            total[:, bound.dof] += bound.value(numbers, states, command, sensed)
+            total[:, bound.dof] += bound.law.value(bound.now(numbers, states, command, sensed))
         return np.maximum(total, 0.0)
+
+    def _remembered(
+        self,
+        states: FloatArray,
+        before: FloatArray,
+        numbers: FloatArray,
+        command: FloatArray,
+        sensed: FloatArray | None,
+    ) -> FloatArray:
+        """States (B, S) after a step with what the laws remember of it."""
+        for bound in self.remembering:
+            shift = states[:, bound.position] - before[:, bound.position]
+            states[:, bound.memory] = bound.law.remembered(bound.now(numbers, before, command, sensed), shift)
+        return states
 
     def _rub(self, friction: list[FloatArray], level: FloatArray) -> None:
         """Write levels (B, nv) into the models' own arrays."""

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.envs.laws import driven_joint
+from sipe_bayes.envs.laws.bound import driven_joint
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator

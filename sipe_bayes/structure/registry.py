@@ -21,6 +21,8 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "hardening_spring": "joint.hardening_spring:HardeningSpring",
     "direction_friction": "joint.direction_friction:DirectionFriction",
     "stribeck": "joint.stribeck:Stribeck",
+    "presliding": "joint.presliding:Presliding",
+    "hysteresis": "joint.hysteresis:Hysteresis",
     "load_friction": "joint.load_friction:LoadFriction",
     "delay": "actuator.delay:Delay",
     "lag": "actuator.lag:Lag",
@@ -35,6 +37,7 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "sensor_delay": "world.sensor_delay:SensorDelay",
     "sensor_filter": "world.sensor_filter:SensorFilter",
     "gravity_tilt": "world.gravity_tilt:GravityTilt",
+    "supply_sag": "world.supply_sag:SupplySag",
     "medium_drag": "world.medium_drag:MediumDrag",
     "residual": "world.residual:Residual",
 }

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.laws import LAWS, Law, LawError, Residual, declare, laws_of
+from sipe_bayes.envs.laws.base import Law, LawError
+from sipe_bayes.envs.laws.bound import declare, laws_of
+from sipe_bayes.envs.laws.registry import LAWS
+from sipe_bayes.envs.laws.residual import Residual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.simulation.simulator import Simulator
@@ -24,6 +27,11 @@ NUMBERS = {  # bounds of each number of a law: large against the machines' force
     "direction_damping": (-0.2, 0.2),
     "stribeck_friction": (0.0, 0.8),
     "stribeck_velocity": (0.05, 2.0),
+    "presliding_friction": (0.0, 0.8),
+    "presliding_range": (0.01, 0.2),
+    "hysteresis_force": (0.0, 0.8),
+    "hysteresis_range": (0.02, 0.5),
+    "supply_sag": (0.0, 0.3),
     "cogging_sin": (-0.5, 0.5),
     "cogging_cos": (-0.5, 0.5),
     "cogging_poles": (1.0, 12.0),
@@ -50,11 +58,14 @@ def drawn(simulator: Simulator, batch: int = 5) -> tuple[Any, Any, Any]:
     rng, model = np.random.default_rng(3), simulator.model
     starts = np.tile(simulator.default_state(), (batch, 1))
     starts[:, 1 : 1 + model.nq + model.nv] += rng.normal(0, 0.7, (batch, model.nq + model.nv))
+    starts[:, 1 + model.nq + model.nv :] = rng.uniform(-1, 1, (batch, model.na))
     actions = rng.normal(0, 2, (batch, HORIZON // 4, simulator.environment.num_actions)).repeat(4, axis=1)
     return rng.random((batch, len(simulator.space))), actions, starts
 
 
-def plain_value(name: str, p: Any, q: float, v: float, u: float, torque: float, force: float) -> float:
+def plain_value(
+    name: str, p: Any, q: float, v: float, u: float, torque: float, force: float, total: float, memory: Any
+) -> float:
     """The laws as their module states them, one number at a time."""
     if name == "residual":
         place = np.array([q / p[0], v / p[1], u / p[2]])
@@ -66,9 +77,20 @@ def plain_value(name: str, p: Any, q: float, v: float, u: float, torque: float, 
         "direction_damping": lambda: -p[0] * abs(v),
         "stribeck": lambda: p[0] * np.exp(-((v / p[1]) ** 2)),
         "cogging": lambda: p[0] * np.sin(p[2] * q) + p[1] * np.cos(p[2] * q),
+        "presliding": lambda: -p[0] * memory[0],
+        "hysteresis": lambda: -p[0] * sum(memory) / 3,
+        "supply_sag": lambda: -force * min(p[0] * total, 1.0),
         "force_drop": lambda: -p[0] * force * abs(force),
     }
     return float(values[name]())
+
+
+def plain_memory(name: str, p: Any, memory: Any, shift: float) -> list[float]:
+    """What a law remembers after a step."""
+    if name == "presliding":
+        towards = np.sign(shift)
+        return [towards + (memory[0] - towards) * np.exp(-abs(shift) / p[1])] if shift else list(memory)
+    return [min(max(s + shift / (p[1] * width), -1.0), 1.0) for s, width in zip(memory, (0.25, 1, 4), strict=True)]
 
 
 def plain_loop(simulator: Simulator, law: Law, drive: Drive, theta: Any, actions: Any, start: Any) -> Any:
@@ -78,22 +100,29 @@ def plain_loop(simulator: Simulator, law: Law, drive: Drive, theta: Any, actions
     data, dry, states = mujoco.MjData(model), model.dof_frictionloss.copy(), [start]
     mujoco.mj_setState(model, data, start, FULL)
     for action in actions:
-        data.ctrl[:], data.qfrc_applied[:], model.dof_frictionloss[:] = action, 0.0, dry
+        data.ctrl[: len(action)], data.qfrc_applied[:], model.dof_frictionloss[:] = action, 0.0, dry
         mujoco.mj_forward(model, data)
         torque = np.empty(model.nv)
         mujoco.mj_rne(model, data, 1, torque)  # what accelerates and carries the links, without the armature
-        applied, friction = np.zeros(model.nv), dry.copy()
+        applied, friction, before = np.zeros(model.nv), dry.copy(), data.qpos.copy()
+        total, memories = float(np.abs(data.actuator_force).sum()), data.act.reshape(len(drive.joints), -1).copy()
         for k, (joint, actuator) in enumerate(zip(drive.joints, drive.actuators, strict=True)):
             dof, owner = int(model.joint(joint).dofadr[0]), joint if law.kind == "joint" else actuator
             p = np.array([values[f"{owner}.{number.attribute}"] for number in law.numbers])
             force = float(data.actuator_force[k])
-            value = plain_value(law.name, p, data.qpos[dof], data.qvel[dof], action[k], torque[dof], force)
+            here = data.qpos[dof], data.qvel[dof], action[k], torque[dof], force, total
+            value = plain_value(law.name, p, *here, memories[k])
             if law.friction:
                 friction[dof] = max(friction[dof] + value, 0.0)
             else:
                 applied[dof] += value * (model.actuator_gear[k, 0] if law.kind == "actuator" else 1.0)
         data.qfrc_applied[:], model.dof_frictionloss[:] = applied, friction
         mujoco.mj_step(model, data)
+        for k, joint in enumerate(drive.joints if law.memory else ()):
+            dof = int(model.joint(joint).dofadr[0])
+            p = np.array([values[f"{joint}.{number.attribute}"] for number in law.numbers])
+            memories[k] = plain_memory(law.name, p, memories[k], data.qpos[dof] - before[dof])
+        data.act[:] = memories.ravel()
         mujoco.mj_getState(model, data, state := np.empty_like(start), FULL)
         states.append(state)
     return np.array(states)
@@ -110,7 +139,9 @@ def test_the_engine_simulates_a_law_as_a_plain_loop(name: str, machine: str) -> 
     for row in range(len(theta)):
         expected = plain_loop(simulator, law, drive, theta[row], actions[row], starts[row])
         np.testing.assert_allclose(run.states[row], expected, rtol=1e-12, atol=1e-12)
-    without = Simulator(environment(drive), 1).rollout(np.full((1, 1), 0.5), actions, starts)
+    plain = Simulator(environment(drive), 1)
+    own = starts[:, : plain.default_state().size]
+    without = plain.rollout(np.full((1, 1), 0.5), actions, own)
     assert np.abs(run.observations - without.observations).max() > 1e-3, "the law's numbers do something"
 
 
@@ -121,8 +152,10 @@ def test_neutral_numbers_are_the_plain_model_bit_for_bit(name: str, machine: str
     theta, actions, starts = drawn(simulator)
     theta[:, 1:] = simulator.space.default_theta[1:]
     run = simulator.rollout(theta, actions, starts)
-    expected = plain.rollout(theta[:, :1], actions, starts)
-    np.testing.assert_array_equal(run.states, expected.states)
+    own = plain.default_state().size
+    expected = plain.rollout(theta[:, :1], actions, starts[:, :own])
+    assert run.states is not None
+    np.testing.assert_array_equal(run.states[..., :own], expected.states)
     np.testing.assert_array_equal(run.observations, expected.observations)
 
 
@@ -168,7 +201,7 @@ def test_laws_stand_in_the_model_and_are_declared_once() -> None:
         for law in LAWS.values():
             declare(spec, law.kind, "hinge" if law.kind == "joint" else "motor", law)
     model = spec.compile()
-    assert model.nnumeric == len(LAWS)
+    assert model.nnumeric == len(LAWS) + len([law for law in LAWS.values() if law.memory])
     assert [bound.law.name for bound in laws_of(model)] == list(LAWS)
     loaded = mujoco.MjModel.from_xml_string(spec.to_xml())
     assert [bound.law.name for bound in laws_of(loaded)] == list(LAWS)
@@ -180,6 +213,7 @@ NO_SENSOR = MACHINES["pendulum"].xml.replace(
     "</mujoco>", '<custom><numeric name="joint:hinge.load_friction" data=".1"/></custom></mujoco>'
 )
 NO_JOINT = NO_SENSOR.replace("joint:hinge.", "joint:gone.")
+FORGETFUL = NO_SENSOR.replace("load_friction", "presliding").replace('data=".1"', 'data=".1 1"')
 TOO_MANY = NO_SENSOR.replace('data=".1"', 'data=".1 .2"')
 
 
@@ -204,6 +238,7 @@ def test_a_law_where_it_cannot_act_is_refused_in_a_line(target: str, words: str)
         (NO_SENSOR, "wants a sensor of the same name"),
         (NO_JOINT, "wants a joint 'gone'"),
         (TOO_MANY, "and 1 number"),
+        (FORGETFUL, "wants an actuator of the same name with 1 activations"),
     ],
 )
 def test_a_numeric_that_is_no_law_is_refused_in_a_line(xml: str, words: str) -> None:

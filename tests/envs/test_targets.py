@@ -15,7 +15,8 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs import targets
 from sipe_bayes.envs.export import write_identified
 from sipe_bayes.envs.inertia import body_frame_inertia, check_inertia
-from sipe_bayes.envs.laws import LAW_OF, LAWS, declare
+from sipe_bayes.envs.laws.bound import declare
+from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import TargetError, bind
 

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import Edit
+from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, discover
 from sipe_bayes.structure.extensions.actuator.lag import FilteredCommand
+from tests.problems.machines import MACHINES, environment
 from tests.problems.pendulums import log, pendulum
 
 
@@ -30,12 +32,43 @@ class Plant:
 
 PLANTED = [
     Plant("lag:motor", {"actuator:motor.lag": 0.05}, ("offset", "dry_friction"), (FilteredCommand("motor", 0.6),)),
+    Plant(
+        "presliding:hinge",
+        {"joint:hinge.presliding_friction": 0.15, "joint:hinge.presliding_range": 0.05},
+        ("dry_friction", "quadratic_damping"),
+    ),
+    Plant(
+        "hysteresis:hinge",
+        {"joint:hinge.hysteresis_force": 0.2, "joint:hinge.hysteresis_range": 0.3},
+        ("dry_friction", "spring"),
+    ),
 ]
+
+
+def test_a_supply_that_sags_is_told_from_motors_that_fall_short() -> None:
+    """Of two joints, the forces of both together."""
+    sag = Parameter("sag", 0.0, 0.1, targets=("actuator:m1.supply_sag", "actuator:m2.supply_sag"))
+    machine = Simulator(environment(MACHINES["double"], [sag]), 1)
+    rng, time, logs = np.random.default_rng(4), np.arange(200) * 0.01, []
+    for name in ("a", "b"):
+        frequencies, phases = rng.uniform(0.3, 1.5, (3, 1, 2)), rng.uniform(0, 6, (3, 1, 2))
+        actions = np.sin(2 * np.pi * frequencies * time[:, None] + phases).sum(0)
+        seen = machine.rollout(np.array([0.5, 0.5]), actions, machine.default_state(), 0.01).observations[0]
+        seen = seen + np.array([0.005, 0.05, 0.005, 0.05]) * rng.standard_normal(seen.shape)
+        logs.append(Trajectory(seen, actions, 0.01, name=name, channels=machine.environment.channels))
+    plain = Simulator(environment(MACHINES["double"]), 1)
+    only = Restriction(only=("supply_sag", "force_drop", "offset"))
+    structures = discover(plain, Trajectories.stack(logs), restriction=only)
+    print(structures.table())
+    assert structures.best.labels == ("supply_sag:world",)
+    value = np.asarray(structures.posterior_of(structures.best).values(1000))[:, 1]
+    assert abs(value.mean() - 0.05) < 4 * value.std()
 
 
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.label)
 def test_what_is_planted_is_found_and_its_size_is_right(plant: Plant) -> None:
-    extra = [Parameter(t.rpartition(".")[2], 0.0, 2 * size, targets=(t,)) for t, size in plant.sizes.items()]
+    least = {target: size / 9 if target.endswith("_range") else 0.0 for target, size in plant.sizes.items()}
+    extra = [Parameter(t.rpartition(".")[2], least[t], 2 * size, targets=(t,)) for t, size in plant.sizes.items()]
     machine = pendulum(*extra, edits=plant.edits)
     recorded = log(machine, [0.6, 0.08, *plant.sizes.values()], 5)
     names = (plant.label.partition(":")[0], *plant.rivals)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.laws import LAWS, LawNumbers
+from sipe_bayes.envs.laws.bound import LawNumbers
+from sipe_bayes.envs.laws.registry import LAWS
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
 

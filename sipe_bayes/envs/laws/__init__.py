@@ -1,0 +1,1 @@
+"""Forces that MJCF has no element for."""

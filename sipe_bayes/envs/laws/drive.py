@@ -1,0 +1,52 @@
+r"""Forces of motors that MJCF has no element for.
+
+- ``cogging``: a force a sin(n q) + b cos(n q).
+- ``force_drop``: the actuator's force falls short by p f \|f\|.
+- ``supply_sag``: it falls short by p f F, with F the forces of all actuators on one supply, added up by size: their
+  currents lower the voltage that each of them gets.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.envs.laws.base import Law, Now, Number
+
+
+class Cogging(Law):
+    """A torque that goes round with the position."""
+
+    name, friction = "cogging", False
+    numbers = (
+        Number("cogging_sin", "force"),
+        Number("cogging_cos", "force"),
+        Number("cogging_poles", "1", 1.0, shape=True),
+    )
+
+    def value(self, now: Now) -> FloatArray:
+        """A sin(n q) + b cos(n q)."""
+        a, b, poles = now.numbers.T
+        return a * np.sin(poles * now.position) + b * np.cos(poles * now.position)
+
+
+class ForceDrop(Law):
+    """An actuator whose force falls short the more of it is asked for."""
+
+    name, kind, senses, friction = "force_drop", "actuator", "force", False
+    numbers = (Number("force_drop", "1/force"),)
+
+    def value(self, now: Now) -> FloatArray:
+        """-p f |f|."""
+        return -now.numbers[:, 0] * now.sensed * np.abs(now.sensed)
+
+
+class SupplySag(Law):
+    """Actuators on one supply, whose voltage falls with the currents of all."""
+
+    name, kind, senses, friction = "supply_sag", "actuator", "force", False
+    numbers = (Number("supply_sag", "1/force", minimum=0.0),)
+
+    def value(self, now: Now) -> FloatArray:
+        """-f min(p F, 1)."""
+        return -now.sensed * np.minimum(now.numbers[:, 0] * now.total, 1.0)
