@@ -36,9 +36,9 @@ def caution(template: str, row: str = "") -> Text:
     return Text(Severity.CAUTION, template, row)
 
 
-def blocking(template: str) -> Text:
+def blocking(template: str, row: str = "") -> Text:
     """The text of what blocks."""
-    return Text(Severity.BLOCKING, template)
+    return Text(Severity.BLOCKING, template, row)
 
 
 _LOOKS_LIKE = (
@@ -56,7 +56,7 @@ class Code(Enum):
         return self.name.lower()
 
     # any estimator
-    BUDGET_SPENT = caution("the budget of {budget} rollouts ran out before the method had converged")
+    BUDGET_SPENT = blocking("the budget of {budget} rollouts ran out before the method had converged")
     AT_BOUND = caution(
         "{parameters} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
     )
@@ -193,12 +193,12 @@ class Code(Enum):
         "bounds, or correct the model, units or signs"
     )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")
-    LOGS_DISAGREE = caution(
+    LOGS_DISAGREE = blocking(
         "the logs disagree about {parameters} (p = {p:.1g}): {estimates} {unit}; give it per_log = true, model what "
         "changed, or leave a log out{without}",
         "disagrees between logs",
     )
-    LOGS_DISAGREE_UNEXPLAINED = caution(
+    LOGS_DISAGREE_UNEXPLAINED = blocking(
         "the logs disagree (p = {p:.1g}) and no single parameter explains it: the model lacks something that differs "
         "between them; {parameters} explains most ({estimates} {unit}){without}",
         "disagrees between logs",

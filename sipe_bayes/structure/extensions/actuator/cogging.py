@@ -9,7 +9,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.structure.extension import PROBE, Extension
 from sipe_bayes.structure.machine import Machine
 
-_MOST_SHAPES = 24  # numbers of poles that are tried
+_MOST = 60  # periods in a turn
 
 
 class Cogging(Extension):
@@ -36,7 +36,7 @@ class Cogging(Extension):
             Parameter(
                 f"{site}.cogging_poles",
                 1.0,
-                60.0,
+                float(_MOST),
                 scale="log",
                 targets=(f"{at}.cogging_poles",),
                 description="periods in a turn",
@@ -46,7 +46,7 @@ class Cogging(Extension):
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """A little of either phase, for numbers of poles that the motion's range tells apart."""
         range_of = 2 * machine.joints[parameters[0].targets[0].removeprefix("joint:").rpartition(".")[0]].position
-        apart = max(np.pi / max(range_of, 0.1) / 1.5, 1.0)
-        poles = np.log(np.arange(1.0, 60.0, max(apart, 60.0 / _MOST_SHAPES))) / np.log(60.0)
+        apart = max(np.pi / max(range_of, 0.1) / 1.5, 1.0)  # whole periods, or as far as the range tells apart
+        poles = np.log(np.arange(1.0, _MOST, apart)) / np.log(_MOST)
         phases = ((PROBE, 0.0), (0.0, PROBE))
         return np.array([[[0.5 + a, 0.5 + b, n] for a, b in phases] for n in poles])
