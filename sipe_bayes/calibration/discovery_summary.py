@@ -158,8 +158,22 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
             continue
         evidence, held_out = _gain(structures, label)
         kept = label in structures.best.labels
-        told = (label, placed.sentence, extension.reference, probability, evidence, held_out)
-        pieces.append(Piece(*told, kept, extension.native, extension.nearest))
+        paid = evidence is not None and evidence > structures.search.cost
+        pieces.append(
+            Piece(
+                label,
+                placed.sentence,
+                extension.reference,
+                probability,
+                evidence,
+                held_out,
+                kept,
+                not kept and paid and held_out is not None and held_out <= 0,
+                extension.native,
+                extension.nearest,
+                tuple(p.name for p in placed.parameters),
+            )
+        )
     return tuple(sorted(pieces, key=lambda piece: not piece.kept))
 
 

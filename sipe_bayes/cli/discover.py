@@ -13,7 +13,7 @@ from sipe_bayes.cli.progress import Progress
 if TYPE_CHECKING:
     from sipe_bayes.diagnostics.discovery import Discovery
 
-_PIECES, _ERRORS, _CHANNELS, _VALUES = 4, 3, 2, 4  # lines of each kind that are printed: twenty in all
+_TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
@@ -44,49 +44,49 @@ def discover(
 
 
 def print_discovery(discovery: Discovery) -> None:
-    """What the model lacks, before and after, what remains and what to do next, on standard output: twenty lines."""
+    """What was tried and what it changes, then the answer, on standard output: twenty lines at most."""
     from rich.console import Console
     from rich.text import Text
 
-    from sipe_bayes.report.discovery.words import discovery_verdicts
+    from sipe_bayes.report.discovery.words import discovery_verdicts, next_steps
 
     console = Console(soft_wrap=True)
-    for verdict in discovery_verdicts(discovery):
-        console.print(Text(verdict.text, style=_TONES[verdict.tone]))
     for line in lines_of(discovery):
         console.print(line, highlight=False, markup=False)
+    for verdict in discovery_verdicts(discovery):
+        console.print(Text(verdict.text, style=_TONES[verdict.tone]))
+    if discovery.out:
+        console.print(f"report: {Path(discovery.out) / 'report.html'}", highlight=False, markup=False)
+        console.print(f"next: {next_steps(discovery)}", highlight=False, markup=False)
 
 
 def lines_of(discovery: Discovery) -> list[str]:
-    """What is printed below the verdicts."""
+    """What is printed above the answer."""
     from sipe_bayes.report.discovery.words import (
-        alternatives,
         error_line,
-        piece_text,
-        residual_lines,
+        nats,
+        probability_text,
+        structure_text,
         value_rows,
         warnings,
     )
 
-    lines = [f"  lacks {piece_text(piece)}" for piece in discovery.kept]
-    lines += [f"  perhaps {piece_text(piece)}" for piece in alternatives(discovery)]
-    lines = _cut(lines, _PIECES)
-    held_out = [f"held out {error_line(row)}" for row in discovery.errors if row.use == "holdout"]
-    train = [f"train {error_line(row)}" for row in discovery.errors if row.use == "train"]
-    lines += _cut(held_out or train, _ERRORS)
-    lines += _cut([f"residual {line}" for line in residual_lines(discovery)], _CHANNELS)
-    rows = [row for row in value_rows(discovery) if not row["nuisance"]]
+    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts, {discovery.seconds:.0f} s"
+    lines = [f"{discovery.name}, what the model lacks: {effort}"]
+    tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]
+    for row in discovery.rows:
+        cells = f"{nats(row.evidence):>9}{nats(row.held_out):>9}{probability_text(row.probability):>12}"
+        tried.append(f"  {structure_text(row):58.58}{cells}")
+    lines += _cut(tried, _TRIED)
+    errors = [row for row in discovery.errors if row.use == "holdout"] or list(discovery.errors)
+    lines += _cut([f"{row.use} {error_line(row)}" for row in errors], _ERRORS)
     values = []
-    for row in rows:
-        before = f"; {row['before']} ({row['before_interval']}) before" if row["before"] else ", of what was found"
-        values.append(f"{row['name']} {row['value']} ({row['interval']}) {row['unit']}".rstrip() + before)
+    for row in value_rows(discovery):
+        if row["before"] and not row["nuisance"]:
+            value = f"{row['name']} {row['value']} {row['unit']}".rstrip() + f" ({row['interval']})"
+            values.append(f"{value}; before {row['before']} ({row['before_interval']})")
     lines += _cut(values, _VALUES)
-    lines += _cut([f"warning: {warning}" for warning in warnings(discovery)], 1)
-    lines.append(f"{len(discovery.rows)} structures, {discovery.rollouts} rollouts, {discovery.seconds:.1f} s")
-    if discovery.out:
-        lines.append(f"report: {Path(discovery.out) / 'report.html'}")
-        lines.append(f"next: sipe calibrate {Path(discovery.out) / 'discovered.toml'}")
-    return lines
+    return lines + _cut([f"warning: {warning}" for warning in warnings(discovery)], 1)
 
 
 def _cut(lines: list[str], most: int) -> list[str]:

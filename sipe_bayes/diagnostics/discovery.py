@@ -25,8 +25,10 @@ class Piece:
             fitted.
         held_out: nats of held-out pieces, likewise; None also where there are no pieces.
         kept: whether the most probable structure has it.
+        undecided: whether it is out although its evidence pays for it, since held-out pieces speak against it.
         native: whether MJCF has an element for it.
         nearest: the element that comes nearest where it has none.
+        parameters: names of its parameters.
     """
 
     label: str
@@ -36,8 +38,10 @@ class Piece:
     evidence: float | None
     held_out: float | None
     kept: bool
+    undecided: bool
     native: bool
     nearest: str
+    parameters: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,11 @@ class Discovery:
     def kept(self) -> tuple[Piece, ...]:
         """The pieces of the most probable structure."""
         return tuple(piece for piece in self.pieces if piece.kept)
+
+    @property
+    def passes(self) -> bool:
+        """Whether what the most probable structure leaves passes for noise."""
+        return self.after.misfit is not None and not self.after.misfit.alarm
 
     def to_dict(self) -> dict[str, object]:
         """As JSON has it, without signals and residuals."""

@@ -15,16 +15,18 @@ from sipe_bayes.report.discovery.words import (
     alternatives,
     discovery_verdicts,
     nats,
+    next_steps,
     piece_text,
     probability_text,
     residual_lines,
+    structure_text,
     value_rows,
     warnings,
 )
 from sipe_bayes.report.drawing import png
 from sipe_bayes.report.page import Picture, run_details, write_pictures
 from sipe_bayes.report.templates import html_templates
-from sipe_bayes.report.words import error_text, listed, number, times, unit_text
+from sipe_bayes.report.words import error_text, number, times, unit_text
 
 
 def discovery_pictures(discovery: Discovery) -> list[Picture]:
@@ -67,7 +69,7 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
         sections.setdefault(image.section, []).append(image)
     structures = [
         {
-            "what": listed(row.sentences) or "the model as it was",
+            "what": structure_text(row),
             "evidence": nats(row.evidence),
             "held_out": nats(row.held_out),
             "probability": probability_text(row.probability),
@@ -102,6 +104,7 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
         "sections": sections,
         "details": run_details(discovery.run),
         "out": discovery.out,
+        "next": next_steps(discovery),
     }
 
 

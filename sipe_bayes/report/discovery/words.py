@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from sipe_bayes.core.findings import Findings
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
 from sipe_bayes.report.verdicts import Verdict
 from sipe_bayes.report.words import error_text, listed, number, significant, unit_text
+from sipe_bayes.structure.structures import StructureRow
 
 _SURE = 0.995  # a probability from which no more digits are told
 _OPEN = 0.05  # and below which a piece is no alternative
+_VALUES, _NAMED = 3, 2  # that a sentence lists
 
 
 def nats(value: float | None) -> str:
@@ -23,26 +27,52 @@ def probability_text(probability: float) -> str:
     return f"{probability:.2f}" if probability >= 1 - _SURE else "< 0.01"
 
 
+def found_values(discovery: Discovery, piece: Piece) -> str:
+    """The values of a kept piece's parameters with their 90 % intervals; of many the first ones."""
+    rows = {row["name"]: row for row in value_rows(discovery) if row["added"]}
+    mine = [rows[name] for name in piece.parameters if name in rows]
+    texts = []
+    for row in mine[:_VALUES]:
+        value = f"{row['value']} {row['unit']}".rstrip() + f" ({row['interval']})"
+        texts.append(value if len(mine) == 1 else f"{row['name'].rpartition('.')[2]} {value}")
+    return listed([*texts, *([f"{len(mine) - _VALUES} more"] if len(mine) > _VALUES else [])])
+
+
+def structure_text(row: StructureRow) -> str:
+    """What a structure has."""
+    return listed(row.sentences) or "the model as it was"
+
+
+def scores_text(piece: Piece) -> str:
+    """How much speaks for a piece."""
+    held_out = "" if piece.held_out is None else f", held-out pieces {nats(piece.held_out)}"
+    return f"probability {probability_text(piece.probability)}, evidence {nats(piece.evidence)} nats{held_out}"
+
+
 def piece_text(piece: Piece) -> str:
-    """What is lacking, and how much speaks for it."""
-    held_out = "" if piece.held_out is None else f", held-out pieces {nats(piece.held_out)} nats"
-    scores = f"probability {probability_text(piece.probability)}, evidence {nats(piece.evidence)} nats{held_out}"
-    return f"{piece.sentence}: {scores}"
+    """What may be lacking, and how much speaks for it."""
+    return f"{piece.sentence}: {scores_text(piece)}"
 
 
 def alternatives(discovery: Discovery) -> tuple[Piece, ...]:
     """Pieces that the most probable structure does without, and that are not out of the question."""
-    return tuple(piece for piece in discovery.pieces if not piece.kept and piece.probability > _OPEN)
+    return tuple(p for p in discovery.pieces if not p.kept and (p.undecided or p.probability > _OPEN))
+
+
+def column_verdict(discovery: Discovery) -> Verdict | None:
+    """Which columns of the logs have a wrong sign or unit."""
+    if not discovery.columns:
+        return None
+    what = f"The logs do not say what the configuration says: {listed(discovery.columns)}."
+    return Verdict("bad", f"{what} discovered.toml has it right, and everything below is of logs set right.")
 
 
 def headline(discovery: Discovery) -> Verdict:
-    """What the model lacks."""
-    misfit = discovery.after.misfit
-    passes = misfit is not None and not misfit.alarm
-    kept = [piece.sentence for piece in discovery.kept]
+    """What the model lacks, and how much of it."""
+    kept = [f"{p.sentence}, {found_values(discovery, p)}" for p in discovery.kept]
     if kept:
-        return Verdict("good" if passes else "fair", f"The model lacks {listed(kept)}.")
-    if passes:
+        return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
+    if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show: the residuals pass for noise.")
     return Verdict("bad", "The residuals are not noise, and nothing that was tried is what the model lacks.")
 
@@ -54,15 +84,26 @@ def held_out_verdict(discovery: Discovery) -> Verdict | None:
         if not discovery.kept or any(row.use == "holdout" for row in discovery.errors):
             return None
         return Verdict("fair", "No log was held out: only pieces of the training logs speak for it.")
-    factor = f"{1 / comparison.ratio:.2f} times"
     interval = f"95 % interval {1 / comparison.high:.2f} to {1 / comparison.low:.2f}"
-    margin = f"{factor} the calibrated plain model's ({interval})"
+    margin = f"{1 / comparison.ratio:.2f} times that of the plain model, calibrated ({interval})"
     words = {
-        "better": ("good", f"On held-out logs its error is {margin}."),
+        "better": ("good", f"On held-out logs its error falls to {margin}."),
         "worse": ("bad", f"On held-out logs its error is LARGER, {margin}."),
         "not better": ("fair", f"On held-out logs it is NOT shown to be better: its error is {margin}."),
     }
     return Verdict(*words[comparison.verdict])
+
+
+def undecided(discovery: Discovery) -> Verdict | None:
+    """What is neither in nor out of the question, and what would decide it."""
+    open_pieces = alternatives(discovery)
+    if not open_pieces:
+        return None
+    named = [
+        f"{p.sentence} (evidence {nats(p.evidence)} nats, held-out pieces {nats(p.held_out)})" for p in open_pieces
+    ]
+    more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
+    return Verdict("fair", f"Not decided: {listed([*named[:_NAMED], *more])}; more or longer logs would tell.")
 
 
 def remains(discovery: Discovery) -> Verdict | None:
@@ -74,29 +115,39 @@ def remains(discovery: Discovery) -> Verdict | None:
     if misfit is None:
         return Verdict("fair", f"Whether the residuals pass for noise cannot be told.{explained}")
     if not misfit.alarm:
-        return (
-            Verdict("good", f"What remains passes for noise (p = {misfit.p:.2g}).{explained}")
-            if discovery.kept
-            else None
-        )
-    text = f"What remains is not noise (p = {misfit.p:.2g}); it looks most like {misfit.cause}.{explained}"
-    return Verdict("bad", f"{text} Intervals are of these structures alone.")
+        told = Verdict("good", f"What remains passes for noise (p = {misfit.p:.2g}).{explained}")
+        return told if discovery.kept else None
+    return Verdict(
+        "bad", f"What remains is not noise (p = {misfit.p:.2g}); it looks most like {misfit.cause}.{explained}"
+    )
 
 
-def column_verdict(discovery: Discovery) -> Verdict | None:
-    """Which columns of the logs have a wrong sign or unit."""
-    if not discovery.columns:
-        return None
-    what = f"The logs do not say what the configuration says: {listed(discovery.columns)}."
-    return Verdict("bad", f"{what} discovered.toml has it right, and everything below is of logs set right.")
+def trust(discovery: Discovery) -> Verdict:
+    """Which intervals hold: those averaged over the structures, once residuals pass and the search has settled."""
+    if not discovery.settled:
+        return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
+    if discovery.passes:
+        return Verdict("good", "Values may be trusted within the intervals averaged over the structures, no narrower.")
+    return Verdict(
+        "bad",
+        "No value may be trusted within its interval yet: the intervals are those of models that are still wrong.",
+    )
 
 
 def discovery_verdicts(discovery: Discovery) -> list[Verdict]:
-    """The sentences at the top of the report and of what is printed."""
-    out = [column_verdict(discovery), headline(discovery), held_out_verdict(discovery), remains(discovery)]
-    if not discovery.settled:
-        out.append(Verdict("fair", "The search ended before it had settled: give it a larger budget."))
-    return [verdict for verdict in out if verdict is not None]
+    """The answer: at the top of the report, and at the end of what is printed."""
+    out = [column_verdict(discovery), headline(discovery), held_out_verdict(discovery), undecided(discovery)]
+    return [verdict for verdict in (*out, remains(discovery), trust(discovery)) if verdict is not None]
+
+
+def next_steps(discovery: Discovery) -> str:
+    """What to do with it."""
+    out = Path(discovery.out)
+    if discovery.kept or discovery.columns:
+        return f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
+    if discovery.passes:
+        return "nothing to put in; go on with the configuration as it is"
+    return "record other motions and search again, or write an extension of your own: structure.extra in the README"
 
 
 def residual_lines(discovery: Discovery) -> list[str]:
@@ -115,7 +166,7 @@ def error_line(row: ModelErrors) -> str:
     fits = f"{error_text(row.fitted_before)} to {error_text(row.fitted_after)}"
     measured = f"{error_text(row.before)} to {error_text(row.after)}"
     unit = unit_text(row.unit)
-    started = f"from measured starts {measured}, {error_text(row.given)} as given"
+    started = f"from measured starts {measured} (as given {error_text(row.given)})"
     return f"{row.log}, {row.channel}: RMSE {fits} {unit}; {started}"
 
 
