@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sipe_bayes.calibration.output import save_posterior
 from sipe_bayes.calibration.problem import RUN, Problem
 from sipe_bayes.core.files import to_json, write_text
@@ -17,7 +15,7 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.toml import to_toml
 from sipe_bayes.diagnostics.discovery import Discovery
-from sipe_bayes.envs.export import ExportError, write_identified
+from sipe_bayes.envs.export import ExportError, write_edited, write_identified
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.report.discovery.page import write_discovery_report
 from sipe_bayes.structure.columns import Column
@@ -36,8 +34,7 @@ def write_discovery(discovery: Discovery, structures: Structures, problem: Probl
     """
     save_posterior(structures.posterior, folder)
     best, placed = structures.best, structures.placed(structures.best)
-    environment = structures.simulator(best).environment
-    assert isinstance(environment, MjcfEnvironment)
+    environment = _environment(structures)
     noticed: list[Finding] = []
     try:
         values = environment.space.values(best.theta)
@@ -50,6 +47,13 @@ def write_discovery(discovery: Discovery, structures: Structures, problem: Probl
     write_text(folder / STRUCTURES, to_json(discovery.to_dict(), indent=2))
     write_text(folder / RUN, to_json({**discovery.run, "status": "complete"}, indent=2))
     return discovery
+
+
+def _environment(structures: Structures) -> MjcfEnvironment:
+    """Of the best structure."""
+    environment = structures.simulator(structures.best).environment
+    assert isinstance(environment, MjcfEnvironment)
+    return environment
 
 
 def _note(placed: list[Placed]) -> str:
@@ -80,13 +84,11 @@ def write_configuration(problem: Problem, structures: Structures, folder: Path, 
     Raises:
         ExportError: where the edited model cannot be written.
     """
-    placed, own = structures.placed(structures.best), problem.environment
+    placed = structures.placed(structures.best)
     data = problem.config.model_dump(mode="json", by_alias=True, exclude_unset=True)
     data = _set_right(_relocated(data, folder), structures.columns) | {"seed": seed}
-    edits = [one.edit for one in placed if one.edit is not None]
-    if edits:
-        edited = MjcfEnvironment.build(own.source, [], own.actuators, own.measurements, edits)
-        write_identified(edited, np.zeros(0), folder / EXTENDED_XML)
+    if any(one.edit is not None for one in placed):
+        write_edited(_environment(structures), folder / EXTENDED_XML)
         data["model"] = EXTENDED_XML
     data["parameters"] = [*data["parameters"], *_entries([p for one in placed for p in one.parameters])]
     lines = [f"# {problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]

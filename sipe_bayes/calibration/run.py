@@ -224,7 +224,7 @@ def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
 
 def run_name(config: Path) -> str:
     """What a run is called: as the configuration's file, or its folder where the file's name says nothing."""
-    return config.resolve().parent.name if config.stem in ("calibrate", "config") else config.stem
+    return config.resolve().parent.name if config.stem in ("calibrate", "config", "discover") else config.stem
 
 
 def run(

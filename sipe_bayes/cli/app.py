@@ -78,10 +78,14 @@ def calibrate(
     seed: Annotated[int | None, typer.Option(help="Default: the configuration's.")] = None,
     budget: Annotated[int | None, typer.Option(help="Rollouts: logs times parameter values simulated.")] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-ESTIMATOR.")] = None,
+    discover: Annotated[
+        bool, typer.Option("--discover", help="Then search what the model lacks, into `discover` of the folder.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
 ) -> None:
     """Posterior of a simulator's parameters from logs of the real machine."""
+    from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.calibration.run import run
     from sipe_bayes.core.files import to_json
 
@@ -89,10 +93,16 @@ def calibrate(
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
         calibration = run(config, estimator, seed, budget, out, threads, progress.update)
+        found = None
+        if discover:
+            folder = Path(calibration.out) / "discover"
+            found = run_discovery(config, folder, seed, num_threads=threads, progress=progress.update)
     if as_json:
-        print(to_json(calibration.to_dict()))
-    else:
-        print_calibration(calibration)
+        print(to_json(calibration.to_dict() | ({} if found is None else {"discovery": found.to_dict()})))
+        return
+    print_calibration(calibration)
+    if found is not None:
+        discover_commands.print_discovery(found)
 
 
 @app.command()

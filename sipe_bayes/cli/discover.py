@@ -74,12 +74,12 @@ def lines_of(discovery: Discovery) -> list[str]:
     effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts, {discovery.seconds:.0f} s"
     lines = [f"{discovery.name}, what the model lacks: {effort}"]
     tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]
-    for row in discovery.rows:
-        cells = f"{nats(row.evidence):>9}{nats(row.held_out):>9}{probability_text(row.probability):>12}"
-        tried.append(f"  {structure_text(row):58.58}{cells}")
+    for one in discovery.rows:
+        cells = f"{nats(one.evidence):>9}{nats(one.held_out):>9}{probability_text(one.probability):>12}"
+        tried.append(f"  {structure_text(one):58.58}{cells}")
     lines += _cut(tried, _TRIED)
-    errors = [row for row in discovery.errors if row.use == "holdout"] or list(discovery.errors)
-    lines += _cut([f"{row.use} {error_line(row)}" for row in errors], _ERRORS)
+    errors = [error for error in discovery.errors if error.use == "holdout"] or list(discovery.errors)
+    lines += _cut([f"{error.use} {error_line(error)}" for error in errors], _ERRORS)
     values = []
     for row in value_rows(discovery):
         if row["before"] and not row["nuisance"]:

@@ -52,6 +52,29 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
         for target in parameter.targets:
             if not target.startswith("sensor:"):
                 _copy(spec, model, target)
+    _write(spec, model, path, note)
+    biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
+    return [finding(Code.BIAS_NOT_EXPORTED, parameters=[name]) for name in biased]
+
+
+def write_edited(environment: MjcfEnvironment, path: Path, note: str = "") -> None:
+    """Write the MJCF with the environment's edits, its values as they are.
+
+    Args:
+        environment: whose MJCF.
+        path: the file.
+        note: a comment at its head.
+
+    Raises:
+        ExportError: where the written model would not be the edited one.
+    """
+    spec = environment.spec()
+    _absolute_assets(spec, environment.source)
+    _write(spec, environment.compile(), path, note)
+
+
+def _write(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path, note: str) -> None:
+    """Write an MJCF that compiles to a model."""
     with replacing(path) as temporary:
         try:
             spec.compile()
@@ -63,8 +86,6 @@ def write_identified(environment: MjcfEnvironment, values: FloatArray, path: Pat
         differing = differing_fields(model, written)
         if differing:
             raise ExportError(f"{path.name}: the written model differs in {', '.join(differing)}; nothing was written")
-    biased = [p.name for p in environment.parameters if any(t.startswith("sensor:") for t in p.targets)]
-    return [finding(Code.BIAS_NOT_EXPORTED, parameters=[name]) for name in biased]
 
 
 def _noted(xml: str, note: str) -> str:

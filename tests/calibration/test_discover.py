@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 
 import sipe_bayes as sipe
@@ -17,6 +18,7 @@ from sipe_bayes.calibration.output import CHECKPOINT
 from sipe_bayes.calibration.run import run
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.discovery import Discovery
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.report.discovery.words import discovery_verdicts
 from tests.problems.interruptions import stop_after
 from tests.problems.lacking import FRICTION, OWN, write_lacking
@@ -89,6 +91,30 @@ def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Disco
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-3)
 
 
+def test_what_mjcf_has_no_element_for_travels_with_the_model_and_is_said(tmp_path: Path) -> None:
+    """discovered.xml moves as the configuration at the best values does, and says who simulates its numbers."""
+    table = '[structure]\nonly = ["direction_friction", "spring"]\n'
+    config = write_lacking(tmp_path, table, target="joint:hinge.direction_friction")
+    found = run_discovery(config, tmp_path / "out", num_threads=1)
+    (piece,) = found.kept
+    assert piece.label == "direction_friction:hinge"
+    xml = (tmp_path / "out" / "discovered.xml").read_text(encoding="utf-8")
+    assert "by sipe_bayes and not by MuJoCo itself; nearest element: joint frictionloss and damping" in xml
+    assert "MJCF has no element for friction at hinge" in (tmp_path / "out" / "report.html").read_text("utf-8")
+    problem = sipe.prepare(tmp_path / "out" / "discovered.toml", 1)
+    space, actions = problem.simulator.space, problem.train.actions
+    assert found.best["hinge.direction_friction"] == pytest.approx(FRICTION, rel=0.1)
+    theta = space.normalise(np.array([found.best[name] for name in space.names]))
+    path = str(tmp_path / "out" / "discovered.xml")
+    environment = MjcfEnvironment.build(path, list(space)[:1], ["motor"], ["joint:hinge.position"])
+    written = sipe.Simulator(environment, num_threads=1)
+    start = written.default_state()[None]
+    one = problem.simulator.rollout(theta[None], actions, start, 0.01).observations
+    other = written.rollout(written.space.default_theta[None], actions, start, 0.01).observations
+    assert np.abs(one).max() > 1
+    np.testing.assert_allclose(other, one, atol=1e-3)  # six digits, over five seconds
+
+
 @pytest.mark.parametrize(
     ("column", "factor", "key"), [("torque", -1.0, "sign"), ("angle", 180 / math.pi, "factor")], ids=["sign", "unit"]
 )
@@ -145,6 +171,11 @@ def test_own_extension_by_path(tmp_path: Path) -> None:
     assert [piece.label for piece in found.kept] == ["rub:hinge"]
     data = tomllib.loads((tmp_path / "out" / "discovered.toml").read_text(encoding="utf-8"))
     assert data["structure"]["extra"] == ["../own.py:Rub"]
+    assert data["model"] == "extended.xml"  # with what the extension adds, which does nothing yet
+    problem = sipe.prepare(tmp_path / "out" / "discovered.toml", 1)
+    model = problem.environment.compile()
+    assert (model.nsite, model.dof_frictionloss[0]) == (1, 0)
+    assert problem.simulator.space.names[-1] == "hinge.rub"
 
 
 BROKEN = {  # what the file says, and words of the one line

@@ -56,6 +56,10 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.structure import Extension
 
 
+def marked(spec):
+    spec.worldbody.add_site(name="rub")
+
+
 class Rub(Extension):
     name, kind, reference = "rub", "joint", "-"
 
@@ -64,22 +68,28 @@ class Rub(Extension):
 
     def parameters(self, machine, site):
         return (Parameter(f"{site}.rub", 0.0, machine.joints[site].force, targets=(f"joint:{site}.frictionloss",)),)
+
+    def edit(self, machine, site):
+        return marked
 """
 
 
 def write_lacking(
-    folder: Path, friction: float = FRICTION, structure: str = "", factors: Mapping[str, float] | None = None
+    folder: Path,
+    structure: str = "",
+    factors: Mapping[str, float] | None = None,
+    target: str = "joint:hinge.frictionloss",
 ) -> Path:
     """Model, log and configuration in a folder, and ``own.py``; returns the configuration.
 
     Args:
         folder: where they go.
-        friction: of the machine, N m.
         structure: the table of that name in place of the configuration's.
         factors: of columns, of which the configuration says nothing.
+        target: that has the friction.
     """
-    truth = pendulum(Parameter("dry", 0.0, 0.5, targets=("joint:hinge.frictionloss",)))
-    recorded = log(truth, [0.6, 0.05, friction], 3, steps=800, sd=0.005)
+    truth = pendulum(Parameter("dry", 0.0, 0.5, targets=(target,)))
+    recorded = log(truth, [0.6, 0.05, FRICTION], 3, steps=800, sd=0.005)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "pendulum.xml").write_text(XML)
     (folder / "own.py").write_text(OWN)

@@ -1,0 +1,51 @@
+"""``sipe discover`` and ``sipe calibrate --discover``: twenty lines that end with an answer, JSON is JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sipe_bayes.cli.app import main
+from tests.problems.lacking import write_lacking
+from tests.problems.swings import strict_json
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    return write_lacking(tmp_path)
+
+
+def told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    monkeypatch.setattr("sys.argv", ["sipe", *map(str, words)])
+    with pytest.raises(SystemExit) as left:
+        main()
+    out, err = capsys.readouterr()
+    assert left.value.code == 0, err
+    return out
+
+
+def test_ends_with_an_answer(config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    out = config.parent / "out"
+    lines = told(monkeypatch, capsys, "discover", config, "--threads", 1, "--out", out).splitlines()
+    assert len(lines) <= 20
+    answer = lines[-6:]
+    words = ("The model lacks dry friction at hinge, 0.1", "error falls to 0.", "passes for noise", "may be trusted")
+    for line, word in zip(answer, words, strict=False):
+        assert word in line
+    assert answer[-2:] == [
+        f"report: {out / 'report.html'}",
+        f"next: sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})",
+    ]
+
+
+def test_calibrates_and_then_discovers(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("calibrate", config, "--discover", "--json", "--threads", 1, "--out", config.parent / "out")
+    found = strict_json(told(monkeypatch, capsys, *words))
+    assert found["misfit"]["p"] < 0.05
+    assert [piece["label"] for piece in found["discovery"]["pieces"] if piece["kept"]] == ["dry_friction:hinge"]
+    assert (Path(found["out"]) / "report.html").exists()
+    assert Path(found["discovery"]["out"]) == Path(found["out"]) / "discover"
+    assert (Path(found["out"]) / "discover" / "discovered.toml").exists()
