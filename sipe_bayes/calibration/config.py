@@ -8,6 +8,7 @@ What needs the MJCF (does the joint exist, which kind of unit has it) is checked
 from __future__ import annotations
 
 import tomllib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -28,6 +29,7 @@ from sipe_bayes.calibration.config_tables import (
     Columns,
     Command,
     LogEntry,
+    Logs,
     Measurement,
     Noise,
     ParameterEntry,
@@ -36,8 +38,8 @@ from sipe_bayes.calibration.config_tables import (
     Search,
     Structure,
     Use,
-    overlap,
 )
+from sipe_bayes.calibration.readers.many import episodes_of
 from sipe_bayes.core.units import find_unit
 
 
@@ -58,7 +60,7 @@ class Config(Table):
     columns: Columns = Columns()
     commands: tuple[Command, ...] = ()
     measurements: Annotated[tuple[Measurement, ...], Field(min_length=1)]
-    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)]
+    logs: Logs
     parameters: Annotated[tuple[ParameterEntry, ...], Field(min_length=1)]
     noise: Noise = Noise()
     prior: PriorSource | None = None
@@ -130,8 +132,8 @@ class Config(Table):
         """A held-out sample that also trains would be no test."""
         for i, held in enumerate(self.logs):
             for train in self.logs_for("train") if held.use == "holdout" else ():
-                if held.file == train.file and overlap(held.span, train.span):
-                    message = f"held out, but its samples also train as log {train.name!r}; give spans apart"
+                if held.file == train.file and held.meets(train):
+                    message = f"held out, but samples of it train as log {train.name!r}; give spans or episodes apart"
                     raise problem(message, "logs", i, "use")
 
 
@@ -162,6 +164,23 @@ def check_dimensions(config: Config, dimensions: Mapping[str, str]) -> None:
                 raise ConfigError(f"{where}: {entry.target} is no such quantity: {error}") from None
 
 
+def _episodes(path: Path, config: Config) -> tuple[LogEntry, ...]:
+    """The logs, each episode as one of its own."""
+    column, logs = config.columns.episode, []
+    for i, log in enumerate(config.logs):
+        if column is None:
+            if log.episodes is not None:
+                raise ConfigError(f"{path}: key `logs[{i}].episodes`: needs `columns.episode`; name the column there")
+            logs.append(log)
+            continue
+        numbers = episodes_of(log.file, column) if log.episodes is None else log.episodes
+        logs += [log.model_copy(update={"name": f"{log.name}-{n}", "episodes": (n,)}) for n in numbers]
+    ((name, count),) = Counter(log.name for log in logs).most_common(1)
+    if count > 1:
+        raise ConfigError(f"{path}: key `logs`: {count} logs are called {name!r}; give each file a `name`")
+    return tuple(logs)
+
+
 def load_config(path: str | Path) -> Config:
     """Read and check a configuration, a TOML file; raises ConfigError for one that cannot be used."""
     path = Path(path)
@@ -177,6 +196,7 @@ def load_config(path: str | Path) -> Config:
         config = Config.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:
         raise ConfigError(f"{path}: {one_line(error.errors()[0])}") from None
+    config = config.model_copy(update={"logs": _episodes(path, config)})
     config._path = path
     if not config.model.is_file():
         raise ConfigError(f"{path}: key `model`: no such file, got {config.model}; {nearest_file(config.model)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, Strict, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, model_validator
 
 from sipe_bayes.calibration.config_fields import (
     ExtensionName,
@@ -24,6 +24,7 @@ from sipe_bayes.calibration.config_fields import (
     check_ordered,
     problem,
 )
+from sipe_bayes.calibration.readers.many import matching, names_of
 
 Use = Literal["train", "holdout"]
 
@@ -36,9 +37,10 @@ class TimeColumn(Table):
 
 
 class Columns(Table):
-    """Columns that are neither command nor measurement."""
+    """Columns that are neither command nor measurement. episode: numbers the logs that one file holds."""
 
     time: TimeColumn = TimeColumn()
+    episode: Text | None = None
 
 
 class Resample(Table):
@@ -89,12 +91,14 @@ class Measurement(Table):
 class LogEntry(Table):
     """One log, or one ``span`` (start, stop) of it in seconds from its first sample.
 
-    ``window`` overrides the configuration's for this log.
+    A ``file`` with ``*`` is all files that match, and where ``columns.episode`` is given, each episode is a log; of
+    those in ``episodes``, else of all. ``window`` overrides the configuration's for this log.
     """
 
     file: Location
     name: Text = ""
     use: Use = "train"
+    episodes: Annotated[tuple[Annotated[int, Strict()], ...], Field(min_length=1)] | None = None
     span: Pair | None = None
     window: Window = None
 
@@ -111,7 +115,43 @@ class LogEntry(Table):
             check_ordered(self.span, "span", "[start, stop] in seconds")
             if self.span[0] < 0:
                 raise problem(f"starts before the log, got {list(self.span)}; count seconds from 0", "span")
+        if self.episodes is not None and len(set(self.episodes)) < len(self.episodes):
+            raise problem(f"names an episode twice, got {list(self.episodes)}; drop one", "episodes")
         return self
+
+    def meets(self, other: LogEntry) -> bool:
+        """Whether two parts of one file share samples."""
+        apart = self.episodes is not None and other.episodes is not None and not {*self.episodes} & {*other.episodes}
+        return not apart and overlap(self.span, other.span)
+
+
+def _log_words(value: Any) -> Any:
+    """``logs = "tosses/*.csv"`` as the table that it stands for."""
+    return [{"file": word} for word in ([value] if isinstance(value, str) else value)] if _is_words(value) else value
+
+
+def _is_words(value: Any) -> bool:
+    return isinstance(value, str) or (isinstance(value, list) and all(isinstance(word, str) for word in value))
+
+
+def _matched(logs: tuple[LogEntry, ...], info: ValidationInfo) -> tuple[LogEntry, ...]:
+    """Each log whose file is a pattern as the files that match it."""
+    found: list[LogEntry] = []
+    for i, log in enumerate(logs):
+        files = matching(log.file, (info.context or {}).get("folder", Path()))
+        if not files:
+            raise problem(f"no file matches {log.file}; correct the pattern", i, "file")
+        if files == [log.file]:
+            found.append(log)
+            continue
+        own = log.name != log.file.stem
+        names = [f"{log.name}-{k}" for k in range(len(files))] if own else names_of(files)
+        pairs = zip(files, names, strict=True)
+        found += [log.model_copy(update={"file": file, "name": name}) for file, name in pairs]
+    return tuple(found)
+
+
+Logs = Annotated[tuple[LogEntry, ...], Field(min_length=1), BeforeValidator(_log_words), AfterValidator(_matched)]
 
 
 class NormalPrior(Table):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,18 +13,33 @@ _GAP_PERIODS = 5.0  # default max_gap, in a column's own median sample periods
 
 
 @dataclass(frozen=True)
+class Series:
+    """One column in SI.
+
+    Args:
+        time: (n,) s from the recording's zero; the recording's own time, unless the column has a clock of its own.
+        values: (n,) with NaN where there is no number.
+    """
+
+    time: FloatArray
+    values: FloatArray
+
+
+@dataclass(frozen=True)
 class Recording:
     """A log in SI.
 
     Args:
-        time: (n,) s from zero.
-        commands: of each actuator (n,), NaN where there is no number.
-        measurements: of each channel (n,), NaN where there is no number.
+        time: (n,) s from zero, of the clock that gives the grid.
+        commands: of each actuator.
+        measurements: of each channel.
+        late: s that were left out before the first command of a clock of its own.
     """
 
     time: FloatArray
-    commands: list[FloatArray]
-    measurements: list[FloatArray]
+    commands: list[Series]
+    measurements: list[Series]
+    late: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +57,13 @@ class Grid:
     samples: int
     rows: FloatArray
     regular: bool
+
+    def on_clock(self, time: FloatArray) -> Grid:
+        """The same grid, with the rows of another clock; time (n,) in s from the grid's start."""
+        rows = np.round(time / self.dt)
+        inside = bool(len(rows)) and rows[0] >= 0 and rows[-1] < self.samples
+        near = inside and np.abs(time - rows * self.dt).max() <= _REGULAR * self.dt and (np.diff(rows) > 0).all()
+        return replace(self, rows=rows if near else time / self.dt, regular=bool(near))
 
 
 def control_grid(time: FloatArray, rate: float | None) -> Grid:

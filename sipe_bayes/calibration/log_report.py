@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from dataclasses import dataclass
 
 import numpy as np
 
 from sipe_bayes.calibration.config import Config
-from sipe_bayes.calibration.config_tables import LogEntry
-from sipe_bayes.calibration.grid import Grid, Recording, gaps
+from sipe_bayes.calibration.config_tables import LogEntry, Measurement
+from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
 
@@ -29,29 +29,43 @@ class Saturation(Options):
 
 
 _SATURATION = Saturation()
+_SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
-def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, trajectory: Trajectory) -> LogReport:
-    """What a log held, as it was read, and what was done to it on the grid; ``trajectory`` is what came out."""
+def report_of(
+    config: Config, log: LogEntry, sha256: str, raw: Recording, grid: Grid, trajectory: Trajectory
+) -> LogReport:
+    """What a log held, as it was read, and what was done to it on the grid.
+
+    Args:
+        config: the configuration.
+        log: which of its logs.
+        sha256: of its file.
+        raw: as it was read.
+        grid: of the control steps.
+        trajectory: what came out.
+    """
     finite = np.isfinite(trajectory.observations)
     names = [*config.channels, *(c.target for c in config.commands)]
-    signals = [*raw.measurements, *raw.commands]
+    signals = [y.values for y in (*raw.measurements, *raw.commands)]
     missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
     clipped = {name: count_clipped(values) for name, values in zip(names, signals, strict=True)}
     saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
-    blank = {c.target: int((~np.isfinite(y[:-1])).sum()) for c, y in zip(config.commands, raw.commands, strict=True)}
+    commands = zip(config.commands, raw.commands, strict=True)
+    blank = {c.target: int((~np.isfinite(y.values[:-1])).sum()) for c, y in commands}
     holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
     jitter = _jitter(raw.time)
     note = functools.partial(finding, log=log.name)
+    own = [y for y in raw.measurements if y.time is not raw.time]
     return LogReport(
         name=log.name,
         file=str(log.file),
-        sha256=hashlib.sha256(log.file.read_bytes()).hexdigest(),
+        sha256=sha256,
         rate_hz=1.0 / grid.dt,
         duration_s=(grid.samples - 1) * grid.dt,
         samples=grid.samples,
         jitter_s=jitter,
-        resampled=not grid.regular,
+        resampled=not all(grid.on_clock(y.time).regular for y in own) or not grid.regular,
         gaps=holes,
         missing=missing,
         clipped=clipped,
@@ -63,12 +77,42 @@ def report_of(config: Config, log: LogEntry, raw: Recording, grid: Grid, traject
                 own_rate=f"{1 / float(np.median(np.diff(raw.time))):.4g} Hz",
                 jitter_ms=1e3 * jitter,
             ),
+            *_of_clocks(config, log, raw),
             *(note(Code.LOG_GAP, start=start, stop=stop) for start, stop in holes),
             *(note(Code.LOG_MISSING, channel=c, missing=n, samples=grid.samples) for c, n in missing.items() if n),
             *(note(Code.LOG_BLANK_COMMANDS, channel=c, blank=n) for c, n in blank.items() if n),
             *(note(Code.LOG_CLIPPED, channel=c, clipped=n) for c, n in saturated.items()),
         ),
     )
+
+
+def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
+    """Of clocks beside the grid's, of commands that end early, and of joints that are logged slowly."""
+    noticed = []
+    series = [*raw.measurements, *raw.commands]
+    apart = sum(y.time is not raw.time for y in series)
+    if apart:
+        noticed.append(finding(Code.LOG_CLOCKS, log=log.name, count=apart, of=len(series), late=raw.late))
+    for command, y in zip(config.commands, raw.commands, strict=True):
+        silent = float(raw.time[-1] - y.time[-1])
+        if len(y.time) > 1 and silent > _SILENT * float(np.median(np.diff(y.time))):
+            noticed.append(finding(Code.LOG_COMMAND_ENDS, log=log.name, channel=command.target, silent=silent))
+    rates = {m.name: _rate(y) for m, y in zip(config.measurements, raw.measurements, strict=True) if _of_joint(m)}
+    slow = {name: rate for name, rate in rates.items() if rate < THRESHOLDS.slow_log}
+    if slow:
+        rate = f"{min(slow.values()):.3g} Hz"
+        noticed.append(finding(Code.LOG_SLOW, log=log.name, channels=", ".join(slow), rate=rate))
+    return noticed
+
+
+def _of_joint(measurement: Measurement) -> bool:
+    return measurement.fit and measurement.target.startswith("joint:")
+
+
+def _rate(series: Series) -> float:
+    """Hz of the samples that are there."""
+    time = series.time[np.isfinite(series.values)]
+    return 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else np.inf
 
 
 def _jitter(time: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""Recorded logs: CSV, Parquet or npz tables, put on a control grid as a ``Trajectory``.
+"""Recorded logs: tables of any format, put on a control grid as a ``Trajectory``.
 
 The grid starts at the log's (or span's) first sample and has the log's own rate unless ``resample.rate`` says
 otherwise. What happens to the samples, in two cases:
@@ -13,21 +13,27 @@ otherwise. What happens to the samples, in two cases:
 
 Either way commands are held (zero-order hold): action k is the last finite command at or before grid time k,
 also across gaps; and missing measurements are NaN: masked, never invented. ``LogReport`` says what was done.
+
+Where columns have clocks of their own, as topics of a bag do, the fitted measurement with the most samples gives the
+grid; the others come onto it by the same two cases, and what lies before the first command is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import reprlib
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 
 import numpy as np
 
 from sipe_bayes.calibration.config import Config, check_dimensions
 from sipe_bayes.calibration.config_fields import nearest
 from sipe_bayes.calibration.config_tables import Command, LogEntry, Measurement
-from sipe_bayes.calibration.grid import Grid, Recording, control_grid, held, sampled
+from sipe_bayes.calibration.grid import Grid, Recording, Series, control_grid, held, sampled
 from sipe_bayes.calibration.log_report import report_of
 from sipe_bayes.calibration.readers.base import Columns, LogError
-from sipe_bayes.calibration.tables import read_table
+from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode
+from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert
@@ -37,85 +43,172 @@ _SLOW = 0.25  # s from row to row: no robot is logged so slowly without its bein
 _EMPTY = 1000  # grid samples for each of the log: a pause, or a wrong unit of time
 
 
-def load_log(
-    config: Config, log: LogEntry, dimensions: Mapping[str, str] | None = None
-) -> tuple[Trajectory, LogReport]:
-    """A log as a trajectory on its control grid, and the report of what was done to it.
+def load_logs(
+    config: Config, logs: Sequence[LogEntry], dimensions: Mapping[str, str] | None = None
+) -> list[tuple[Trajectory, LogReport]]:
+    """Logs as trajectories on their control grids, and the reports of what was done to them.
+
+    A file of which several of them are parts, one after the other, is read once.
 
     Args:
         config: the configuration.
-        log: which of its logs.
+        logs: which of its logs.
         dimensions: kind of quantity of each target, see ``config.check_dimensions``; without it units are only
             converted.
 
     Returns:
-        Observations are the measurements (T+1, O), actions the commands (T, A), in the config's order.
+        Of each, observations are the measurements (T+1, O), actions the commands (T, A), in the config's order.
 
     Raises:
         LogError: for a log that cannot be used.
         ConfigError: for a unit of the wrong kind.
     """
     check_dimensions(config, dimensions or {})
-    try:
-        return _loaded(config, log)
-    except LogError as error:
-        raise LogError(f"log {log.name!r}: {error}") from None
+    wanted = [m.column for m in config.measurements] + [c.column for c in config.commands]
+    wanted += [config.columns.episode] if config.columns.episode else []
+    loaded = []
+    for file, parts in groupby(logs, key=lambda log: log.file):
+        table, sha256 = None, ""
+        for log in parts:
+            try:
+                if table is None:
+                    table, sha256 = read_table(file, wanted), digest(file)
+                loaded.append(_loaded(config, log, table, sha256))
+            except LogError as error:
+                raise LogError(f"log {log.name!r}: {error}") from None
+    return loaded
 
 
-def _loaded(config: Config, log: LogEntry) -> tuple[Trajectory, LogReport]:
-    raw = _read_log(config, log)
+def load_log(
+    config: Config, log: LogEntry, dimensions: Mapping[str, str] | None = None
+) -> tuple[Trajectory, LogReport]:
+    """One log, as ``load_logs`` gives it."""
+    return load_logs(config, [log], dimensions)[0]
+
+
+def _loaded(config: Config, log: LogEntry, table: Columns, sha256: str) -> tuple[Trajectory, LogReport]:
+    if config.columns.episode:
+        if log.episodes is None or len(log.episodes) != 1:
+            raise LogError(f"expected one number in `episodes`, got {log.episodes}; use load_config, which names them")
+        table = episode(log.file, table, config.columns.episode, log.episodes[0])
+        sha256 = combined([sha256, str(log.episodes[0])])
+    raw = _read_log(config, log, table)
     grid = control_grid(raw.time, config.resample.rate)
     _check_length(config, log, grid, raw.time)
-    observed = [sampled(raw.time, y, grid, config.resample.max_gap) for y in raw.measurements]
+    observed = [sampled(y.time, y.values, _placed(grid, raw, y), config.resample.max_gap) for y in raw.measurements]
     for measurement, before, after in zip(config.measurements, raw.measurements, observed, strict=True):
-        _check_any(measurement.column, before, after)
-    commands = [held(y, grid) for y in raw.commands]
+        _check_any(measurement.column, before.values, after)
+    commands = [held(y.values, _placed(grid, raw, y)) for y in raw.commands]
     actions = np.stack(commands, -1) if commands else np.zeros((grid.samples - 1, 0))
     trajectory = Trajectory(np.stack(observed, -1), actions, grid.dt, name=log.name, channels=config.channels)
-    return trajectory, report_of(config, log, raw, grid, trajectory)
+    return trajectory, report_of(config, log, sha256, raw, grid, trajectory)
 
 
-def _read_log(config: Config, log: LogEntry) -> Recording:
-    table, clock = read_table(log.file), config.columns.time
-    time = _column(log, table, clock.column)
-    _check_clock(clock.column, time)
+def _placed(grid: Grid, raw: Recording, series: Series) -> Grid:
+    return grid if series.time is raw.time else grid.on_clock(series.time)
+
+
+def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
+    times: dict[str, FloatArray] = {}
+
+    def time_of(column: str) -> FloatArray:
+        """The clock of a column (n,) in s; equal clocks are one array."""
+        name = clock_of(table, column, config.columns.time.column)
+        if name not in times:
+            time = _seconds(config, log, table, name)
+            times[name] = next((other for other in times.values() if np.array_equal(other, time)), time)
+        return times[name]
+
+    def signal(entry: Command | Measurement) -> Series:
+        column = _column(log, table, entry.column)
+        time = time_of(entry.column)
+        values = _fitted(entry.column, column, len(time))
+        return Series(
+            time, entry.sign * entry.factor * convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
+        )
+
+    measurements, commands = [signal(m) for m in config.measurements], [signal(c) for c in config.commands]
+    lead = max((y.time for y, m in zip(measurements, config.measurements, strict=True) if m.fit), key=len)
+    span = _span(log, lead - lead[0])
+    part = _after_commands(config, lead, span, commands)
+    time = (lead - lead[0])[part]
+    late, time = float(time[0] - (lead[span.start] - lead[0])), time - time[0]
+
+    def cut(series: Series, before: bool) -> Series:
+        """Within the part; of another clock, with the last sample before it where that is asked for."""
+        if series.time is lead:
+            return Series(time, series.values[part])
+        own = series.time - lead[part.start]
+        first = int(np.searchsorted(own, 0.0, side="right")) - 1 if before else int(np.searchsorted(own, 0.0))
+        rows = slice(max(first, 0), int(np.searchsorted(own, time[-1], side="right")))
+        return Series(own[rows], series.values[rows])
+
+    for command, series in zip(config.commands, commands, strict=True):
+        if series.time is lead:
+            _check_first_command(command.column, time, series.values[part])
+    for measurement, series in zip(config.measurements, measurements, strict=True):
+        if not cut(series, False).time.size:
+            raise _apart(measurement.column, series.time, lead[part])
+    return Recording(time, [cut(y, True) for y in commands], [cut(y, False) for y in measurements], late)
+
+
+def _seconds(config: Config, log: LogEntry, table: Columns, name: str) -> FloatArray:
+    """A clock of the log (n,) in s, which increases."""
+    clock = config.columns.time
+    time = _column(log, table, name)
+    _check_clock(name, time)
     time = convert(time, clock.unit, "time")
-    time = time - time[0]
-    if "unit" not in clock.model_fields_set and np.median(np.diff(time)) >= _SLOW:
+    period = float(np.median(np.diff(time)))
+    if "unit" not in clock.model_fields_set and period >= _SLOW:
         raise LogError(
-            f"read in seconds, {clock.column!r} is {np.median(np.diff(time)):g} s from row to row; "
+            f"read in seconds, {name!r} is {period:g} s from row to row; "
             'name its unit, such as `columns.time.unit = "ms"`, or "s" if that is right'
         )
-    part = _span(log, time)
+    return time
 
-    def signal(entry: Command | Measurement) -> FloatArray:
-        values = _fitted(entry.column, _column(log, table, entry.column), len(time))[part]
-        return entry.sign * entry.factor * convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
 
-    commands = [signal(c) for c in config.commands]
-    measurements = [signal(m) for m in config.measurements]
-    time = time[part]
-    for command, values in zip(config.commands, commands, strict=True):
-        _check_first_command(command.column, time, values)
-    return Recording(time - time[0], commands, measurements)
+def _after_commands(config: Config, lead: FloatArray, span: slice, commands: list[Series]) -> slice:
+    """The rows of the span from where all commands of other clocks have begun."""
+    first = span.start
+    for command, series in zip(config.commands, commands, strict=True):
+        known = series.time[np.isfinite(series.values)]
+        if not known.size:
+            raise LogError(f"command column {command.column!r} holds no number; choose another column")
+        if series.time is lead:
+            continue
+        first = max(first, int(np.searchsorted(lead, known[0])))
+        if span.stop - first < 2 or known[-1] < lead[0]:
+            raise _apart(command.column, known, lead)
+    return slice(first, span.stop)
+
+
+def _apart(column: str, time: FloatArray, lead: FloatArray) -> LogError:
+    """What to say of a column whose clock (m,) has nothing in common with that of the grid (n,)."""
+    return LogError(
+        f"the clock of {column!r} goes from {time[0]:g} to {time[-1]:g} s, that of the grid from {lead[0]:g} to "
+        f"{lead[-1]:g} s; name one in `columns.time.column` that they share"
+    )
 
 
 def _column(log: LogEntry, table: Columns, name: str) -> FloatArray:
     """One column as numbers (n,)."""
     if name not in table:
         raise LogError(f"no column {name!r} in {log.file.name}; {nearest(name, table)}")
+    values = table[name]
     try:
-        return np.asarray(table[name], dtype=np.float64)
-    except (TypeError, ValueError):
-        row, cell = next((i, value) for i, value in enumerate(table[name], 1) if not _is_cell(value))
-        where = f"column {name!r} holds {cell!r} in row {row}"
-        raise LogError(f"{where}, expected numbers; correct it or leave it blank") from None
+        if values.dtype.kind not in "cV":  # complex numbers and records would lose a part of themselves
+            return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    row, cell = next(((i, value) for i, value in enumerate(values, 1) if not _is_cell(value)), (1, values[:1]))
+    where = f"column {name!r} holds {reprlib.repr(cell)} in row {row}"
+    raise LogError(f"{where}, expected numbers; correct it or leave it blank")
 
 
 def _is_cell(value: object) -> bool:
     try:
         float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False
     return True
 
@@ -161,11 +254,9 @@ def _span(log: LogEntry, time: FloatArray) -> slice:
 
 def _check_first_command(name: str, time: FloatArray, values: FloatArray) -> None:
     known = np.flatnonzero(np.isfinite(values))
-    if not known.size:
-        raise LogError(f"command column {name!r} holds no number; choose another column")
-    if known[0] > 0:
+    if not known.size or known[0] > 0:
         raise LogError(
-            f"command column {name!r} holds no number before {time[known[0]]:g} s, "
+            f"command column {name!r} holds no number before {time[known[0]] if known.size else time[-1]:g} s, "
             "so what drove the actuator is unknown; start `span` there"
         )
 

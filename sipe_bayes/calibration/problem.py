@@ -13,7 +13,7 @@ import torch
 from sipe_bayes.calibration.config import Config, check_dimensions, load_config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.config_tables import LogEntry, overlap
-from sipe_bayes.calibration.logs import load_log
+from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
@@ -128,7 +128,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
 def _read(
     config: Config, logs: Sequence[LogEntry], dimensions: Mapping[str, str]
 ) -> tuple[list[Trajectory], list[LogReport]]:
-    read = [load_log(config, log, dimensions) for log in logs]
+    read = load_logs(config, logs, dimensions)
     return [trajectory for trajectory, _ in read], [report for _, report in read]
 
 

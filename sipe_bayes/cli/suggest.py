@@ -114,7 +114,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
 
 def _read(problem: Problem, file: Path, dt: float) -> Plan:
     """Commands of a table, in the configuration's columns and units, on the logs' grid."""
-    from sipe_bayes.calibration.tables import read_table
+    from sipe_bayes.calibration.readers.tables import read_table
     from sipe_bayes.core.units import to_si
     from sipe_bayes.diagnostics.expected import Plan
 

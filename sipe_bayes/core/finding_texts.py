@@ -213,6 +213,18 @@ class Code(Enum):
     LOG_GAP = note("no measurement from {start:.3f} to {stop:.3f} s; commands are held there")
     LOG_MISSING = note("{channel}: {missing} of {samples} samples missing, masked")
     LOG_BLANK_COMMANDS = note("{channel}: {blank} blank commands, the one before is held")
+    LOG_CLOCKS = note(
+        "{count} of {of} columns have clocks of their own and were put on the grid of the others; the first "
+        "{late:.3g} s, before all commands had begun, are left out"
+    )
+    LOG_COMMAND_ENDS = caution(
+        "{channel}: no command in the last {silent:.3g} s, the one before is held; cut the log there with `span` if "
+        "the controller had stopped"
+    )
+    LOG_SLOW = caution(
+        "{channels} were recorded at {rate}: too slowly to see what friction and delays do, whose estimates will be "
+        "biased; log joints at 100 Hz or more"
+    )
     LOG_CLIPPED = note("{channel}: {clipped} samples stuck at an extreme value, perhaps saturated")
 
     # what went in and what came out

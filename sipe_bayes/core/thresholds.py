@@ -61,6 +61,9 @@ class Thresholds(Options):
     logs_disagree: float = option(
         0.01, "false alarms of logs that agree; rare, since each pair of logs is a chance", "p-value"
     )
+    slow_log: float = option(
+        25.0, "a joint stops, turns round and answers within a hundredth of a second or two: slower logs miss it", "Hz"
+    )
     misfit: float = option(
         0.05, "false alarms of residuals that are noise, and of logs that the prior gives", "p-value"
     )

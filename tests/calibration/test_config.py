@@ -151,7 +151,7 @@ WRONG: list[tuple[str, str, str]] = [
     ('"a.csv"', '"a.csv"\nspan = [1, 1]', r"`logs\[0\].span`: .*low < high"),
     ('"a.csv"', '"a.csv"\nspan = [-1, 1]', r"`logs\[0\].span`: starts before the log"),
     ('"b.csv"', '"c/a.csv"', r"`logs\[1\].name`: .*got 'a' also at logs\[0\]"),
-    ('"b.csv"', '"a.csv"\nname = "b"', r"`logs\[1\].use`: held out, but its samples also train as log 'a'"),
+    ('"b.csv"', '"a.csv"\nname = "b"', r"`logs\[1\].use`: held out, but samples of it train as log 'a'"),
     ("[0.1, 1.0]", "[1.0, 0.1]", r"`parameters\[0\].bounds`: reversed, got \[1, 0.1\]; swap to \[0.1, 1\]"),
     ("[0.1, 1.0]", '["0.1", 1.0]', r"`parameters\[0\].bounds\[0\]`: .*got '0.1'"),
     ("[0.1, 1.0]", "[0.1]", r"`parameters\[0\].bounds\[1\]`: missing"),

@@ -14,7 +14,7 @@ from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.log_report import count_clipped
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.readers.base import LogError
-from sipe_bayes.calibration.tables import read_table
+from sipe_bayes.calibration.readers.tables import read_table
 from tests.problems.log_tables import EXAMPLES, FAST, QUIET, TOML, configure, load, regular, write
 
 finite = st.floats(-1e6, 1e6, allow_subnormal=False)
@@ -202,7 +202,7 @@ def test_npz_matrices_and_actions_one_shorter(tmp_path: Path) -> None:
     write(tmp_path / "log.npz", columns)
     (tmp_path / "m.xml").write_text("<mujoco/>")
     text = TOML.format(window=0.1, resample="", measurements="", log="", file="log.npz")
-    (tmp_path / "run.toml").write_text(text.replace('"u"', '"acts:0"').replace('"q"', '"states:1"'))
+    (tmp_path / "run.toml").write_text(text.replace('"u"', '"acts[0]"').replace('"q"', '"states[1]"'))
     config = load_config(tmp_path / "run.toml")
     trajectory, report = load_log(config, config.logs[0])
     np.testing.assert_array_equal(trajectory.observations[:, 0], columns["states"][:, 1])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sipe_bayes.calibration.readers.base import LogError
-from sipe_bayes.calibration.tables import read_table
+from sipe_bayes.calibration.readers.tables import read_table
 from tests.problems.log_tables import QUIET, load, regular, write
 
 
@@ -45,7 +45,7 @@ WRONG: list[tuple[dict[str, Any], dict[str, str], str]] = [
     (edited(), {"resample": "rate = 1.0"}, "lasts 0.49 s, shorter than one control step of 1 s"),
     ({"t": [0.0], "q": [0.0], "u": [0.0]}, {}, "expected at least 2 samples, got 1"),
     ({"t": [], "q": [], "u": []}, {}, "holds no samples"),
-    ({"time": regular()["t"], "tt": nan50}, {}, r"no column 't' in log.npz; did you mean 'tt'"),
+    ({"time": regular()["t"], "tt": nan50, "q": half, "u": half}, {}, r"no column 't' in log.npz; did you mean 'tt'"),
     (
         {"t": regular()["t"], "u": nan50, "angle": nan50},
         {},

@@ -14,7 +14,7 @@ NAMES = {
     "sipe_bayes/inference/base.py": ("class Estimator", "def start(", "def step(", "def posterior("),
     "sipe_bayes/inference/registry.py": ("ESTIMATORS = {",),
     "sipe_bayes/inference/laplace/levenberg_marquardt.py": ("class DampingRule", "def after("),
-    "sipe_bayes/calibration/tables.py": ("READERS:",),
+    "sipe_bayes/calibration/readers/tables.py": ("READERS:",),
     "sipe_bayes/calibration/readers/base.py": ("class LogReader",),
     "sipe_bayes/envs/task.py": ("class Task(",),
     "sipe_bayes/core/finding_texts.py": ("class Code", "TEXTS"),

@@ -30,7 +30,7 @@ from sipe_bayes.calibration.config_tables import (
     Structure,
     TimeColumn,
 )
-from sipe_bayes.calibration.tables import READERS
+from sipe_bayes.calibration.readers.tables import READERS
 from sipe_bayes.core.units import UNITS
 from sipe_bayes.diagnostics.catalogue import tasks
 from sipe_bayes.envs.sensing import NEUTRAL
@@ -242,7 +242,10 @@ def test_readme_explains_every_key() -> None:
 
 
 def test_readme_lists_every_format_of_logs() -> None:
-    assert set(re.findall(r"\.[a-z]+\b", rows("Configuration")["logs.file"].split("|", 2)[2])) == set(READERS)
+    listed = {kind: line.split("|")[-2].strip(" `[]") for kind, line in rows("Logs").items()}
+    assert listed == {kind: format.extra for kind, format in READERS.items()}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert set(listed.values()) - {""} <= set(project["optional-dependencies"])
 
 
 def test_readme_lists_every_unit() -> None:

@@ -1,1 +1,1 @@
-"""Log readers: one file for each format; ``sipe_bayes.calibration.tables`` lists them."""
+"""Log readers: one file for each format; ``sipe_bayes.calibration.readers.tables`` lists them."""

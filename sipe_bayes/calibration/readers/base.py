@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -13,6 +15,12 @@ if TYPE_CHECKING:
 
 Columns = dict[str, NDArray[np.generic]]
 
+LARGEST = 2**30
+"""Bytes of a log's columns together: a header that claims more is not believed, and nothing is allocated for it."""
+
+WIDEST = 512
+"""Columns of one array: a wider one is a picture or a map, which is no column of a log."""
+
 
 class LogError(ValueError):
     """A log that cannot be used; the message is one line with the log, the value and the remedy."""
@@ -22,23 +30,63 @@ class LogReader(Protocol):
     """Reads one format.
 
     A reader gives the columns of a file as it finds them: one-dimensional, of any type, in the file's units; which of
-    them are commands, measurements and time, and whether they are fit to be used, is checked by those who ask.
+    them are commands, measurements and time, and whether they are fit to be used, is checked by those who ask. An array
+    ``q`` of two dimensions, (n, k), has the columns ``q[0]`` to ``q[k-1]``, or ``q[NAME]`` where the file names them.
+    It runs nothing that the file holds, and asks ``check_size`` before it believes a header.
     """
 
-    def __call__(self, path: Path) -> Columns:
+    def __call__(self, path: Path, wanted: Collection[str]) -> Columns:
         """Read a file.
 
         Args:
-            path: a file that exists and has the reader's suffix.
+            path: a file or folder that exists and is of the reader's format.
+            wanted: columns that will be asked for, none for all. What has nothing to do with them may be left out.
 
         Returns:
             The columns by name, each (n,); they may differ in length.
 
         Raises:
             LogError: the file cannot be used and the reader can say why.
-            ValueError: what a library says of a file that it cannot read; ``read_table`` words it.
+            Exception: what a library says of a file that it cannot read; ``read_table`` words it.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of logs.
+
+    Args:
+        read: its reader.
+        extra: the extra of this package that brings the library it needs; none where the package itself does.
+    """
+
+    read: LogReader
+    extra: str = ""
+
+
+def check_size(path: Path, size: int) -> None:
+    """Refuse a file whose columns would be larger than ``LARGEST``; size in bytes, as it claims them."""
+    if size > LARGEST:
+        claims = f"claims {size / 2**30:.3g} GiB of columns, the most is {LARGEST / 2**30:g}"
+        raise LogError(f"{path}: {claims}; cut it into shorter logs, or leave out what is not needed")
+
+
+def spread(name: str, values: NDArray[np.generic], labels: Sequence[str] = ()) -> Columns:
+    """The columns of an array.
+
+    Args:
+        name: of the array.
+        values: (n,) or (n, k); of any other shape, or with k above ``WIDEST``, it has none.
+        labels: k names, all different; otherwise the columns are numbered.
+    """
+    if values.ndim == 1:
+        return {name: plain(values)}
+    if values.ndim != 2 or values.shape[1] > WIDEST:
+        return {}
+    width = values.shape[1]
+    words = labels if len(set(labels)) == len(labels) == width else range(width)
+    return {f"{name}[{word}]": plain(values[:, j]) for j, word in enumerate(words)}
 
 
 def frame_columns(frame: pandas.DataFrame) -> Columns:
@@ -49,5 +97,5 @@ def frame_columns(frame: pandas.DataFrame) -> Columns:
 def plain(values: NDArray[np.generic]) -> NDArray[np.generic]:
     """Dates as seconds from the first one; everything else as it is."""
     if values.dtype.kind == "M":
-        return (values - values[0]) / np.timedelta64(1, "s")
+        values = np.subtract(values, values[:1])
     return np.divide(values, np.timedelta64(1, "s")) if values.dtype.kind == "m" else values

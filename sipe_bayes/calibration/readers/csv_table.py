@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
-from sipe_bayes.calibration.readers.base import Columns, LogError, frame_columns
+from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, frame_columns
+
+_LONGEST = 2**17  # characters of a header or a name: what the csv module takes
 
 
-def read_csv(path: Path) -> Columns:
+def read_csv(path: Path, wanted: Collection[str]) -> Columns:
     """The columns; a comma is the decimal sign where semicolons separate."""
     import pandas as pd
 
+    check_size(path, path.stat().st_size)
     with path.open(encoding="utf-8-sig", newline="") as file:
-        header, first = file.readline().rstrip("\r\n"), file.readline()
+        header, first = file.readline(_LONGEST).rstrip("\r\n"), file.readline(_LONGEST)
+    if len(header) >= _LONGEST - 2:
+        raise LogError(f"{path}: the first line is longer than {_LONGEST} characters; is it a table of columns?")
     separator = _separator(header)
     names = [name.strip() for name in _split(header.lstrip("# "), separator)]
     if any(_is_number(name) for name in names):

@@ -1,0 +1,94 @@
+"""Tables of a log: the columns of a file by name, whatever its format."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from sipe_bayes.calibration.config_fields import nearest_file
+from sipe_bayes.calibration.readers.base import Columns, Format, LogError
+from sipe_bayes.calibration.readers.csv_table import read_csv
+from sipe_bayes.calibration.readers.hdf5_file import read_hdf5
+from sipe_bayes.calibration.readers.lerobot import INFO, read_lerobot
+from sipe_bayes.calibration.readers.matlab import read_matlab
+from sipe_bayes.calibration.readers.npz_arrays import read_npz
+from sipe_bayes.calibration.readers.parquet_table import read_parquet
+from sipe_bayes.calibration.readers.ros_bag import read_bag
+from sipe_bayes.calibration.readers.ulog import read_ulog
+
+READERS: dict[str, Format] = {
+    ".csv": Format(read_csv),
+    ".parquet": Format(read_parquet),
+    ".npz": Format(read_npz),
+    ".h5": Format(read_hdf5),
+    ".hdf5": Format(read_hdf5),
+    ".mat": Format(read_matlab),
+    INFO: Format(read_lerobot),
+    ".mcap": Format(read_bag, extra="ros"),
+    ".db3": Format(read_bag, extra="ros"),
+    "metadata.yaml": Format(read_bag, extra="ros"),
+    ".ulg": Format(read_ulog, extra="px4"),
+}
+"""The one list of formats: by the suffix of a file, or by the file that tells what a folder is."""
+
+
+def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
+    """The columns of a log's file by name.
+
+    Args:
+        path: a file with a suffix of ``READERS``, or a folder with one of its files.
+        wanted: columns that will be asked for; none for all.
+
+    Returns:
+        The columns, each (n,); they may differ in length.
+
+    Raises:
+        LogError: there is no such file, no reader for it, or nothing in it that can be read.
+    """
+    path = Path(path)
+    kind = _kind(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            columns = READERS[kind].read(path, wanted)
+    except LogError:
+        raise
+    except ModuleNotFoundError as error:
+        needs = f"needs the package {error.name}, which is not installed"
+        raise LogError(f"{path}: {needs}: pip install 'sipe-bayes[{READERS[kind].extra}]'") from None
+    except Exception as error:  # whatever a library makes of a file that is not what it says
+        raise LogError(f"{path}: cannot be read as {kind} ({_reason(error)}); write it anew") from error
+    if not columns or not max(len(values) for values in columns.values()):
+        raise LogError(f"{path}: holds no samples; record the log again or drop it")
+    return columns
+
+
+def _kind(path: Path) -> str:
+    """The key of ``READERS`` for a path."""
+    if path.is_dir():
+        folders = [kind for kind in READERS if not kind.startswith(".")]
+        found = next((kind for kind in folders if (path / kind).is_file()), None)
+        if found is None:
+            raise LogError(f"{path}: a folder without {_one_of(folders)}; name the log's file")
+        return found
+    if not path.is_file():
+        raise LogError(f"{path}: no such file; {nearest_file(path)}")
+    if path.suffix.lower() not in READERS:
+        suffixes = _one_of(kind for kind in READERS if kind.startswith("."))
+        raise LogError(f"{path}: expected a {suffixes} file, got {path.suffix!r}; convert it")
+    return path.suffix.lower()
+
+
+def _one_of(words: Iterable[str]) -> str:
+    *others, last = words
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _reason(error: Exception) -> str:
+    """One line of an exception, which may have no words of its own."""
+    text = " ".join(str(error).split())
+    short = text if len(text) <= 200 else f"{text[:197]}..."
+    if isinstance(error, MemoryError):
+        return "more than the memory holds"
+    return short if short and isinstance(error, OSError | ValueError | EOFError) else f"{type(error).__name__} {short}"
