@@ -92,7 +92,7 @@ class Config(Table):
         _check_unique("commands", "actuator", [c.actuator for c in self.commands])
         _check_unique("measurements", "name", self.channels)
         _check_unique("measurements", "target", [m.target for m in self.measurements])
-        _check_unique("logs", "name", [log.name for log in self.logs])
+        _check_unique("logs", "name", [log.name for log in self.logs if log.episodes is None])
         _check_unique("parameters", "name", [p.name for p in self.parameters])
         self._check_likelihood()
         self._check_targets()

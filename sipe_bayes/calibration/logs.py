@@ -40,6 +40,7 @@ from sipe_bayes.core.units import convert
 from sipe_bayes.diagnostics.records import LogReport
 
 _SLOW = 0.25  # s from row to row: no robot is logged so slowly without its being meant
+_SHORTEST, _LONGEST = 1e-9, 1e9  # s, of a step and of a log: beyond, a clock holds no times
 _EMPTY = 1000  # grid samples for each of the log: a pause, or a wrong unit of time
 
 
@@ -158,7 +159,9 @@ def _seconds(config: Config, log: LogEntry, table: Columns, name: str) -> FloatA
     time = _column(log, table, name)
     _check_clock(name, time)
     time = convert(time, clock.unit, "time")
-    period = float(np.median(np.diff(time)))
+    period, duration = float(np.median(np.diff(time))), float(time[-1]) - float(time[0])
+    if not (period >= _SHORTEST and duration <= _LONGEST):
+        raise LogError(f"{name!r} goes on for {duration:g} s in steps of {period:g} s; correct the clock or its unit")
     if "unit" not in clock.model_fields_set and period >= _SLOW:
         raise LogError(
             f"read in seconds, {name!r} is {period:g} s from row to row; "
@@ -206,6 +209,8 @@ def _column(log: LogEntry, table: Columns, name: str) -> FloatArray:
 
 
 def _is_cell(value: object) -> bool:
+    if isinstance(value, complex | np.complexfloating):
+        return False
     try:
         float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):

@@ -59,10 +59,12 @@ class Format:
     Args:
         read: its reader.
         extra: the extra of this package that brings the library it needs; none where the package itself does.
+        remedy: what to do about a file that is broken.
     """
 
     read: LogReader
     extra: str = ""
+    remedy: str = "write it anew"
 
 
 def check_size(path: Path, size: int) -> None:

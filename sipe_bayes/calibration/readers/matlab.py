@@ -19,8 +19,8 @@ from sipe_bayes.calibration.readers.base import LARGEST, Columns, LogError, chec
 
 _HEADER = 128  # bytes before the first element
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
-_CELL, _STRUCT, _OBJECT, _SPARSE, _OPAQUE = 1, 2, 3, 5, 17  # classes of matrices
-_OBJECTS = ("object", "function", "opaque")
+_CELL, _STRUCT, _OBJECT, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 5, 16, 17  # classes of matrices
+_OBJECTS = (_OBJECT, _FUNCTION, _OPAQUE)
 _DEEPEST = 32  # cells in cells
 _VISIT = 4096  # bytes that each dataset counts for at least, so that cells which hold one another come to an end
 
@@ -41,12 +41,11 @@ def read_matlab(path: Path, wanted: Collection[str]) -> Columns:
 
 
 def _version_5(path: Path) -> tuple[Columns, list[str]]:
-    from scipy.io import loadmat, whosmat
+    from scipy.io import loadmat
 
-    _check_elements(path)
-    kinds = {name: kind for name, _, kind in whosmat(path)}
+    kinds = dict(_variables(path))
     objects = [name for name, kind in kinds.items() if kind in _OBJECTS]
-    names = [name for name in kinds if name not in objects]
+    names = [name for name in kinds if name and name not in objects]
     found = loadmat(path, variable_names=names, simplify_cells=True) if names else {}
     columns: Columns = {}
     for name in names:
@@ -69,8 +68,8 @@ def _leaves(name: str, value: object, depth: int) -> Iterator[tuple[str, NDArray
         yield name, value
 
 
-def _check_elements(path: Path) -> None:
-    """Refuse a file whose elements claim more than it holds."""
+def _variables(path: Path) -> Iterator[tuple[str, int]]:
+    """Name and class of each variable; refuses a file whose elements claim more than it holds."""
     data = path.read_bytes()
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None or data[:4].count(0):
@@ -88,19 +87,21 @@ def _check_elements(path: Path) -> None:
             check_size(path, total)
             kind, body = struct.unpack_from(f"{order}I", body)[0], body[8:]
         if kind == _MATRIX:
-            _check_matrix(path, memoryview(body), order, 0)
+            yield _check_matrix(path, memoryview(body), order, 0)
         position += 8 + size
 
 
-def _check_matrix(path: Path, body: memoryview, order: str, depth: int) -> None:
-    """Refuse a matrix, or one within it, whose dimensions are more than its bytes."""
+def _check_matrix(path: Path, body: memoryview, order: str, depth: int) -> tuple[str, int]:
+    """Name and class of a matrix; refuses one that, or one within which, has dimensions beyond its bytes."""
     if depth > _DEEPEST:
         raise LogError(f"{path}: cells and structs are nested more than {_DEEPEST} deep; save the numbers as variables")
     elements = list(_elements(path, body, order))
     if len(elements) < 3:
-        return
+        return "", 0
     kind = elements[0][1][0] if order == "<" else elements[0][1][3]
-    lengths = np.frombuffer(elements[1][1], f"{order}i4").tolist() if kind != _OPAQUE else []
+    opaque = kind in (_FUNCTION, _OPAQUE)  # which have no dimensions
+    lengths = [] if opaque else np.frombuffer(elements[1][1], f"{order}i4").tolist()
+    name = bytes(elements[1 if opaque else 2][1]).decode("latin1")
     inside = [part for what, part in elements[3:] if what == _MATRIX]
     count = 1
     for length in lengths:
@@ -110,6 +111,7 @@ def _check_matrix(path: Path, body: memoryview, order: str, depth: int) -> None:
         raise LogError(f"{path}: a variable claims the size {lengths}, more than it holds; save it anew")
     for part in inside:
         _check_matrix(path, part, order, depth + 1)
+    return name, kind
 
 
 def _elements(path: Path, body: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,8 @@ from sipe_bayes.calibration.readers.base import Columns, check_size, frame_colum
 
 if TYPE_CHECKING:
     import pyarrow
+
+_ROWS = 2**16  # read at once, so that a file is refused before it has filled the memory
 
 
 def read_parquet(path: Path, wanted: Collection[str]) -> Columns:
@@ -27,7 +30,10 @@ def parquet_columns(path: Path, files: Sequence[Path], labels: Mapping[str, Sequ
     """
     import pyarrow as pa
 
-    table = pa.concat_tables([_table(path, file) for file in files])
+    tables: list[pyarrow.Table] = []
+    for file in files:
+        tables.append(_table(path, file, sum(table.nbytes for table in tables)))
+    table = pa.concat_tables(tables)
     columns: Columns = {}
     for name in table.column_names:
         column = table.column(name)
@@ -38,19 +44,28 @@ def parquet_columns(path: Path, files: Sequence[Path], labels: Mapping[str, Sequ
     return columns
 
 
-def _table(path: Path, file: Path) -> pyarrow.Table:
-    """One file without pictures and other columns that hold no numbers."""
+def _table(path: Path, file: Path, size: int) -> pyarrow.Table:
+    """One file without pictures and other columns that hold no numbers; size in bytes of the files before it."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(file) as source:
+    with _naming(file), pq.ParquetFile(file) as source:
         names = [field.name for field in source.schema_arrow if _is_kept(field.type)]
-        about = source.metadata
-        groups = (about.row_group(i) for i in range(about.num_row_groups))
-        chunks = (group.column(j) for group in groups for j in range(about.num_columns))
-        check_size(
-            path, sum(8 * chunk.num_values for chunk in chunks if chunk.path_in_schema.split(".list")[0] in names)
-        )
-        return source.read(columns=names).select(names)
+        batches = []
+        for batch in source.iter_batches(_ROWS, columns=names):
+            size += batch.nbytes
+            check_size(path, size)
+            batches.append(batch.select(names))
+        return pa.Table.from_batches(batches, pa.schema([source.schema_arrow.field(name) for name in names]))
+
+
+@contextmanager
+def _naming(file: Path) -> Iterator[None]:
+    """Says which of several files an error is of."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise type(error)(f"{file.name}: {error}") from None
 
 
 def _is_kept(kind: pyarrow.DataType) -> bool:

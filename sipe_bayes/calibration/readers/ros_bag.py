@@ -1,7 +1,7 @@
 """ROS 2 bags and MCAP: numbers by topic and field, ``/joint_states.position[elbow]``, ``/effort.data[0]``.
 
 Beside its fields each topic has two clocks in seconds from the first message that is read: ``time``, when the recorder
-got the message, and ``stamp``, its header's stamp, or ``time`` where it has no header.
+got the message, and ``stamp``, its header's stamp, or ``time`` where no message of the topic has one.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ def read_bag(path: Path, wanted: Collection[str]) -> Columns:
     """The numbers of the topics that are wanted."""
     from rosbags.rosbag2 import Reader
 
+    _check_databases(path)
     topics: dict[str, _Topic] = {}
     with Reader(path) as bag:
         connections = list(_connections(path, bag.connections, wanted))
@@ -52,6 +53,19 @@ def _connections(path: Path, all_of_them: Collection[Connection], wanted: Collec
     for one in all_of_them:
         if not wanted or any(name.startswith(f"{one.topic}.") for name in wanted):
             yield one
+
+
+def _check_databases(path: Path) -> None:
+    """Refuse a database in which a name stands for a computation: a recording has tables of its own, no views."""
+    import apsw
+
+    for file in [path] if path.is_file() else sorted(path.glob("*.db3")):
+        if file.suffix != ".db3":
+            continue
+        database = apsw.Connection(str(file), flags=apsw.SQLITE_OPEN_READONLY)
+        for kind, name, text in database.execute("SELECT type, name, sql FROM sqlite_master"):
+            if kind not in ("table", "index") or "virtual" in str(text).lower():
+                raise LogError(f"{file}: {name!r} is no plain table, which a recording does not have; record it again")
 
 
 def _types(connection: Connection) -> Mapping[str, Fields]:
@@ -85,7 +99,7 @@ class _Topic:
         """A message; received in ns."""
         row = len(self.received)
         self.received.append(received)
-        self.stamps.append(message.stamp or received)
+        self.stamps.append(message.stamp)
         for name, value in message.numbers.items():
             column = self.numbers.setdefault(name, array("d"))
             column.extend([np.nan] * (row - len(column)))
@@ -94,7 +108,8 @@ class _Topic:
     def columns(self, first: int) -> Columns:
         """Each (n,), times from ``first`` in ns."""
         rows = len(self.received)
-        found: Columns = {"time": _seconds(self.received, first), "stamp": _seconds(self.stamps, first)}
+        stamps = self.stamps if any(self.stamps) else self.received
+        found: Columns = {"time": _seconds(self.received, first), "stamp": _seconds(stamps, first)}
         for name, column in self.numbers.items():
             found[name] = np.append(np.array(column), np.full(rows - len(column), np.nan))
         return found

@@ -46,7 +46,7 @@ class Message:
         if len(data) < 4 or data[0] or data[1] > 1:
             raise ValueError("a message is not encoded as plain CDR")
         self.numbers: dict[str, float] = {}
-        self.stamp: int | None = None  # ns, of the header
+        self.stamp = 0  # ns, of the header
         self._types, self._order = types, "<" if data[1] else ">"
         self._data, self._position, self._fields = memoryview(data)[4:], 0, 0
         self._structure(kind, "")

@@ -17,6 +17,8 @@ from sipe_bayes.calibration.readers.parquet_table import read_parquet
 from sipe_bayes.calibration.readers.ros_bag import read_bag
 from sipe_bayes.calibration.readers.ulog import read_ulog
 
+_BAG = Format(read_bag, "ros", "mend it with `mcap recover` or `ros2 bag reindex`, or record it again")
+
 READERS: dict[str, Format] = {
     ".csv": Format(read_csv),
     ".parquet": Format(read_parquet),
@@ -25,10 +27,10 @@ READERS: dict[str, Format] = {
     ".hdf5": Format(read_hdf5),
     ".mat": Format(read_matlab),
     INFO: Format(read_lerobot),
-    ".mcap": Format(read_bag, extra="ros"),
-    ".db3": Format(read_bag, extra="ros"),
-    "metadata.yaml": Format(read_bag, extra="ros"),
-    ".ulg": Format(read_ulog, extra="px4"),
+    ".mcap": _BAG,
+    ".db3": _BAG,
+    "metadata.yaml": _BAG,
+    ".ulg": Format(read_ulog, "px4"),
 }
 """The one list of formats: by the suffix of a file, or by the file that tells what a folder is."""
 
@@ -58,7 +60,7 @@ def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
         needs = f"needs the package {error.name}, which is not installed"
         raise LogError(f"{path}: {needs}: pip install 'sipe-bayes[{READERS[kind].extra}]'") from None
     except Exception as error:  # whatever a library makes of a file that is not what it says
-        raise LogError(f"{path}: cannot be read as {kind} ({_reason(error)}); write it anew") from error
+        raise LogError(f"{path}: cannot be read as {kind} ({_reason(error)}); {READERS[kind].remedy}") from error
     if not columns or not max(len(values) for values in columns.values()):
         raise LogError(f"{path}: holds no samples; record the log again or drop it")
     return columns
