@@ -174,7 +174,11 @@ def _episodes(path: Path, config: Config) -> tuple[LogEntry, ...]:
             logs.append(log)
             continue
         numbers = episodes_of(log.file, column) if log.episodes is None else log.episodes
-        logs += [log.model_copy(update={"name": f"{log.name}-{n}", "episodes": (n,)}) for n in numbers]
+        own = log.episodes is not None and len(log.episodes) == 1 and log.name != log.file.stem
+        names = [log.name if own else f"{log.name}-{n}" for n in numbers]
+        logs += [
+            log.model_copy(update={"name": name, "episodes": (n,)}) for name, n in zip(names, numbers, strict=True)
+        ]
     ((name, count),) = Counter(log.name for log in logs).most_common(1)
     if count > 1:
         raise ConfigError(f"{path}: key `logs`: {count} logs are called {name!r}; give each file a `name`")

@@ -124,9 +124,8 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         column = _column(log, table, entry.column)
         time = time_of(entry.column)
         values = _fitted(entry.column, column, len(time))
-        return Series(
-            time, entry.sign * entry.factor * convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
-        )
+        values = convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
+        return Series(time, entry.sign * entry.factor * values)
 
     measurements, commands = [signal(m) for m in config.measurements], [signal(c) for c in config.commands]
     lead = max((y.time for y, m in zip(measurements, config.measurements, strict=True) if m.fit), key=len)

@@ -204,6 +204,8 @@ def test_episodes_are_held_out_by_number(tmp_path: Path) -> None:
     config = many(tmp_path, episodes(), tables)
     uses = [(log.name, log.use) for log in config.logs]
     assert uses == [("log-7", "train"), ("log-5", "train"), ("log-3", "holdout")]
+    named = many(tmp_path, episodes(), tables.replace("[3]", '[3]\nname = "last"'))
+    assert [log.name for log in named.logs] == ["log-7", "log-5", "last"]
     with pytest.raises(ConfigError, match=r"held out, but samples of it train as log"):
         many(tmp_path, episodes(), tables.replace("[3]", "[5]"))
 
