@@ -19,6 +19,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
+from sipe_bayes.likelihood.starts import velocity_columns
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
@@ -48,12 +49,9 @@ def measured_starts(windows: Windows, theta: FloatArray) -> FloatArray:
 
 
 def _tangents(model: mujoco.MjModel) -> dict[int, int]:
-    """Column of the physics state -> column of a start, for hinge and slide joints."""
+    """Column of the physics state -> column of a start, but of a quaternion's numbers."""
     columns = {1 + model.nq + dof: model.nv + dof for dof in range(model.nv)}
-    for joint in range(model.njnt):
-        if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            columns[1 + int(model.jnt_qposadr[joint])] = int(model.jnt_dofadr[joint])
-    return columns
+    return columns | {position: velocity - 1 - model.nq for position, velocity in velocity_columns(model).items()}
 
 
 def errors(windows: Windows, theta: FloatArray) -> FloatArray:

@@ -207,7 +207,7 @@ class _Residuals:
         windows = self.windows
         pulls = Pulls(self.inner, np.zeros(moments.num_theta), windows.start_precision, windows.no_starts(), self.free)
         span = float(windows.dt.min()), windows.trajectories.longest
-        return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span)
+        return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span, windows.scales)
 
     def _arrow(self, moments: Moments, noise: Noise) -> Eliminated:
         windows = self.windows

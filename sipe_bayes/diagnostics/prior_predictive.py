@@ -16,6 +16,7 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
@@ -112,12 +113,13 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
 
 
 def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
-    """Observations (R, T+1, O) of the logs at draws of the prior."""
+    """Observations (R, T+1, O) of the logs at draws of the prior, orientations written near the logs' own."""
     replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
     thetas = prior.sample((_OPTIONS.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()
     batches = np.array_split(thetas, max(1, _OPTIONS.simulations // _OPTIONS.batch))
     made = (one for batch in batches for one in replicas.many(batch, rng, estimated=True))
-    return [one.observations for one in made if one is not None]
+    rotations, seen = windows.simulator.environment.rotations, windows.trajectories.observations
+    return [written_near(one.observations, seen, rotations) for one in made if one is not None]
 
 
 def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:

@@ -25,6 +25,8 @@ from sipe_bayes.envs.sensing import Sensing
 if TYPE_CHECKING:
     import mujoco
 
+    from sipe_bayes.envs.poses import PoseReading
+
 START_SD = (10.0, 100.0, 10.0)  # position, velocity, activation: far wider than any measurement
 _CONTROL = 1 << 6  # mjSTATE_CTRL, without importing mujoco here
 
@@ -43,6 +45,8 @@ class Environment(ABC):
     kinematic: bool = False  # a stepwise environment's sensors feel no forces: read without contacts and constraints
     memory_size: int = 0  # M, columns of a stepwise environment's states behind MuJoCo's own
     goal_size: int = 0  # G
+    rotations: tuple[tuple[int, int, int], ...] = ()  # channels that are together a rotation vector (rad)
+    poses: tuple[PoseReading, ...] = ()  # what the channels tell of free and ball joints
 
     @property
     def control_spec(self) -> int:

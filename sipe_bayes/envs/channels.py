@@ -11,9 +11,20 @@ import numpy as np
 
 from sipe_bayes.envs.targets import TargetError, named
 
+_AXES = ("x", "y", "z")
+_QUANTITIES = {  # of a body, in the world's axes: the sensor that reads it, and its unit
+    "position": (mujoco.mjtSensor.mjSENS_FRAMEPOS, "m"),
+    "orientation": (mujoco.mjtSensor.mjSENS_FRAMEQUAT, "rad"),
+    "linear_velocity": (mujoco.mjtSensor.mjSENS_FRAMELINVEL, "m/s"),
+    "angular_velocity": (mujoco.mjtSensor.mjSENS_FRAMEANGVEL, "rad/s"),
+}
 _CHANNEL = re.compile(
-    r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity)|sensor:(?P<sensor>[^\[\]]+)(?:\[(?P<item>\d+)\])?)$"
+    r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity)"
+    rf"|(?P<body>body:[^\[\]]+\.(?P<quantity>{'|'.join(_QUANTITIES)}))(?:\[(?P<axis>[0-2])\])?"
+    r"|sensor:(?P<turned>[^\[\]]+)\.rotation\[(?P<turn>[0-2])\]"
+    r"|sensor:(?P<sensor>[^\[\]]+)(?:\[(?P<item>\d+)\])?)$"
 )
+_TURNS = (mujoco.mjtSensor.mjSENS_FRAMEQUAT, mujoco.mjtSensor.mjSENS_BALLQUAT)
 
 _SENSOR_UNITS = {
     "rad": (mujoco.mjtSensor.mjSENS_JOINTPOS,),
@@ -42,7 +53,10 @@ class Channel:
     """One measured quantity.
 
     Args:
-        target: ``joint:NAME.position``, ``joint:NAME.velocity`` or ``sensor:NAME[i]``.
+        target: ``joint:NAME.position``, ``joint:NAME.velocity``, ``sensor:NAME[i]``, or of a body's frame in the
+            world's axes ``body:NAME.position``, ``.orientation``, ``.linear_velocity``, ``.angular_velocity``, three
+            channels ``[i]`` each. An orientation, ``body:NAME.orientation[i]`` or ``sensor:NAME.rotation[i]`` of a
+            sensor that gives a quaternion, is a rotation vector (rad).
         name: what it is called; default the target.
         unit: filled in from the model.
     """
@@ -59,11 +73,67 @@ class Channel:
 
 @dataclass(frozen=True)
 class Reader:
-    """Where a channel is found: column ``index`` of the sensordata (``derived``) or of the physics state."""
+    """Where a channel is found: column ``index`` of the sensordata (``derived``) or of the physics state.
+
+    ``turn``: which number of the rotation vector whose quaternion begins there, for an orientation.
+    """
 
     index: int
     derived: bool
     unit: str
+    turn: int | None = None
+
+
+def is_rotation(channel: Channel) -> bool:
+    """Whether a channel is one number of a rotation vector."""
+    match = _CHANNEL.match(channel.target)
+    return match is not None and (match["quantity"] == "orientation" or match["turned"] is not None)
+
+
+def components(target: str, name: str, quaternion: bool = False) -> list[Channel]:
+    """The three channels of a vector, or of an orientation that comes as a quaternion; NAME_x, NAME_y, NAME_z."""
+    part = f"{target}.rotation" if quaternion and target.startswith("sensor:") else target
+    return [Channel(f"{part}[{i}]", name and f"{name}_{axis}") for i, axis in enumerate(_AXES)]
+
+
+def rotation_triples(channels: Sequence[Channel]) -> tuple[tuple[int, int, int], ...]:
+    """Places of the rotation vectors; raises TargetError where one of the three numbers is missing."""
+    places = {c.target: k for k, c in enumerate(channels) if is_rotation(c)}
+    found = []
+    for whole in dict.fromkeys(target.rpartition("[")[0] for target in places):
+        parts = [places.get(f"{whole}[{i}]") for i in range(3)]
+        if None in parts:
+            raise TargetError(f"measurement {whole!r}: an orientation is measured whole; give {whole!r}, without [i]")
+        found.append(tuple(parts))
+    return tuple(found)  # type: ignore[arg-type]
+
+
+def expanded(model: mujoco.MjModel, channel: Channel) -> list[Channel]:
+    """A channel, or where its target stands for a body's vector or for an orientation the three of that."""
+    match = _CHANNEL.match(channel.target)
+    if match and match["body"] and match["axis"] is None:
+        return components(channel.target, channel.name)
+    if match and match["sensor"] and match["item"] is None:
+        sensor = named(model, "sensor", match["sensor"], f"measurement {channel.label!r}")
+        if int(model.sensor_type[sensor]) in map(int, _TURNS):
+            return components(channel.target, channel.name, quaternion=True)
+    return [channel]
+
+
+def add_body_sensors(spec: mujoco.MjSpec, channels: Sequence[Channel]) -> None:
+    """Give a spec the sensors that read what is measured of bodies, called as the targets are."""
+    for channel in channels:
+        match = _CHANNEL.match(channel.target)
+        if not match or not match["body"] or spec.sensor(match["body"]) is not None:
+            continue
+        body = _body_name(match["body"])
+        if spec.body(body) is not None:
+            kind = _QUANTITIES[match["quantity"]][0]
+            spec.add_sensor(name=match["body"], type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body)
+
+
+def _body_name(target: str) -> str:
+    return target.removeprefix("body:").rpartition(".")[0]
 
 
 def reader_of(model: mujoco.MjModel, channel: Channel) -> Reader:
@@ -72,13 +142,21 @@ def reader_of(model: mujoco.MjModel, channel: Channel) -> Reader:
     match = _CHANNEL.match(channel.target)
     if not match:
         raise TargetError(
-            f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, sensor:NAME[i]"
+            f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, "
+            f"sensor:NAME[i], {', '.join(f'body:NAME.{q}' for q in _QUANTITIES)}"
         )
+    if match["body"]:
+        return _of_body(model, match, where)
+    if match["turned"]:
+        return _of_turn(model, match["turned"], int(match["turn"]), where)
     if match["joint"]:
         joint = named(model, "joint", match["joint"], where)
         hinge = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
         if not hinge and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_SLIDE):
-            raise TargetError(f"{where}: joint {match['joint']!r} is neither hinge nor slide; measure it by a sensor")
+            raise TargetError(
+                f"{where}: joint {match['joint']!r} is neither hinge nor slide; measure its body: "
+                "body:NAME.position, body:NAME.orientation"
+            )
         if match["what"] == "position":
             return Reader(1 + int(model.jnt_qposadr[joint]), False, "rad" if hinge else "m")
         return Reader(1 + model.nq + int(model.jnt_dofadr[joint]), False, "rad/s" if hinge else "m/s")
@@ -91,10 +169,28 @@ def reader_of(model: mujoco.MjModel, channel: Channel) -> Reader:
     return Reader(int(model.sensor_adr[sensor]) + item, True, _sensor_unit(model, sensor))
 
 
+def _of_body(model: mujoco.MjModel, match: re.Match[str], where: str) -> Reader:
+    named(model, "body", _body_name(match["body"]), where)
+    address = int(model.sensor_adr[named(model, "sensor", match["body"], where)])
+    axis, unit = int(match["axis"] or 0), _QUANTITIES[match["quantity"]][1]
+    if match["quantity"] == "orientation":
+        return Reader(address, True, unit, axis)
+    return Reader(address + axis, True, unit)
+
+
+def _of_turn(model: mujoco.MjModel, name: str, turn: int, where: str) -> Reader:
+    sensor = named(model, "sensor", name, where)
+    if int(model.sensor_type[sensor]) not in map(int, _TURNS):
+        raise TargetError(f"{where}: sensor {name!r} gives no quaternion; write sensor:{name}, without .rotation")
+    return Reader(int(model.sensor_adr[sensor]), True, "rad", turn)
+
+
 def state_column(model: mujoco.MjModel, reader: Reader) -> int | None:
     """The column of the physics state that a reader's quantity is, if it is one."""
     if not reader.derived:
         return reader.index
+    if reader.turn is not None:
+        return None
     sensor = int(np.flatnonzero(model.sensor_adr == reader.index)[0]) if reader.index in model.sensor_adr else -1
     kind, joint = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
     if sensor >= 0 and kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
@@ -116,10 +212,11 @@ def check_sensors(model: mujoco.MjModel, channels: Sequence[Channel]) -> None:
     """Raises TargetError for sensors that do not read the present state, which no window could start from."""
     for channel in channels:
         match = _CHANNEL.match(channel.target)
-        if match and match["sensor"]:
-            sensor = named(model, "sensor", match["sensor"], f"measurement {channel.label!r}")
+        name = match and (match["sensor"] or match["turned"])
+        if name:
+            sensor = named(model, "sensor", name, f"measurement {channel.label!r}")
             if model.sensor_delay[sensor] > 0 or model.sensor_interval[sensor, 0] > 0:
                 raise TargetError(
-                    f"measurement {channel.label!r}: sensor {match['sensor']!r} has a delay or an interval; "
+                    f"measurement {channel.label!r}: sensor {name!r} has a delay or an interval; "
                     "remove it and shift the log instead"
                 )

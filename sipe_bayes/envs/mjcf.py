@@ -1,7 +1,8 @@
 """The user's own MJCF as an Environment: which actuators the log drives and which quantities it measures.
 
 Observations are read aligned: joint positions and velocities from the state itself, sensors from the
-sensordata that belongs to that state (MuJoCo's own belong to the state one physics step earlier).
+sensordata that belongs to that state (MuJoCo's own belong to the state one physics step earlier). What is measured of a
+body is read by a sensor that the model is given; an orientation is observed as a rotation vector.
 """
 
 from __future__ import annotations
@@ -18,13 +19,24 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.rotations import rotation_vectors
 from sipe_bayes.envs.base import Environment
-from sipe_bayes.envs.channels import Channel, Reader, check_sensors, reader_of, state_column
+from sipe_bayes.envs.channels import (
+    Channel,
+    Reader,
+    add_body_sensors,
+    check_sensors,
+    expanded,
+    reader_of,
+    rotation_triples,
+    state_column,
+)
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
 from sipe_bayes.envs.internal import filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import BoundLaw, declare, laws_of, moving_on
 from sipe_bayes.envs.laws.registry import LAW_OF
+from sipe_bayes.envs.poses import PoseReading, pose_columns, pose_readings
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
 from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
 from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, with_model_values
@@ -100,7 +112,8 @@ class MjcfEnvironment(Environment):
             parameters: their ``targets`` name what they write; several targets of one parameter are all set to its
                 value, or, where it is ``relative``, keep their proportions.
             actuators: names of those that the log drives.
-            measurements: what the log holds; a text stands for a channel with that target.
+            measurements: what the log holds; a text stands for a channel with that target, and the target of a
+                body's vector or of an orientation for its three channels.
             edits: what is changed in the MJCF before it is compiled.
 
         Raises:
@@ -111,17 +124,19 @@ class MjcfEnvironment(Environment):
         channels = tuple(c if isinstance(c, Channel) else Channel(c) for c in measurements)
         parameters = tuple(parameters)
         try:
-            model = compile_spec(_prepared(str(source), parameters, edits), str(source))
+            model = compile_spec(_prepared(str(source), parameters, edits, channels), str(source))
             laws_of(model)
         except LawError as error:
             raise TargetError(str(error)) from None
         for actuator in actuators:
             _single_control(model, actuator)
+        channels = tuple(part for c in channels for part in expanded(model, c))
         channels = tuple(replace(c, name=c.label, unit=reader_of(model, c).unit) for c in channels)
         twice = sorted({c.label for c in channels if [d.label for d in channels].count(c.label) > 1})
         if twice:
             raise ValueError(f"measurements: names must differ, but {twice} appear more than once")
         check_sensors(model, channels)
+        rotation_triples(channels)
         space = ParameterSpace(with_model_values(model, p, channels) for p in parameters)
         check_conflicts(space)
         return cls(str(source), tuple(actuators), channels, space, tuple(edits))
@@ -157,7 +172,7 @@ class MjcfEnvironment(Environment):
         It has a command history for each actuator whose delay is a parameter, the laws that parameters write, and not
         MuJoCo's short cut for bodies whose centre of mass lies in their origin where that may change.
         """
-        return _prepared(self.source, self.parameters, self.edits)
+        return _prepared(self.source, self.parameters, self.edits, self.measurements)
 
     def compile(self) -> mujoco.MjModel:
         """A fresh model at the MJCF's own values."""
@@ -302,12 +317,27 @@ class MjcfEnvironment(Environment):
             source = derived if reader.derived else states
             if source is None:
                 raise ValueError(f"channel {self.channels[k]!r}: needs sensordata, got none")
-            out[..., k] = source[..., reader.index]
+            if reader.turn is None:
+                out[..., k] = source[..., reader.index]
+        for triple in self.rotations:
+            first = self._readers[triple[0]].index
+            out[..., triple] = rotation_vectors(derived[..., first : first + 4])  # type: ignore[index]
         return out
 
+    @cached_property
+    def rotations(self) -> tuple[tuple[int, int, int], ...]:  # type: ignore[override]
+        """Channels that are together a rotation vector."""
+        return rotation_triples(self.measurements)
+
+    @cached_property
+    def poses(self) -> tuple[PoseReading, ...]:  # type: ignore[override]
+        """What the channels tell of free and ball joints."""
+        return pose_readings(self._model, self._readers)
+
     def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
-        """Joint positions and velocities, measured as such or by their sensors."""
-        return tuple(state_column(model, r) for r in self._readers)
+        """Positions and velocities of joints, of free ones those of their body's origin."""
+        of_poses = pose_columns(model, self.poses, len(self._readers))
+        return tuple(state_column(model, r) if c is None else c for r, c in zip(self._readers, of_poses, strict=True))
 
     def history(
         self, model: mujoco.MjModel, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
@@ -344,11 +374,14 @@ class MjcfEnvironment(Environment):
             )
 
 
-def _prepared(source: str, parameters: Iterable[Parameter], edits: Iterable[Edit]) -> mujoco.MjSpec:
-    """The MjSpec of a source, edited, with what its parameters write to."""
+def _prepared(
+    source: str, parameters: Iterable[Parameter], edits: Iterable[Edit], channels: Sequence[Channel]
+) -> mujoco.MjSpec:
+    """The MjSpec of a source, edited, with what its parameters write to and what reads the channels."""
     spec = load_spec(source)
     for edit in edits:
         edit(spec)
+    add_body_sensors(spec, channels)
     timestep = spec.option.timestep
     for parameter in parameters:
         for target in physical_targets(parameter.targets):

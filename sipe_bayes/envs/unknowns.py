@@ -11,7 +11,7 @@ import numpy as np
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.validation import nearest_name
-from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.channels import Channel, is_rotation
 from sipe_bayes.envs.sensing import LEAST, NEUTRAL, UNITS, of_sensor, sensed_channels
 from sipe_bayes.envs.targets import TargetError, bind
 
@@ -73,6 +73,11 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
 
 
 def _channel_unit(parameter: Parameter, target: str, channels: Sequence[Channel], concerned: Sequence[int]) -> str:
+    if any(is_rotation(channels[k]) for k in concerned):
+        raise TargetError(
+            f"parameter {parameter.name!r}: target {target!r} is of an orientation, whose sensor has no bias, scale, "
+            "delay or filter here; turn the frame in the MJCF instead"
+        )
     if concerned:
         return channels[concerned[0]].unit
     names = [c.label for c in channels]

@@ -26,7 +26,8 @@ class CallableWindows(Windows):
             raise ValueError(
                 f"trajectories: expected an x ({size},), got observations {trajectories.observations.shape}"
             )
-        self.channels = fitted_channels(simulator.environment.channels, settings.fit)
+        self.channels, self.rotations = fitted_channels(simulator.environment.channels, settings.fit), ()
+        self.scales = np.arange(len(self.channels))
         count = len(trajectories)
         self.log, self.start, self.steps = np.arange(count), np.zeros(count, int), np.ones(count, int)
         self.dt, self.names, self.goals = trajectories.dt, list(trajectories.names), None

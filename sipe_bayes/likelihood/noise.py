@@ -7,11 +7,12 @@ on across windows and across missing samples); e_0 ~ N(0, sigma_c^2). White nois
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.likelihood.sequences import Sequence
 
 
@@ -41,6 +42,21 @@ def chosen_sd(given: tuple[float | None, ...] | None, channels: list[int], names
             f"noise_sd: expected one for each of the channels {list(names)}, got {len(given)}; None where unknown"
         )
     return np.array([np.nan if given[c] is None else given[c] for c in channels], float)
+
+
+def noise_scales(count: int, rotations: Iterable[tuple[int, int, int]]) -> IntArray:
+    """Which noise scale (G of them) each of C channels has: the three numbers of a rotation vector share one."""
+    owner = np.arange(count)
+    for triple in rotations:
+        owner[list(triple)] = min(triple)
+    return np.unique(owner, return_inverse=True)[1]
+
+
+def pooled(sd: FloatArray, scales: IntArray) -> FloatArray:
+    """Sds (C,), those of one scale at their root mean square."""
+    if scales.max(initial=-1) + 1 == len(sd):
+        return sd
+    return np.asarray(np.sqrt(np.bincount(scales, sd**2) / np.bincount(scales))[scales])
 
 
 def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:

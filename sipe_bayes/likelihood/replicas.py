@@ -18,6 +18,7 @@ import numpy as np
 import scipy.signal
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.rotations import with_noise
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_level import noise_level
@@ -82,14 +83,16 @@ class Replicas:
         """
         noises = [self._noise(rng) for _ in theta]
         starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
-        motion, count = self.simulator.replay(theta, self.trajectories, starts), len(self.trajectories)
+        simulator, count = self.simulator, len(self.trajectories)
+        motion = simulator.replay(theta, self.trajectories, starts)
         if self.process is not None:
             motion = self._shaken(motion, theta, rng)
         replicas = []
         for b, noise in enumerate(noises):
             rows = slice(b * count, (b + 1) * count)
             states = None if motion.states is None else motion.states[rows]
-            replicas.append(self._measured(motion.observations[rows] + noise, motion.valid[rows], states))
+            seen = with_noise(motion.observations[rows], noise, simulator.environment.rotations)
+            replicas.append(self._measured(seen, motion.valid[rows], states))
         return replicas
 
     def _shaken(self, motion: Trajectories, theta: FloatArray, rng: np.random.Generator) -> Trajectories:
@@ -149,7 +152,8 @@ class Replicas:
         moved = np.zeros_like(self.starts)
         for k, ((begin, before), own) in enumerate(zip(self._beginnings, noise, strict=True)):
             assert isinstance(self.simulator, Simulator)
-            noisy = replace(begin, observations=begin.observations + own[: len(begin) + 1])
+            rotations = self.simulator.environment.rotations
+            noisy = replace(begin, observations=with_noise(begin.observations, own[: len(begin) + 1], rotations))
             moved[k, : len(before)] = estimate_states(self.simulator, noisy)[0] - before
         return moved
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated, eliminate
 from sipe_bayes.likelihood.minimise import minimise
 from sipe_bayes.likelihood.moments import Moments
@@ -141,11 +141,18 @@ def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[flo
 
 
 def estimate_noise(
-    moments: Moments, noise: Noise, pulls: Pulls, fixed_sd: FloatArray, coloured: bool, shortest: float, longest: float
+    moments: Moments,
+    noise: Noise,
+    pulls: Pulls,
+    fixed_sd: FloatArray,
+    coloured: bool,
+    shortest: float,
+    longest: float,
+    scales: IntArray | None = None,
 ) -> Noise:
     """Noise that maximises the restricted likelihood.
 
-    (log innovation sd, log tau) of all channels are searched, whose information is all but diagonal.
+    (log innovation sd, log tau) of all scales are searched, whose information is all but diagonal.
 
     Args:
         moments: of the linearisation.
@@ -155,13 +162,20 @@ def estimate_noise(
         coloured: whether tau is estimated.
         shortest: seconds, of which tau is a tenth at least.
         longest: seconds, which tau is at most.
+        scales: (C,), which of G noise scales each channel has; default one each.
     """
     channels, estimated = len(noise.sd), np.isnan(fixed_sd)
+    scales = np.arange(channels) if scales is None else scales
+    first = np.unique(scales, return_index=True)[1]
+    groups = len(first)
 
     def unpack(x: FloatArray) -> Noise:
-        tau = np.exp(x[channels:]) if coloured else np.zeros(channels)
+        tau = np.exp(x[groups:][scales]) if coloured else np.zeros(channels)
         innovation = 1 - coefficients(np.full(channels, shortest), tau) ** 2 if coloured else np.ones(channels)
-        return Noise(np.where(estimated, np.exp(x[:channels]) / np.sqrt(innovation), fixed_sd), tau)
+        return Noise(np.where(estimated, np.exp(x[:groups][scales]) / np.sqrt(innovation), fixed_sd), tau)
+
+    def summed(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(scales, values), float)
 
     def loss(x: FloatArray) -> tuple[float, FloatArray]:
         tried = unpack(x)
@@ -170,11 +184,11 @@ def estimate_noise(
         except np.linalg.LinAlgError:
             return 1e12, np.zeros_like(x)
         by_sd = np.where(estimated, by_sd, 0.0)
-        slope = by_sd
+        slope = summed(by_sd)
         if coloured:
             ratio = shortest / tried.tau
             a = np.exp(-ratio)
-            slope = np.concatenate([by_sd, by_tau + by_sd * a**2 * ratio / (1 - a**2)])
+            slope = np.concatenate([slope, summed(by_tau + by_sd * a**2 * ratio / (1 - a**2))])
         return (-value, -slope) if np.isfinite(value) and np.isfinite(slope).all() else (1e12, np.zeros_like(x))
 
     # with tau a tenth of a sample period the noise is white to a part in 10^4
@@ -183,10 +197,10 @@ def estimate_noise(
     if coloured and (noise.tau <= 0).all():
         tau = np.clip(np.log(moments.correlation_times()), low, high)
     innovation = 1 - coefficients(np.full(channels, shortest), np.exp(tau)) ** 2 if coloured else np.ones(channels)
-    x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation)), tau if coloured else []])
-    free_sd, free_tau = np.full(channels, 12.0), np.tile([[low], [high]], channels if coloured else 0)
-    bounds = np.concatenate([[x0[:channels] - free_sd, x0[:channels] + free_sd], free_tau], axis=1)
+    x0 = np.concatenate([np.log(noise.sd * np.sqrt(innovation))[first], tau[first] if coloured else []])
+    free_sd, free_tau = np.full(groups, 12.0), np.tile([[low], [high]], groups if coloured else 0)
+    bounds = np.concatenate([[x0[:groups] - free_sd, x0[:groups] + free_sd], free_tau], axis=1)
     counts = np.array([len(s.index) for s in moments.sequences], float)
     ratio = shortest / np.exp(tau)
     information = [2 * counts, counts * ratio**2 / np.maximum(np.expm1(2 * ratio), 1e-300)][: 1 + coloured]
-    return unpack(minimise(loss, x0, bounds, np.concatenate(information)))
+    return unpack(minimise(loss, x0, bounds, np.concatenate([summed(part) for part in information])))

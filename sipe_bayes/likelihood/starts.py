@@ -10,19 +10,27 @@ import numpy as np
 import scipy.signal
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.poses import PoseReading, has_pose
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
 
 
-def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
+def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = False) -> FloatArray:
     """A first guess of the states (T+1, S) along a log: recorded ones, else measured ones.
 
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
-    the slopes of the positions; what no channel measures stays at the model's reset state. The search starts here,
-    and so do the windows of held-out logs.
+    the slopes of the positions. Orientations are smoothed likewise, in rotation vectors from each sample; the joint's
+    body is where the measured frame tells. What no channel measures stays at the model's reset state. The search starts
+    here, and so do the windows of held-out logs.
+
+    Args:
+        simulator: of the model.
+        trajectory: the log.
+        raw: whether positions and measured velocities are those of the samples, not smoothed.
     """
     if trajectory.states is not None:
         return trajectory.states
@@ -34,14 +42,118 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
         finite = np.flatnonzero(np.isfinite(series))
         if column is not None and len(finite):
             measured[column] = np.interp(np.arange(len(series)), finite, series[finite])
-    for joint in range(model.njnt):
-        if int(model.jnt_type[joint]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            position, velocity = 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
-            if position in measured and velocity not in measured:
-                states[:, velocity] = smoothed(measured[position], trajectory.dt, 1)
+    for position, velocity in velocity_columns(model).items():
+        if position in measured and velocity not in measured:
+            states[:, velocity] = smoothed(measured[position], trajectory.dt, 1)
     if measured:
-        states[:, list(measured)] = smoothed(np.stack(list(measured.values()), axis=1), trajectory.dt)
+        series = np.stack(list(measured.values()), axis=1)
+        states[:, list(measured)] = series if raw else smoothed(series, trajectory.dt)
+    readings = simulator.environment.poses
+    for joint in dict.fromkeys(reading.joint for reading in readings):
+        told = [r for r in readings if r.joint == joint and _seen(trajectory, r)]
+        _put_pose(model, {r.quantity: r for r in told}, trajectory, states, raw)
     return states
+
+
+def velocity_columns(model: mujoco.MjModel) -> dict[int, int]:
+    """Columns of positions that have one velocity, with those of the velocities."""
+    sizes = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}  # of a free joint the place
+    out = {}
+    for joint in range(model.njnt):
+        for i in range(sizes.get(int(model.jnt_type[joint]), 1)):
+            out[1 + int(model.jnt_qposadr[joint]) + i] = 1 + model.nq + int(model.jnt_dofadr[joint]) + i
+    return out
+
+
+def _seen(trajectory: Trajectory, reading: PoseReading) -> bool:
+    """Whether a sample has all three numbers."""
+    return bool(np.isfinite(trajectory.observations[:, reading.channels]).all(-1).any())
+
+
+def _put_pose(
+    model: mujoco.MjModel, told: dict[str, PoseReading], trajectory: Trajectory, states: FloatArray, raw: bool
+) -> None:
+    """Write what is told of one free or ball joint into states (T+1, S): nothing without its orientation."""
+    if "orientation" not in told:
+        return
+    orientation = told["orientation"]
+    joint, dt = orientation.joint, trajectory.dt
+    free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    place, motion = 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
+    turning = slice(motion + 3, motion + 6) if free else slice(motion, motion + 3)
+    # the joint's own quaternion, and how it turns
+    seen = quaternions(bridged(trajectory.observations[:, orientation.channels]))
+    body = product(seen, inverse(orientation.turn))
+    parent = None if free or orientation.of_joint else _parents(model, joint, states)
+    own = rotation_vectors(body if parent is None else product(inverse(parent), body))
+    smooth, spin = smoothed_rotations(own, dt)
+    turn = quaternions(own if raw else smooth)
+    states[:, place + 3 * free : place + 3 * free + 4] = turn
+    states[:, turning] = turned(inverse(turn), spin)
+    of_body = turn if parent is None else product(parent, turn)
+    if "angular_velocity" in told and (free or told["angular_velocity"].of_joint):
+        velocity = _values(trajectory, told["angular_velocity"], raw)
+        states[:, turning] = _in_body(velocity, told["angular_velocity"], of_body)
+    if free and "position" in told and not told["position"].at_origin:
+        arm = turned(turn, told["position"].offset)
+        position = _values(trajectory, told["position"], raw=True) - arm
+        states[:, place : place + 3] = position if raw else smoothed(position, dt)
+        states[:, motion : motion + 3] = smoothed(position, dt, 1)
+    if free and "linear_velocity" in told:
+        reading = told["linear_velocity"]
+        velocity = turned(turn, _in_body(_values(trajectory, reading, raw), reading, turn))
+        arm = np.cross(states[:, turning], reading.offset)  # in the body's axes
+        states[:, motion : motion + 3] = velocity - turned(turn, arm)
+
+
+def _values(trajectory: Trajectory, reading: PoseReading, raw: bool) -> FloatArray:
+    """The three channels (T+1, 3), missing samples bridged, smoothed unless ``raw``."""
+    columns = []
+    for series in trajectory.observations[:, reading.channels].T:
+        finite = np.flatnonzero(np.isfinite(series))
+        columns.append(np.interp(np.arange(len(series)), finite, series[finite]))
+    values = np.stack(columns, axis=1)
+    return values if raw else smoothed(values, trajectory.dt)
+
+
+def _in_body(velocity: FloatArray, reading: PoseReading, of_body: FloatArray) -> FloatArray:
+    """A velocity (T+1, 3) in the axes of the joint's body, whose orientation is ``of_body`` (T+1, 4)."""
+    if reading.of_joint:
+        return velocity
+    return turned(reading.turn, velocity) if reading.own_axes else turned(inverse(of_body), velocity)
+
+
+def _parents(model: mujoco.MjModel, joint: int, states: FloatArray) -> FloatArray:
+    """Quaternions (T+1, 4) of the frame in which a ball joint turns its body, at states (T+1, S)."""
+    body, data = int(model.jnt_bodyid[joint]), mujoco.MjData(model)
+    still = model.body_weldid[model.body_parentid[body]] == 0
+    out = np.empty((1 if still else len(states), 4))
+    for quaternion, state in zip(out, states, strict=False):
+        data.qpos[:] = state[1 : 1 + model.nq]
+        mujoco.mj_kinematics(model, data)
+        quaternion[:] = data.xquat[model.body_parentid[body]]
+    return np.broadcast_to(product(out, model.body_quat[body]), (len(states), 4))
+
+
+def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
+    """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state."""
+    model, environment = simulator.model, simulator.environment
+    if trajectories.states is not None:
+        return []
+    seen = np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
+    columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
+    told = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
+    missing = []
+    for joint in range(model.njnt):
+        if has_pose(model, joint):
+            known = (joint, "orientation") in told
+            if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+                known &= (joint, "position") in told
+        else:
+            known = 1 + int(model.jnt_qposadr[joint]) in columns
+        if not known:
+            missing.append(joint)
+    return missing
 
 
 def first_states(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
@@ -53,10 +165,35 @@ def first_states(simulator: Simulator | CallableSimulator, trajectories: Traject
 
 def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
     """Local quadratics over 60 ms, at least 5 samples, of a series (T+1, ...); derivative 1: their slopes in time."""
-    span = min(max(5, 2 * round(0.06 / dt / 2) + 1), len(series) - (len(series) + 1) % 2)
+    span = _span(len(series), dt)
     if span < 3:
         return np.gradient(series, dt, axis=0) if derivative else series
     return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
+
+
+def _span(count: int, dt: float) -> int:
+    """Samples of a local quadratic, an odd number."""
+    return min(max(5, 2 * round(0.06 / dt / 2) + 1), count - (count + 1) % 2)
+
+
+def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors (T+1, 3) smoothed as ``smoothed`` does, and angular velocities (T+1, 3) about axes that stay.
+
+    Around each sample a local quadratic is laid through the rotation vectors that lead from it to its neighbours.
+    """
+    count, span = len(vectors), _span(len(vectors), dt)
+    if span < 3:
+        turn = between(vectors[1:], vectors[:-1]) / dt if count > 1 else np.zeros((1, 3))
+        return vectors, np.concatenate([turn, turn[-1:]])[:count]
+    begin = np.clip(np.arange(count) - span // 2, 0, count - span)
+    neighbours = begin[:, None] + np.arange(span)
+    ways = between(vectors[neighbours], vectors[:, None])
+    place = np.arange(count) - begin
+    out = []
+    for derivative in (0, 1):
+        weights = np.stack([scipy.signal.savgol_coeffs(span, 2, derivative, dt, pos=p, use="dot") for p in range(span)])
+        out.append((weights[place][..., None] * ways).sum(1))
+    return added(vectors, out[0]), out[1]
 
 
 def moved(model: mujoco.MjModel, states: FloatArray, tangent: FloatArray) -> FloatArray:

@@ -4,7 +4,8 @@ A log of T samples is cut into windows of ``window`` seconds; each is simulated 
 unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by exactly one
 window. Long open loops are chaotic and one model error would dominate them; short windows with measured starts give
 away the noise of the measurement: both cost coverage. The residuals are white or first-order autoregressive and carry
-on across windows (``sipe_bayes.likelihood.noise``).
+on across windows (``sipe_bayes.likelihood.noise``). That of an orientation is the rotation vector from the predicted to
+the measured one, three numbers of one noise scale.
 
 A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior, far wider
 than any measurement (``Environment.start_sd``), so that what is never measured does not make the equations singular.
@@ -21,12 +22,20 @@ from functools import cached_property
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, chosen_sd, whiten
+from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
-from sipe_bayes.likelihood.starts import STATE_STEP, estimate_states, moved, past_commands, with_history
+from sipe_bayes.likelihood.starts import (
+    STATE_STEP,
+    estimate_states,
+    moved,
+    past_commands,
+    unmeasured_joints,
+    with_history,
+)
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -55,6 +64,20 @@ def fitted_channels(names: SequenceOf[str], fit: tuple[str, ...] | None) -> list
     if unknown:
         raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
     return [list(names).index(n) for n in fit]
+
+
+def fitted_rotations(
+    rotations: SequenceOf[tuple[int, int, int]], channels: list[int]
+) -> tuple[tuple[int, int, int], ...]:
+    """Places among the fitted ``channels`` of rotation vectors; raises ValueError where one is fitted in part."""
+    found = []
+    for triple in rotations:
+        fitted = [channels.index(c) for c in triple if c in channels]
+        if len(fitted) not in (0, 3):
+            raise ValueError("fit: an orientation's three numbers are fitted together or not at all; name all three")
+        if fitted:
+            found.append((fitted[0], fitted[1], fitted[2]))
+    return tuple(found)
 
 
 def check_seen(names: SequenceOf[str], seen: BoolArray) -> None:
@@ -89,6 +112,8 @@ class Windows:
         self.rollouts, self.budget = 0, math.inf
         self._subset: Windows | None = None
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
+        self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
+        self.scales = noise_scales(len(self.channels), self.rotations)
         if settings.starts == "recorded" and trajectories.states is None:
             raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
         self._cut(trajectories)
@@ -222,8 +247,8 @@ class Windows:
             starts: (B, W, D).
 
         Returns:
-            Predictions (B, W, L, C), NaN from the sample on at which a window diverged; and which of the B (B,) stayed
-            valid throughout.
+            Predictions (B, W, L, C), NaN from the sample on at which a window diverged, rotation vectors written near
+            the measured ones; and which of the B (B,) stayed valid throughout.
 
         Raises:
             BudgetExhausted: instead of simulating beyond the budget.
@@ -240,6 +265,7 @@ class Windows:
         good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
         predicted = np.where(good[..., None], predicted, np.nan)
+        predicted = written_near(predicted, self.measured, self.rotations)
         return predicted, np.asarray((good | ~self.owned).all(axis=(1, 2)))
 
     def spend(self, batch: int) -> None:
@@ -259,14 +285,9 @@ class Windows:
     @property
     def starts_measured(self) -> bool:
         """Whether the log tells where every window starts: recorded states, or a measured position of each joint."""
-        model = self.simulator.model
         if self.trajectories.states is not None:
             return True
-        if model.na or model.nq != model.nv:
-            return False
-        columns = self.simulator.environment.state_columns(model)
-        seen = [column for c, column in enumerate(columns) if np.isfinite(self.trajectories.observations[..., c]).any()]
-        return set(range(1, 1 + model.nq)) <= set(seen)
+        return not self.simulator.model.na and not unmeasured_joints(self.simulator, self.trajectories)
 
     def linearise(
         self,
@@ -314,12 +335,24 @@ class Windows:
             again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
             inside = np.clip(again, 0, 1)
             predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
+        predicted[1:] = self._continued(predicted[1:], predicted[0])
         scale = np.concatenate([sign[:n] * size[:n], np.full(d, STATE_STEP)])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
         jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
         residual = np.where(self.observed, self.measured - predicted[0], 0.0)
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
+
+    def _continued(self, predicted: FloatArray, here: FloatArray) -> FloatArray:
+        """Predictions (B, W, L, C) whose differences from those ``here`` (W, L, C) jump nowhere.
+
+        The residual of an orientation does where it is half a turn.
+        """
+        for triple in map(list, self.rotations):
+            measured = self.measured[..., triple]
+            near = nearest(measured - predicted[..., triple], measured - here[..., triple])
+            predicted[..., triple] = measured - near
+        return predicted
 
     def moments(self, lin: Linearisation, white: bool = False) -> Moments:
         """Products of the linearised rows, from which the normal equations of any noise follow, or of white alone."""

@@ -32,6 +32,7 @@ class CallableEnvironment:
 
     channels: tuple[str, ...]
     num_actions: int = 0
+    rotations: ClassVar[tuple[tuple[int, int, int], ...]] = ()
 
 
 class CallableSimulator:

@@ -133,7 +133,7 @@ class _Around:
         start_pull = -windows.start_precision * self.starts
         pulls = Pulls(precision, pull, windows.start_precision, start_pull, np.ones(n + k, bool))
         span = float(windows.dt.min()), windows.trajectories.longest
-        noise = estimate_noise(moments, self.noise, pulls, windows.fixed_sd, True, *span)
+        noise = estimate_noise(moments, self.noise, pulls, windows.fixed_sd, True, *span, windows.scales)
         normal = moments.normal(noise)
         arrow = eliminate_starts(normal, n + k, windows.start_precision, start_pull)
         total = arrow.gradient + pull

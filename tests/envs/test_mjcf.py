@@ -252,7 +252,7 @@ def test_all_sensor_units_are_known_or_empty() -> None:
         (
             {"measurements": ("joint:free.position",)},
             TargetError,
-            "neither hinge nor slide; measure it by a sensor",
+            "neither hinge nor slide; measure its body",
         ),
         ({"measurements": ("sensor:gps",)}, TargetError, r"no sensor 'gps'; the model has \['encoder'"),
         ({"measurements": ("sensor:acc",)}, TargetError, r"has 3 components; write sensor:NAME\[i\], i < 3"),

@@ -15,7 +15,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import QuadraticModel
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.noise import Noise, pooled
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
@@ -92,7 +92,7 @@ def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: Fl
 def present_noise(windows: Windows, residual: FloatArray) -> Noise:
     """White noise with the root-mean-square of a residual (W, L, C), or the given sds."""
     fixed, counts = windows.fixed_sd, windows.observed.sum(axis=(0, 1))
-    size = np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1))
+    size = pooled(np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1)), windows.scales)
     return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
 
 
@@ -128,7 +128,7 @@ def updated_noise(
 def estimated(windows: Windows, moments: Moments, before: Noise, context: Pulls, coloured: bool) -> Noise:
     """``likelihood.restricted.estimate_noise`` of windows."""
     shortest, longest = float(windows.dt.min()), windows.trajectories.longest
-    return estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest)
+    return estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest, windows.scales)
 
 
 def beyond_rounding(windows: Windows, noise: Noise) -> Noise:

@@ -31,11 +31,12 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.likelihood.noise import chosen_sd
+from sipe_bayes.core.rotations import written_near
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
 from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, with_history
-from sipe_bayes.likelihood.windows import check_seen, chosen_channels
+from sipe_bayes.likelihood.windows import check_seen, chosen_channels, fitted_rotations
 from sipe_bayes.simulation.simulator import Simulator
 
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known, beyond rounding: position, velocity, activation
@@ -61,6 +62,8 @@ class Chain:
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
         self.rollouts, self.uncounted, self.budget = 0, 0.0, math.inf
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
+        self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
+        self.scales = noise_scales(len(self.channels), self.rotations)
         steps = trajectories.length
         self.log = np.repeat(np.arange(len(trajectories)), steps + 1)
         self.sample = np.concatenate([np.arange(n + 1) for n in steps])
@@ -76,7 +79,8 @@ class Chain:
         if known and trajectories.states is None:
             raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
-        reference = np.concatenate([_measured_states(simulator, replace(t, states=None)) for t in trajectories])
+        measured = [replace(t, states=None) for t in trajectories]
+        reference = np.concatenate([estimate_states(simulator, t, raw=True) for t in measured])
         if known:
             reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt) if model.nhistory else []
@@ -140,10 +144,10 @@ class Chain:
     def coordinates(self) -> list[int | None]:
         """For each fitted channel the state coordinate that it measures directly, if it does.
 
-        Of a quaternion's numbers that is one of its joint's turns.
+        Of a quaternion's numbers, and of an orientation's, that is one of its joint's turns.
         """
-        model = self.simulator.model
-        columns = self.simulator.environment.state_columns(model)
+        model, environment = self.simulator.model, self.simulator.environment
+        columns = environment.state_columns(model)
         owner = np.searchsorted(model.jnt_qposadr, np.arange(model.nq), side="right") - 1
         last = np.append(model.jnt_dofadr[1:], model.nv)[owner] - 1
         turn = np.minimum(model.jnt_dofadr[owner] + np.arange(model.nq) - model.jnt_qposadr[owner], last)
@@ -153,7 +157,14 @@ class Chain:
                 return None
             return int(turn[column - 1]) if column <= model.nq else column - 1 - model.nq + model.nv
 
-        return [coordinate(columns[c]) for c in self.channels]
+        of_channels = [coordinate(column) for column in columns]
+        for reading in environment.poses:
+            turns = reading.quantity in ("orientation", "angular_velocity")
+            first = int(model.jnt_dofadr[reading.joint]) + model.nv * ("velocity" in reading.quantity)
+            free = int(model.jnt_type[reading.joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+            for i, channel in enumerate(reading.channels if turns or free else ()):
+                of_channels[channel] = first + 3 * (turns and free) + i
+        return [of_channels[c] for c in self.channels]
 
     @property
     def labels(self) -> list[str]:
@@ -249,6 +260,7 @@ class Chain:
         goes_on = np.append(self.linked, False)[at]
         valid = result.valid[:, 0] & (result.valid[:, 1] | ~np.tile(goes_on, batch))
         predicted = np.where(self.late, observations[:, 1], observations[:, 0]).reshape(*shape, -1)
+        predicted = written_near(predicted, self.measured[at], self.rotations)
         return predicted, result.states[:, 1].reshape(*shape, -1), valid.reshape(shape)
 
     def with_memory(self, states: FloatArray, dt: FloatArray) -> FloatArray:
@@ -278,17 +290,3 @@ def _floor(sizes: FloatArray) -> FloatArray:
     """A millionth of each size: noise below is not told from rounding; one that is all but zero has a size, too."""
     usual = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
     return np.asarray(1e-6 * np.maximum(sizes, 1e-3 * usual))
-
-
-def _measured_states(simulator: Simulator, trajectory: Trajectory) -> FloatArray:
-    """A first guess of the states (T+1, S) of a trajectory without recorded ones.
-
-    What each sample measured, the rest as ``estimate_states`` has it. Unlike there nothing is smoothed: the chain does
-    that.
-    """
-    states = estimate_states(simulator, trajectory).copy()
-    for channel, column in enumerate(simulator.environment.state_columns(simulator.model)):
-        seen = np.isfinite(trajectory.observations[:, channel])
-        if column is not None:
-            states[seen, column] = trajectory.observations[seen, channel]
-    return states

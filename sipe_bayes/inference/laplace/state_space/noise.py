@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.optimize
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.inference.laplace.state_space.options import NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import border
 from sipe_bayes.likelihood.minimise import damped_box_step
@@ -51,11 +51,14 @@ def infer_noise(
     least_sd, least_process = chain.least
     least = np.log(np.concatenate([least_sd, np.maximum(least_process, tuning.least_share * movement)]))
     start = np.maximum(np.log(np.concatenate([noise.sd, noise.process])), least)
-    free = np.concatenate([np.isnan(fixed), np.full(len(noise.process), True)])
+    # of channels of one scale the first stands for all
+    owner = np.concatenate([_first(chain.scales), channels + np.arange(len(noise.process))])
+    free = np.concatenate([np.isnan(fixed), np.full(len(noise.process), True)]) & (owner == np.arange(len(owner)))
 
     def split(logs: FloatArray) -> ChainNoise:
         everything = start.copy()
         everything[free] = logs
+        everything = everything[owner]
         sd = np.where(np.isnan(fixed), np.exp(everything[:channels]), noise.sd)
         return replace(noise, sd=sd, process=np.exp(everything[channels:]))
 
@@ -66,7 +69,8 @@ def infer_noise(
         except np.linalg.LinAlgError:  # so far apart that rounding rules
             return 1e300, np.zeros(len(logs))  # L-BFGS takes no infinity
         slope = tried.process / movement - tuning.prior_power
-        return process_penalty(tried, movement, tuning) - value, np.concatenate([-by_sd, slope - by_process])[free]
+        slopes = np.bincount(owner, np.concatenate([-by_sd, slope - by_process]), len(owner))
+        return process_penalty(tried, movement, tuning) - value, slopes[free]
 
     span = np.log(tuning.most_factor)
     bounds = [(max(low, s - span), s + span) for low, s in zip(least[free], start[free], strict=True)]
@@ -74,6 +78,11 @@ def infer_noise(
     limits = {"maxiter": tuning.search_steps, "maxfun": tuning.search_steps + 4}
     best = scipy.optimize.minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds, options=limits)
     return split(best.x), float(before - best.fun)
+
+
+def _first(scales: IntArray) -> IntArray:
+    """The first channel (C,) of each channel's scale."""
+    return np.unique(scales, return_index=True)[1][scales]
 
 
 def process_penalty(noise: ChainNoise, movement: FloatArray, tuning: NoiseTuning) -> float:
