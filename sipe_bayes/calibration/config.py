@@ -76,7 +76,12 @@ class Config(Table):
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the measurements, in the order of a trajectory's observations."""
-        return tuple(m.name for m in self.measurements)
+        return tuple(name for m in self.measurements for _, name in m.channels)
+
+    @property
+    def sources(self) -> tuple[tuple[Measurement, str], ...]:
+        """Every measured column of a log, with its measurement."""
+        return tuple((m, column) for m in self.measurements for column in m.sources)
 
     def logs_for(self, use: Use) -> tuple[LogEntry, ...]:
         """The logs that train, or those held out."""

@@ -118,36 +118,45 @@ class MeasurementTarget:
 
     Args:
         kind: of what it is.
-        name: of the joint or sensor.
-        quantity: of the joint; ``reading`` of a sensor.
-        index: of the sensor's component, if it has several.
+        name: of the joint, body or sensor.
+        quantity: of the joint or body; ``reading`` of a sensor.
+        index: of the body's or sensor's component, if it has several.
     """
 
-    kind: Literal["joint", "sensor"]
+    kind: Literal["joint", "body", "sensor"]
     name: str
-    quantity: Literal["position", "velocity", "reading"]
+    quantity: Literal["position", "velocity", "orientation", "linear_velocity", "angular_velocity", "reading"]
     index: int | None = None
 
 
 _JOINT = re.compile(r"joint:(?P<name>.+)\.(?P<quantity>position|velocity)")
+_BODY = re.compile(
+    r"body:(?P<name>[^\[\]]+)\.(?P<quantity>position|orientation|linear_velocity|angular_velocity)"
+    r"(\[(?P<index>[0-2])\])?"
+)
 _SENSOR = re.compile(r"sensor:(?P<name>[^\[\]]+)(\[(?P<index>\d+)\])?")
 
 
 def parse_measurement_target(target: str) -> MeasurementTarget:
-    """Read ``joint:NAME.position``, ``joint:NAME.velocity``, ``sensor:NAME`` or ``sensor:NAME[i]``.
+    """Read ``joint:NAME.position``, ``body:NAME.orientation``, ``sensor:NAME``, ``sensor:NAME[i]`` and their like.
 
     Raises:
         ValueError: for anything else.
     """
-    if match := _JOINT.fullmatch(target):
-        quantity: Any = match["quantity"]
-        return MeasurementTarget("joint", match["name"], quantity)
-    if match := _SENSOR.fullmatch(target):
-        index = match["index"]
-        return MeasurementTarget("sensor", match["name"], "reading", None if index is None else int(index))
+    for kind, pattern in (("joint", _JOINT), ("body", _BODY), ("sensor", _SENSOR)):
+        if match := pattern.fullmatch(target):
+            found: dict[str, Any] = match.groupdict()
+            index = found.get("index")
+            return MeasurementTarget(
+                kind,  # type: ignore[arg-type]
+                found["name"],
+                found.get("quantity", "reading"),
+                None if index is None else int(index),
+            )
     raise ValueError(
-        f"expected a measurement target, got {target!r}; "
-        "write 'joint:NAME.position', 'joint:NAME.velocity', 'sensor:NAME' or 'sensor:NAME[0]'"
+        f"expected a measurement target, got {target!r}; write 'joint:NAME.position', 'joint:NAME.velocity', "
+        "'body:NAME.position', 'body:NAME.orientation', 'body:NAME.linear_velocity', 'body:NAME.angular_velocity', "
+        "'sensor:NAME' or 'sensor:NAME[0]'"
     )
 
 

@@ -22,6 +22,7 @@ from sipe_bayes.calibration.config_fields import (
     UnitWord,
     Window,
     check_ordered,
+    parse_measurement_target,
     problem,
 )
 from sipe_bayes.calibration.readers.many import matching, names_of
@@ -66,12 +67,16 @@ class Command(Table):
 
 
 class Measurement(Table):
-    """A column that measures a joint or a sensor; ``sign`` * ``factor`` * column in ``unit``.
+    """A column that measures a joint, body or sensor; ``sign`` * ``factor`` * column in ``unit``.
 
-    fit: False keeps it out of the likelihood, for starting windows and plots only. noise_sd: in SI, if known.
+    A vector has three ``columns``; an orientation four, those of a quaternion in the order that ``quaternion`` names,
+    and three channels, its rotation vector (rad). fit: False keeps it out of the likelihood, for starting windows and
+    plots only. noise_sd: in SI, if known.
     """
 
-    column: Text
+    column: Text | None = None
+    columns: tuple[Text, ...] = ()
+    quaternion: Literal["wxyz", "xyzw"] | None = None
     target: TargetWord
     unit: UnitWord
     sign: Sign = 1
@@ -83,13 +88,53 @@ class Measurement(Table):
     @model_validator(mode="before")
     @classmethod
     def _default_name(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "name" not in data and "column" in data:
-            return {**data, "name": data["column"]}
-        return data
+        if not isinstance(data, dict):
+            return data
+        target = str(data.get("target", "")).partition(":")[2]
+        unit = {"unit": "1"} if "quaternion" in data or target.endswith(".orientation") else {}
+        name = {"name": data.get("column", target)} if "column" in data or target else {}
+        return {**unit, **name, **data}
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The log's columns."""
+        return self.columns or (self.column or "",)
+
+    @property
+    def channels(self) -> tuple[tuple[str, str], ...]:
+        """(target, name) of each channel."""
+        if not self.columns:
+            return ((self.target, self.name),)
+        part = f"{self.target}.rotation" if self.quaternion and self.target.startswith("sensor:") else self.target
+        return tuple((f"{part}[{i}]", f"{self.name}_{axis}") for i, axis in enumerate("xyz"))
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        target = parse_measurement_target(self.target)
+        if (self.column is None) != bool(self.columns):
+            came = "both" if self.columns else "neither"
+            raise problem(f"expected either `column` or `columns`, got {came}; give one of them", "column")
+        whole = target.kind != "joint" and target.index is None
+        turns = target.quantity == "orientation" or (target.kind == "sensor" and self.quaternion is not None)
+        if turns and self.quaternion is None:
+            expected = "an orientation is four columns of a quaternion; name their order"
+            raise problem(f"{expected}, quaternion = 'wxyz' or 'xyzw'", "quaternion")
+        if self.quaternion and not (turns and whole):
+            raise problem(f"{self.target} is no orientation; drop it", "quaternion")
+        size = 4 if turns else 3 if target.kind == "body" and whole else 0
+        if size and len(self.columns) != size:
+            message = f"{self.target} is {size} columns, got {list(self.sources)}; give `columns` in order"
+            raise problem(message, "columns")
+        if self.columns and not (whole and len(self.columns) in (3, 4 * turns)):
+            message = f"{self.target} is one column, or a sensor's three, got {list(self.columns)}; use `column`"
+            raise problem(message, "columns")
+        if turns and (self.sign, self.factor) != (1, 1.0):
+            raise problem("a quaternion has none; turn the frame in the MJCF instead", "sign")
+        return self
 
 
 class LogEntry(Table):
-    """One log, or one ``span`` (start, stop) of it in seconds from its first sample.
+    """One log, or one ``span`` (start, stop) of it in seconds from its first sample; or all that a pattern names.
 
     A ``file`` with ``*`` is all files that match, and where ``columns.episode`` is given, each episode is a log; of
     those in ``episodes``, else of all. ``window`` overrides the configuration's for this log.

@@ -108,7 +108,7 @@ def _set_right(data: dict[str, Any], columns: Sequence[Column]) -> dict[str, Any
                 return {**row, "sign": -row.get("sign", 1)}
             return {**row, "factor": by * row.get("factor", 1.0)}
 
-        out[table] = [multiplied(row) if row.get(key, row["column"]) == column.name else row for row in out[table]]
+        out[table] = [multiplied(row) if row.get(key, row.get("column")) == column.name else row for row in out[table]]
     return out
 
 
@@ -121,7 +121,8 @@ def _relocated(data: dict[str, Any], folder: Path) -> dict[str, Any]:
     def rows(table: dict[str, Any]) -> dict[str, Any]:
         return {key: moved(value) if key in ("file", "from") else value for key, value in table.items()}
 
-    out = {**data, "model": moved(data["model"]), "logs": [rows(log) for log in data["logs"]]}
+    logs = [{"file": data["logs"]}] if isinstance(data["logs"], str) else data["logs"]
+    out = {**data, "model": moved(data["model"]), "logs": [rows(log) for log in logs]}
     if data.get("prior"):
         out["prior"] = rows(data["prior"])
     extra = data.get("structure", {}).get("extra")

@@ -46,7 +46,7 @@ def report_of(
         trajectory: what came out.
     """
     finite = np.isfinite(trajectory.observations)
-    names = [*config.channels, *(c.target for c in config.commands)]
+    names = [*_column_names(config), *(c.target for c in config.commands)]
     signals = [y.values for y in (*raw.measurements, *raw.commands)]
     missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
     clipped = {name: count_clipped(values) for name, values in zip(names, signals, strict=True)}
@@ -97,7 +97,7 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
         silent = float(raw.time[-1] - y.time[-1])
         if len(y.time) > 1 and silent > _SILENT * float(np.median(np.diff(y.time))):
             noticed.append(finding(Code.LOG_COMMAND_ENDS, log=log.name, channel=command.target, silent=silent))
-    rates = {m.name: _rate(y) for m, y in zip(config.measurements, raw.measurements, strict=True) if _of_joint(m)}
+    rates = {m.name: _rate(y) for (m, _), y in zip(config.sources, raw.measurements, strict=True) if _of_joint(m)}
     slow = {name: rate for name, rate in rates.items() if rate < THRESHOLDS.slow_log}
     if slow:
         rate = f"{min(slow.values()):.3g} Hz"
@@ -113,6 +113,11 @@ def _rate(series: Series) -> float:
     """Hz of the samples that are there."""
     time = series.time[np.isfinite(series.values)]
     return 1.0 / float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+
+
+def _column_names(config: Config) -> list[str]:
+    """What the measured columns are called: as their channels, those of a vector as themselves."""
+    return [f"{m.name} ({column})" if m.columns else m.name for m, column in config.sources]
 
 
 def _jitter(time: FloatArray) -> float:

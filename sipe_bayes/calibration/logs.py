@@ -35,12 +35,14 @@ from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.rotations import aligned, continued, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert
 from sipe_bayes.diagnostics.records import LogReport
 
 _SLOW = 0.25  # s from row to row: no robot is logged so slowly without its being meant
 _SHORTEST, _LONGEST = 1e-9, 1e9  # s, of a step and of a log: beyond, a clock holds no times
+_UNIT_LENGTH = 0.05  # by which a quaternion's length may differ from one
 _EMPTY = 1000  # grid samples for each of the log: a pause, or a wrong unit of time
 
 
@@ -65,7 +67,7 @@ def load_logs(
         ConfigError: for a unit of the wrong kind.
     """
     check_dimensions(config, dimensions or {})
-    wanted = [m.column for m in config.measurements] + [c.column for c in config.commands]
+    wanted = [column for _, column in config.sources] + [c.column for c in config.commands]
     wanted += [config.columns.episode] if config.columns.episode else []
     loaded = []
     for file, parts in groupby(logs, key=lambda log: log.file):
@@ -97,11 +99,11 @@ def _loaded(config: Config, log: LogEntry, table: Columns, sha256: str) -> tuple
     grid = control_grid(raw.time, config.resample.rate)
     _check_length(config, log, grid, raw.time)
     observed = [sampled(y.time, y.values, _placed(grid, raw, y), config.resample.max_gap) for y in raw.measurements]
-    for measurement, before, after in zip(config.measurements, raw.measurements, observed, strict=True):
-        _check_any(measurement.column, before.values, after)
+    for (_, column), before, after in zip(config.sources, raw.measurements, observed, strict=True):
+        _check_any(column, before.values, after)
     commands = [held(y.values, _placed(grid, raw, y)) for y in raw.commands]
     actions = np.stack(commands, -1) if commands else np.zeros((grid.samples - 1, 0))
-    trajectory = Trajectory(np.stack(observed, -1), actions, grid.dt, name=log.name, channels=config.channels)
+    trajectory = Trajectory(_observations(config, observed), actions, grid.dt, name=log.name, channels=config.channels)
     return trajectory, report_of(config, log, sha256, raw, grid, trajectory)
 
 
@@ -120,15 +122,16 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
             times[name] = next((other for other in times.values() if np.array_equal(other, time)), time)
         return times[name]
 
-    def signal(entry: Command | Measurement) -> Series:
-        column = _column(log, table, entry.column)
-        time = time_of(entry.column)
-        values = _fitted(entry.column, column, len(time))
+    def signal(entry: Command | Measurement, name: str) -> Series:
+        column = _column(log, table, name)
+        time = time_of(name)
+        values = _fitted(name, column, len(time))
         values = convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
         return Series(time, entry.sign * entry.factor * values)
 
-    measurements, commands = [signal(m) for m in config.measurements], [signal(c) for c in config.commands]
-    lead = max((y.time for y, m in zip(measurements, config.measurements, strict=True) if m.fit), key=len)
+    measurements = [y for m in config.measurements for y in _aligned(m, [signal(m, column) for column in m.sources])]
+    commands = [signal(c, c.column) for c in config.commands]
+    lead = max((y.time for y, (m, _) in zip(measurements, config.sources, strict=True) if m.fit), key=len)
     span = _span(log, lead - lead[0])
     part = _after_commands(config, lead, span, commands)
     time = (lead - lead[0])[part]
@@ -146,10 +149,37 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
     for command, series in zip(config.commands, commands, strict=True):
         if series.time is lead:
             _check_first_command(command.column, time, series.values[part])
-    for measurement, series in zip(config.measurements, measurements, strict=True):
+    for (_, column), series in zip(config.sources, measurements, strict=True):
         if not cut(series, False).time.size:
-            raise _apart(measurement.column, series.time, lead[part])
+            raise _apart(column, series.time, lead[part])
     return Recording(time, [cut(y, True) for y in commands], [cut(y, False) for y in measurements], late)
+
+
+def _aligned(entry: Measurement, columns: list[Series]) -> list[Series]:
+    """The columns of a measurement; a quaternion's w-x-y-z with aligned signs, NaN where a number is missing."""
+    if entry.quaternion is None:
+        return columns
+    if len({id(y.time) for y in columns}) > 1:
+        raise LogError(f"columns {list(entry.columns)} have clocks of their own; give a quaternion of one clock")
+    rows = np.stack([y.values for y in columns], axis=-1)
+    rows = rows if entry.quaternion == "wxyz" else rows[:, [3, 0, 1, 2]]
+    size = np.linalg.norm(rows, axis=1)
+    usual = float(np.nanmedian(size)) if np.isfinite(size).any() else 1.0
+    if abs(usual - 1) > _UNIT_LENGTH:
+        raise LogError(
+            f"columns {list(entry.columns)} are no quaternion: its length is {usual:.3g}, expected 1; name its four"
+        )
+    rows = aligned(np.where((np.abs(size - 1) < _UNIT_LENGTH)[:, None], rows, np.nan))
+    return [Series(y.time, values) for y, values in zip(columns, rows.T, strict=True)]
+
+
+def _observations(config: Config, columns: list[FloatArray]) -> FloatArray:
+    """Channels (T+1, O) of the columns on the grid: quaternions become rotation vectors, written without jumps."""
+    rest, channels = iter(columns), []
+    for entry in config.measurements:
+        own = np.stack([next(rest) for _ in entry.sources], axis=-1)
+        channels.append(own if entry.quaternion is None else continued(rotation_vectors(own)))
+    return np.concatenate(channels, axis=-1)
 
 
 def _seconds(config: Config, log: LogEntry, table: Columns, name: str) -> FloatArray:

@@ -21,7 +21,7 @@ from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
-from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.target import TargetError
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Progress
@@ -99,7 +99,10 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
     config = config if isinstance(config, Config) else load_config(config)
     train_logs, held_logs = config.logs_for("train"), config.logs_for("holdout")
     environment = _environment(config, train_logs)
-    dimensions = {m.target: _dimension(u) for m, u in zip(config.measurements, environment.channel_units, strict=True)}
+    units = dict(zip(environment.channels, environment.channel_units, strict=True))
+    dimensions = {
+        m.target: "dimensionless" if m.quaternion else _dimension(units[m.channels[0][1]]) for m in config.measurements
+    }
     dimensions = {target: d for target, d in dimensions.items() if d}
     check_dimensions(config, dimensions)
     train, train_reports = _read(config, train_logs, dimensions)
@@ -160,18 +163,26 @@ def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
             raise ConfigError(f"{config.path}: key `parameters[{i}]`: {error}") from None
         logs = [log.name for log in train] if entry.per_log else []
         parameters += [replace(one, name=f"{one.name}[{log}]", log=log) for log in logs] or [one]
-    channels = [Channel(m.target, m.name) for m in config.measurements]
+    channels = [Channel(*channel) for m in config.measurements for channel in m.channels]
     try:
-        return MjcfEnvironment.build(config.model, parameters, [c.actuator for c in config.commands], channels)
+        environment = MjcfEnvironment.build(config.model, parameters, [c.actuator for c in config.commands], channels)
     except (TargetError, ModelError):
         raise
     except ValueError as error:
         raise ConfigError(f"{config.path}: {error}") from None
+    known = {channel.target for channel in environment.measurements}
+    for m in config.measurements:
+        if not m.columns and m.target not in known:
+            raise ConfigError(
+                f"{config.path}: measurement {m.name!r}: {m.target} is an orientation; give its quaternion's four "
+                "`columns`, and quaternion = 'wxyz' or 'xyzw'"
+            )
+    return environment
 
 
 def _likelihood(config: Config) -> Segments | StateSpace:
-    fit = tuple(m.name for m in config.measurements if m.fit)
-    noise_sd = tuple(m.noise_sd for m in config.measurements)
+    fit = tuple(name for m in config.measurements if m.fit for _, name in m.channels)
+    noise_sd = tuple(m.noise_sd for m in config.measurements for _ in m.channels)
     if config.likelihood == "state_space":
         return StateSpace(fit, noise_sd)
     return Segments(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from sipe_bayes.envs.targets import TargetError, named
+from sipe_bayes.envs.target import TargetError, named
 
 _AXES = ("x", "y", "z")
 _QUANTITIES = {  # of a body, in the world's axes: the sensor that reads it, and its unit

@@ -7,6 +7,7 @@ field before it gets its name, so what is written is what was calibrated.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.envs.contact_targets import pair_index
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
@@ -130,11 +132,22 @@ def _copy(spec: mujoco.MjSpec, model: mujoco.MjModel, target: str) -> None:
     elif kind == "actuator":
         _copy_actuator(spec, model, name)
     elif kind == "geom":
-        spec.geom(name).friction[:] = model.geom(name).friction
+        _copy_contacts(spec.geom(name), model.geom(name))
+    elif kind == "pair":
+        index = pair_index(model, name, target)
+        _copy_contacts(spec.pairs[index], model.pair(index))
     else:
         for field in ("gravity", "wind"):
             getattr(spec.option, field)[:] = getattr(model.opt, field)
-        spec.option.density, spec.option.viscosity = model.opt.density, model.opt.viscosity
+        for field in ("density", "viscosity", "impratio"):
+            setattr(spec.option, field, getattr(model.opt, field))
+
+
+def _copy_contacts(element: Any, model: Any) -> None:
+    """Of a spec's geom or pair what the model's one has."""
+    for field in ("friction", "solref", "solimp"):
+        getattr(element, field)[:] = getattr(model, field)
+    element.margin = float(model.margin[0])
 
 
 def _copy_inertial(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> None:

@@ -38,7 +38,8 @@ from sipe_bayes.envs.laws.bound import BoundLaw, declare, laws_of, moving_on
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.poses import PoseReading, pose_columns, pose_readings
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
-from sipe_bayes.envs.targets import Target, TargetError, bind, named, split
+from sipe_bayes.envs.target import Target, TargetError, named
+from sipe_bayes.envs.targets import bind, split
 from sipe_bayes.envs.unknowns import check_conflicts, physical_targets, with_model_values
 
 _LONGEST_STEP = 0.25  # of the cube: a finite difference of what is not smooth

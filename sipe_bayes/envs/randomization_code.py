@@ -29,7 +29,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment, compile_spec, load_spec
 from sipe_bayes.envs.targets import split
 
 _SIZES = ("nbody", "njnt", "nv", "nu", "ngeom")
-_OPTIONS = ("gravity", "wind", "density", "viscosity")
+_OPTIONS = ("gravity", "wind", "density", "viscosity", "impratio")
 _REACH = 4.0  # sds: what a normal is taken to reach
 _DIGITS = 9  # significant, of numbers in the tables
 

@@ -12,83 +12,29 @@ other two. Several inertia components of a body compose, each leaving the others
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.laws.base import Number
 from sipe_bayes.envs.laws.registry import LAW_OF
+from sipe_bayes.envs.target import Maker, Target, TargetError, entry, named
 
-Writer = Callable[[mujoco.MjModel, float], None]
-Maker = Callable[[mujoco.MjModel, str, int], "Target"]
-Check = Callable[[mujoco.MjModel, str, int], None]
-
-_PATTERN = re.compile(r"^(?:(body|joint|actuator|geom):(.+)|(option))\.([a-z0-9_]+)$")
-_OBJECTS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
-}
-_COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nactuator", "geom": "ngeom", "sensor": "nsensor"}
+_PATTERN = re.compile(r"^(?:(body|joint|actuator|geom|pair):(.+)|(option))\.([a-z0-9_]+)$")
 _AXES = ("x", "y", "z")
-
-
-class TargetError(ValueError):
-    """A target that the model does not have, or that cannot be written."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """One number of a compiled model.
-
-    Args:
-        spec: how it is named.
-        unit: of its value.
-        value: in the model that it is bound to.
-        write: writes another one into a copy of that model.
-        order: writes with a smaller order come first.
-        constants: MuJoCo's derived constants, counts or flags depend on it, so mj_setConst follows a write.
-        minimum: the smallest physical value.
-        physical: whether it is a property of the machine that a report may compare with the model's.
-        step: the least change that a finite difference can be taken over, from values below it.
-        shape: whether its value in the model says nothing, as that of a force's shape while its size is zero.
-    """
-
-    spec: str
-    unit: str
-    value: float
-    write: Writer
-    order: int = 0
-    constants: bool = False
-    minimum: float = -np.inf
-    physical: bool = True
-    step: float = 0.0
-    shape: bool = False
-
-
-def named(model: mujoco.MjModel, kind: str, name: str, where: str) -> int:
-    """Id of an object of ``kind``; raises TargetError that lists what there is."""
-    index = mujoco.mj_name2id(model, _OBJECTS[kind], name)
-    if index < 0:
-        names = [mujoco.mj_id2name(model, _OBJECTS[kind], i) for i in range(getattr(model, _COUNTS[kind]))]
-        known = [n for n in names if n]
-        hint = nearest_name(name, known) or f"; the model has {known}"
-        raise TargetError(f"{where}: the model has no {kind} {name!r}{hint}")
-    return index
 
 
 def split(spec: str) -> tuple[str, str, str]:
     """(kind, name, attribute) of a target; raises TargetError."""
     match = _PATTERN.match(spec)
     if not match:
+        kinds = sorted(set(ATTRIBUTES) - {"option"})
         raise TargetError(
-            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {sorted(_OBJECTS)}, or option.ATTRIBUTE"
+            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {kinds}, or option.ATTRIBUTE"
         )
     kind, name, option, attribute = match.groups()
     return (option or kind, name or "", attribute)
@@ -102,32 +48,11 @@ def bind(model: mujoco.MjModel, spec: str) -> Target:
         article = "an" if kind[0] in "ao" else "a"
         hint = nearest_name(attribute, legal) or f"; known: {', '.join(sorted(legal))}"
         raise TargetError(f"target {spec!r}: {article} {kind} has no attribute {attribute!r}{hint}")
-    index = 0 if kind == "option" else named(model, kind, name, f"target {spec!r}")
+    if kind in ("option", "pair"):
+        index = 0 if kind == "option" else pair_index(model, name, spec)
+    else:
+        index = named(model, kind, name, f"target {spec!r}")
     return legal[attribute](model, spec, index)
-
-
-def _entry(
-    field: str,
-    unit: str,
-    slot: int | None = None,
-    check: Check | None = None,
-    constants: bool = False,
-    minimum: float = -np.inf,
-    order: int = 0,
-) -> Maker:
-    """Of an array of the model, at the object's index and perhaps a slot."""
-
-    def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
-        if check is not None:
-            check(model, spec, index)
-        at = index if slot is None else (index, slot)
-
-        def write(other: mujoco.MjModel, value: float) -> None:
-            getattr(other, field)[at] = value
-
-        return Target(spec, unit, float(getattr(model, field)[at]), write, order, constants, minimum)
-
-    return make
 
 
 def _hinge(model: mujoco.MjModel, joint: int) -> bool:
@@ -152,7 +77,7 @@ def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) 
 
 def _joint_stiffness(model: mujoco.MjModel, spec: str, joint: int) -> Target:
     unit = "N m/rad" if _hinge(model, joint) else "N/m"
-    return _entry("jnt_stiffness", unit, minimum=0.0)(model, spec, joint)
+    return entry("jnt_stiffness", unit, minimum=0.0)(model, spec, joint)
 
 
 def _joint_springref(model: mujoco.MjModel, spec: str, joint: int) -> Target:
@@ -160,7 +85,7 @@ def _joint_springref(model: mujoco.MjModel, spec: str, joint: int) -> Target:
     if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
         raise TargetError(f"target {spec!r}: only hinge and slide joints have this attribute")
     unit = "rad" if _hinge(model, joint) else "m"
-    return _entry("qpos_spring", unit)(model, spec, int(model.jnt_qposadr[joint]))
+    return entry("qpos_spring", unit)(model, spec, int(model.jnt_qposadr[joint]))
 
 
 def _fixed_gain(model: mujoco.MjModel, spec: str, actuator: int) -> None:
@@ -294,7 +219,7 @@ def _joint_polynomial(field: str, slot: int, power: int) -> Maker:
         unit = f"{'N m' if _hinge(model, joint) else 'N'}/({motion})^{power}"
         index = int(model.jnt_dofadr[joint]) if field == "dof_dampingpoly" else joint
         minimum = 0.0 if field == "dof_dampingpoly" else -np.inf
-        return _entry(field, unit, slot, minimum=minimum)(model, spec, index)
+        return entry(field, unit, slot, minimum=minimum)(model, spec, index)
 
     return make
 
@@ -314,7 +239,7 @@ def _force_limit(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
 def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     if int(model.actuator_dyntype[actuator]) != int(mujoco.mjtDyn.mjDYN_FILTEREXACT):
         raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact"')
-    target = _entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
+    target = entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
     return replace(target, step=2 * float(model.opt.timestep))  # shorter ones than a physics step act alike
 
 
@@ -344,7 +269,7 @@ def _laws(kind: str) -> dict[str, Maker]:
 ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds it
     "body": {
         "mass": _body_mass,
-        **{f"com_{a}": _entry("body_ipos", "m", i, order=1, constants=True) for i, a in enumerate(_AXES)},
+        **{f"com_{a}": entry("body_ipos", "m", i, order=1, constants=True) for i, a in enumerate(_AXES)},
         **{f"inertia_{_AXES[i]}{_AXES[j]}": _body_inertia(i, j) for i in range(3) for j in range(i, 3)},
     },
     "joint": {
@@ -360,8 +285,8 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         **_laws("joint"),
     },
     "actuator": {
-        "gear": _entry("actuator_gear", "1", 0, constants=True),
-        "gain": _entry("actuator_gainprm", "force/command", 0, _fixed_gain),
+        "gear": entry("actuator_gear", "1", 0, constants=True),
+        "gain": entry("actuator_gainprm", "force/command", 0, _fixed_gain),
         "kp": _actuator_kp,
         "kv": _actuator_kv,
         "bias_force": _actuator_bias(0, "force"),
@@ -374,14 +299,17 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         **_laws("actuator"),
     },
     "geom": {
-        "friction": _entry("geom_friction", "1", 0, minimum=0.0),
-        "friction_torsional": _entry("geom_friction", "m", 1, minimum=0.0),
-        "friction_rolling": _entry("geom_friction", "m", 2, minimum=0.0),
+        "friction": entry("geom_friction", "1", 0, minimum=0.0),
+        "friction_torsional": entry("geom_friction", "m", 1, minimum=0.0),
+        "friction_rolling": entry("geom_friction", "m", 2, minimum=0.0),
+        **GEOM_CONTACTS,
     },
+    "pair": PAIR_CONTACTS,
     "option": {
         **{f"gravity_{a}": _option("gravity", i, "m/s^2") for i, a in enumerate(_AXES)},
         **{f"wind_{a}": _option("wind", i, "m/s") for i, a in enumerate(_AXES)},
         "density": _option("density", None, "kg/m^3"),
         "viscosity": _option("viscosity", None, "Pa s"),
+        "impratio": _option("impratio", None, "1"),
     },
 }

@@ -23,7 +23,8 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.base import Environment
-from sipe_bayes.envs.targets import Target, bind
+from sipe_bayes.envs.target import Target
+from sipe_bayes.envs.targets import bind
 
 Variant = Literal["default", "in_distribution", "out_of_distribution"]
 VARIANTS: tuple[Variant, ...] = ("default", "in_distribution", "out_of_distribution")

@@ -13,7 +13,8 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.channels import Channel, is_rotation
 from sipe_bayes.envs.sensing import LEAST, NEUTRAL, UNITS, of_sensor, sensed_channels
-from sipe_bayes.envs.targets import TargetError, bind
+from sipe_bayes.envs.target import TargetError
+from sipe_bayes.envs.targets import bind
 
 # the numbers that a target writes, where they are not its own
 _WRITES = {"kp": ("gain", "bias_position"), "kv": ("bias_velocity",), "offset": ("bias_force",)}

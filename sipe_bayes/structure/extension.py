@@ -32,7 +32,8 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
-from sipe_bayes.envs.targets import TargetError, bind
+from sipe_bayes.envs.target import TargetError
+from sipe_bayes.envs.targets import bind
 from sipe_bayes.envs.unknowns import physical_targets
 from sipe_bayes.structure.machine import Machine
 

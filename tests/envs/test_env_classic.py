@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.target import TargetError
 from sipe_bayes.envs.task import Task, Transition
 from sipe_bayes.envs.tasks.classic import CART_POLE, PENDULUM, rod_length
 from sipe_bayes.simulation.simulator import Simulator

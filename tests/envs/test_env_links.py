@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sipe_bayes.envs.assets import gymnasium_asset
-from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.target import TargetError
 from sipe_bayes.envs.tasks.links import Links
 from tests.problems.lengthened import compiled, differences, edited, read
 

@@ -15,7 +15,7 @@ from sipe_bayes.envs.laws.bound import declare, laws_of
 from sipe_bayes.envs.laws.registry import LAWS
 from sipe_bayes.envs.laws.residual import Residual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.target import TargetError
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.machines import MACHINES, Drive, environment
 

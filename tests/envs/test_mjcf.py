@@ -13,7 +13,7 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
-from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.target import TargetError
 from sipe_bayes.simulation.simulator import Simulator
 
 XML = """<mujoco><worldbody>

@@ -22,8 +22,9 @@ XML = """
   <body name="arm"><joint name="hinge" axis="0 1 0" damping="0.1"/>
     <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.02" mass="0.5"/>
     <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="0 0 1"/>
-    <geom size="0.03" mass="0.2"/></body></body>
-  </worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+    <geom name="tip" size="0.03" mass="0.2"/></body></body>
+  </worldbody><contact><pair geom1="link" geom2="tip"/></contact>
+  <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
 PARAMETERS = [
     Parameter("mass", 0.2, 1.0, targets=("body:arm.mass",)),
     Parameter("damping", 0.0, 0.5, targets=("joint:hinge.damping",)),
@@ -33,6 +34,9 @@ PARAMETERS = [
     Parameter("gravity", -11.0, -9.0, targets=("option.gravity_z",)),
     Parameter("density", 0.0, 2.0, targets=("option.density",)),
     Parameter("friction", 0.0, 0.1, targets=("joint:slide.frictionloss",)),
+    Parameter("bounce", 0.1, 1.0, targets=("geom:link.solref_dampratio",)),
+    Parameter("touching", 0.0, 0.01, targets=("pair:link/tip.margin",)),
+    Parameter("impratio", 0.5, 10.0, targets=("option.impratio",)),
     Parameter("bias", -0.1, 0.1, targets=("sensor:joint:hinge.position.bias",)),
 ]
 FILES = {"mujoco_playground.py", "gymnasium_wrapper.py", "isaac_lab_events.py"}

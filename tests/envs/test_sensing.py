@@ -9,7 +9,7 @@ import scipy.integrate
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.sensing import Sensing
-from sipe_bayes.envs.targets import TargetError
+from sipe_bayes.envs.target import TargetError
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.machines import MACHINES, environment
 

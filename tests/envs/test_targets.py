@@ -18,7 +18,8 @@ from sipe_bayes.envs.inertia import body_frame_inertia, check_inertia
 from sipe_bayes.envs.laws.bound import declare
 from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.envs.targets import TargetError, bind
+from sipe_bayes.envs.target import TargetError
+from sipe_bayes.envs.targets import bind
 
 XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worldbody>
   <geom name="floor" type="plane" size="3 3 .1"/>
@@ -33,7 +34,7 @@ XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><world
   <body name="box" pos="2 0 1"><freejoint name="free"/>
     <geom name="box" type="box" size=".1 .2 .3" mass="2"/></body>
   <body name="top" pos="3 0 1"><joint name="spin" type="ball"/><geom size=".1" mass="1" pos="0 0 .3"/></body>
-  </worldbody><actuator>
+  </worldbody><contact><pair name="ends" geom1="box" geom2="ball" solref=".03 .9"/></contact><actuator>
   <motor name="motor" joint="hinge" gear="2"/>
   <position name="position" joint="slide" kp="30" kv="2"/>
   <general name="general" joint="hinge2" gainprm="4" biastype="affine" biasprm=".1 -3 -.2"
@@ -84,6 +85,16 @@ def offset(element: Any, value: float) -> None:
 
 def limit(element: Any, value: float) -> None:
     element.forcelimited, element.forcerange = True, [-value, value]
+
+
+def sliding(element: Any, value: float) -> None:
+    vector("friction", 0)(element, value)
+    vector("friction", 1)(element, value)
+
+
+def rolling(element: Any, value: float) -> None:
+    vector("friction", 3)(element, value)
+    vector("friction", 4)(element, value)
 
 
 def mass(element: Any, value: float) -> None:
@@ -157,6 +168,26 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("geom:box.friction", 0.3, "1", vector("friction", 0)),
     ("geom:box.friction_torsional", 0.01, "m", vector("friction", 1)),
     ("geom:floor.friction_rolling", 0.002, "m", vector("friction", 2)),
+    ("geom:box.solref_timeconst", 0.05, "s", vector("solref", 0)),
+    ("geom:box.solref_dampratio", 0.3, "1", vector("solref", 1)),
+    ("geom:floor.solimp_dmin", 0.8, "1", vector("solimp", 0)),
+    ("geom:floor.solimp_dmax", 0.99, "1", vector("solimp", 1)),
+    ("geom:ball.solimp_width", 0.003, "m", vector("solimp", 2)),
+    ("geom:ball.solimp_midpoint", 0.4, "1", vector("solimp", 3)),
+    ("geom:ball.solimp_power", 3.0, "1", vector("solimp", 4)),
+    ("geom:ball.margin", 0.01, "m", scalar("margin")),
+    ("pair:ends.friction", 0.4, "1", sliding),
+    ("pair:ends.friction_torsional", 0.01, "m", vector("friction", 2)),
+    ("pair:ball/box.friction_rolling", 0.003, "m", rolling),
+    ("pair:box/ball.solref_timeconst", 0.05, "s", vector("solref", 0)),
+    ("pair:ends.solref_dampratio", 0.3, "1", vector("solref", 1)),
+    ("pair:ends.solimp_dmin", 0.8, "1", vector("solimp", 0)),
+    ("pair:ends.solimp_dmax", 0.99, "1", vector("solimp", 1)),
+    ("pair:ends.solimp_width", 0.003, "m", vector("solimp", 2)),
+    ("pair:ends.solimp_midpoint", 0.4, "1", vector("solimp", 3)),
+    ("pair:ends.solimp_power", 3.0, "1", vector("solimp", 4)),
+    ("pair:ends.margin", 0.01, "m", scalar("margin")),
+    ("option.impratio", 3.0, "1", scalar("impratio")),
     ("option.gravity_x", 0.5, "m/s^2", vector("gravity", 0)),
     ("option.gravity_z", -9.5, "m/s^2", vector("gravity", 2)),
     ("option.wind_y", 0.5, "m/s", vector("wind", 1)),
@@ -188,6 +219,8 @@ def element(spec: Any, target: str) -> Any:
     if (kind, attribute) in LAW_OF:
         label = f"{kind}:{name}.{LAW_OF[kind, attribute][0].name}"
         return next(numeric for numeric in spec.numerics if numeric.name == label)
+    if kind == "pair":
+        return spec.pairs[0]
     return spec.option if kind == "option" else getattr(spec, kind)(name)
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.assets import robotics_asset
-from sipe_bayes.envs.targets import Target, named
+from sipe_bayes.envs.target import Target, named
 from sipe_bayes.envs.task import Solved, Task, Transition, scaled
 
 _FINGERS = ("FFJ3", "FFJ2", "FFJ1", "FFJ0", "MFJ3", "MFJ2", "MFJ1", "MFJ0", "RFJ3", "RFJ2", "RFJ1", "RFJ0")

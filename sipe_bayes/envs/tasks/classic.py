@@ -25,7 +25,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.envs.targets import Target, TargetError, named
+from sipe_bayes.envs.target import Target, TargetError, named
 from sipe_bayes.envs.task import Solved, Task, Transition, scaled
 
 PENDULUM = """

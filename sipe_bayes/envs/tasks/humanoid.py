@@ -27,7 +27,8 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.assets import compiled_without_visuals, gymnasium_asset
-from sipe_bayes.envs.targets import Target, bind
+from sipe_bayes.envs.target import Target
+from sipe_bayes.envs.targets import bind
 from sipe_bayes.envs.task import Solved, Transition, scaled
 from sipe_bayes.envs.tasks.links import LinkTask
 

@@ -37,7 +37,8 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.inertia import body_frame_inertia
-from sipe_bayes.envs.targets import Target, TargetError, bind
+from sipe_bayes.envs.target import Target, TargetError
+from sipe_bayes.envs.targets import bind
 from sipe_bayes.envs.task import Task
 
 _SPHERE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
