@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.rotations import rotation_vectors
 from sipe_bayes.envs.target import TargetError, named
 
 _AXES = ("x", "y", "z")
@@ -183,6 +185,27 @@ def _of_turn(model: mujoco.MjModel, name: str, turn: int, where: str) -> Reader:
     if int(model.sensor_type[sensor]) not in map(int, _TURNS):
         raise TargetError(f"{where}: sensor {name!r} gives no quaternion; write sensor:{name}, without .rotation")
     return Reader(int(model.sensor_adr[sensor]), True, "rad", turn)
+
+
+def read_channels(
+    names: Sequence[str],
+    readers: Sequence[Reader],
+    rotations: Sequence[tuple[int, int, int]],
+    states: FloatArray,
+    derived: FloatArray | None,
+) -> FloatArray:
+    """What channels (..., O) are of states (..., S) and sensordata (..., D); those of ``rotations`` are vectors."""
+    out = np.empty((*states.shape[:-1], len(readers)))
+    for k, reader in enumerate(readers):
+        source = derived if reader.derived else states
+        if source is None:
+            raise ValueError(f"channel {names[k]!r}: needs sensordata, got none")
+        if reader.turn is None:
+            out[..., k] = source[..., reader.index]
+        elif reader.turn == 0:
+            triple = next(triple for triple in rotations if k in triple)
+            out[..., triple] = rotation_vectors(source[..., reader.index : reader.index + 4])
+    return out
 
 
 def state_column(model: mujoco.MjModel, reader: Reader) -> int | None:

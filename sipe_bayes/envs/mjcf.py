@@ -19,7 +19,6 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.core.rotations import rotation_vectors
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import (
     Channel,
@@ -27,6 +26,7 @@ from sipe_bayes.envs.channels import (
     add_body_sensors,
     check_sensors,
     expanded,
+    read_channels,
     reader_of,
     rotation_triples,
     state_column,
@@ -313,17 +313,7 @@ class MjcfEnvironment(Environment):
         self, model: mujoco.MjModel, states: FloatArray, derived: FloatArray | None, goals: FloatArray | None = None
     ) -> FloatArray:
         """What is measured, of states and sensordata; raises ValueError where that is wanted and missing."""
-        out = np.empty((*states.shape[:-1], len(self._readers)))
-        for k, reader in enumerate(self._readers):
-            source = derived if reader.derived else states
-            if source is None:
-                raise ValueError(f"channel {self.channels[k]!r}: needs sensordata, got none")
-            if reader.turn is None:
-                out[..., k] = source[..., reader.index]
-        for triple in self.rotations:
-            first = self._readers[triple[0]].index
-            out[..., triple] = rotation_vectors(derived[..., first : first + 4])  # type: ignore[index]
-        return out
+        return read_channels(self.channels, self._readers, self.rotations, states, derived)
 
     @cached_property
     def rotations(self) -> tuple[tuple[int, int, int], ...]:  # type: ignore[override]
@@ -337,8 +327,7 @@ class MjcfEnvironment(Environment):
 
     def state_columns(self, model: mujoco.MjModel) -> tuple[int | None, ...]:
         """Positions and velocities of joints, of free ones those of their body's origin."""
-        of_poses = pose_columns(model, self.poses, len(self._readers))
-        return tuple(state_column(model, r) if c is None else c for r, c in zip(self._readers, of_poses, strict=True))
+        return pose_columns(model, self.poses, [state_column(model, r) for r in self._readers])
 
     def history(
         self, model: mujoco.MjModel, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray

@@ -121,9 +121,11 @@ def _frame(
     return int(bodies[index]), positions[index], quaternion
 
 
-def pose_columns(model: mujoco.MjModel, readings: Sequence[PoseReading], count: int) -> list[int | None]:
-    """For each of ``count`` channels the column of the physics state that it is, as it tells of a free joint."""
-    columns: list[int | None] = [None] * count
+def pose_columns(
+    model: mujoco.MjModel, readings: Sequence[PoseReading], columns: Sequence[int | None]
+) -> tuple[int | None, ...]:
+    """``columns`` of the physics state by channel, with those that channels tell of free joints."""
+    columns = list(columns)
     for reading in readings:
         if int(model.jnt_type[reading.joint]) != _FREE or not reading.at_origin or reading.own_axes:
             continue
@@ -131,6 +133,7 @@ def pose_columns(model: mujoco.MjModel, readings: Sequence[PoseReading], count: 
             "position": 1 + int(model.jnt_qposadr[reading.joint]),
             "linear_velocity": 1 + model.nq + int(model.jnt_dofadr[reading.joint]),
         }.get(reading.quantity)
-        for i, channel in enumerate(reading.channels):
-            columns[channel] = None if first is None else first + i
-    return columns
+        if first is not None:
+            for i, channel in enumerate(reading.channels):
+                columns[channel] = first + i
+    return tuple(columns)
