@@ -1,4 +1,4 @@
-"""Logs of poses: quaternions in either order and of any sign, vectors, many logs by a pattern, wrong input."""
+"""Logs of poses: quaternions in either order and of any sign, vectors, wrong input."""
 
 from __future__ import annotations
 
@@ -115,7 +115,6 @@ def test_a_log_of_one_sample_is_refused_in_one_line(tmp_path: Path) -> None:
         ('name = "turn"', "sign = -1", "a quaternion has none; turn the frame in the MJCF instead"),
         ('name = "turn"', 'unit = "deg"', "body:cube.orientation is no such quantity"),
         ("body:cube.position", "body:cub.position", "no body 'cub'; did you mean 'cube'"),
-        ("tosses/*.csv", "throws/*.csv", r"`logs\[0\].file`: no file matches 'throws/\*.csv'"),
         ("body:cube.orientation", "sensor:tag", "gives no quaternion"),
     ],
 )
@@ -137,14 +136,3 @@ def test_a_quaternion_sensor_needs_its_four_columns(tmp_path: Path) -> None:
 def test_columns_that_are_no_quaternion_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"columns \['x', 'b', 'c', 'd'\] are no quaternion: its length is"):
         prepare(write(tmp_path, CONFIG.replace('"a", "b"', '"x", "b"')))
-
-
-def test_logs_of_a_pattern_are_called_as_their_files(tmp_path: Path) -> None:
-    text = CONFIG.replace('logs = "tosses/*.csv"\n', "") + '\n[[logs]]\nfile = "tosses/*.csv"\nname = "toss"\n'
-    with pytest.raises(
-        ConfigError, match=r"`logs\[0\].name`: 2 files match .*; drop it, each log is called as its file"
-    ):
-        load_config(write(tmp_path, text))
-    text = text.replace('name = "toss"', 'span = [0, 0.2]\nuse = "train"')
-    logs = load_config(write(tmp_path, text)).logs
-    assert [(log.name, log.span) for log in logs] == [("0", (0.0, 0.2)), ("1", (0.0, 0.2))]
