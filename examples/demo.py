@@ -1,29 +1,37 @@
-"""``make demo``: calibrate the simple pendulum from one real log and compare it on two others.
+"""``make demo``: calibrate the simple pendulum from one real log, compare it on two others, and ask what it lacks.
 
 The comparison is the error over 0.5 s open-loop windows of logs that were not used for the fit, from the same starts:
-the posterior's mode, the identification published with the logs, and the model as weighed, without friction.
+the posterior's mode, the identification published with the logs, and the model as weighed, without friction. Then the
+model as weighed is asked what it lacks (``sipe discover``), which ends with an answer.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sipe_bayes.calibration.discover import run_discovery
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.run import run
 from sipe_bayes.cli.app import print_calibration
+from sipe_bayes.cli.discover import print_discovery
 from sipe_bayes.cli.progress import Progress
 from sipe_bayes.core.files import OutputError
+from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.likelihood.windows import Windows
 
-CONFIG = Path(__file__).parent / "simple_pendulum" / "calibrate.toml"
+FOLDER = Path(__file__).parent / "simple_pendulum"
+CONFIG, LACKING = FOLDER / "calibrate.toml", FOLDER / "discover.toml"
 OUT = Path("runs")
+Run = TypeVar("Run")
 
 INERTIA, MASS_LENGTH = 0.06259, 0.1022  # kg m^2, kg m: published with the logs
 VISCOUS, COULOMB, OFFSET = 0.04707, 0.1839, -0.07586  # N m s/rad, N m, N m
@@ -73,22 +81,32 @@ def published_errors(windows: Windows) -> NDArray[np.float64]:
     return np.array([np.sqrt(square[m].sum() / windows.observed[m].sum()) for m in mine])
 
 
-def calibrate() -> Calibration:
-    """Into runs/demo, or a fresh folder when that one holds another configuration's run."""
-    folders = [OUT / "demo", *(OUT / f"demo-{n}" for n in range(2, 100))]
-    for folder in folders:
+def fresh(run_into: Callable[[Path], Run], name: str) -> Run:
+    """What a run into runs/NAME gives, or into a fresh folder when that one holds another configuration's run."""
+    for folder in [OUT / name, *(OUT / f"{name}-{n}" for n in range(2, 100))]:
         try:
-            with Progress() as progress:
-                return run(CONFIG, out=folder, progress=progress.update)
+            return run_into(folder)
         except OutputError:
             continue
     raise OutputError(f"{OUT}: holds a hundred demos; delete them")
 
 
-def save_picture(found: Calibration) -> Path:
-    """The README's picture, from the report's figures: a held-out log above the marginals."""
+def calibrate(folder: Path) -> Calibration:
+    with Progress() as progress:
+        return run(CONFIG, out=folder, progress=progress.update)
+
+
+def discover(folder: Path) -> Discovery:
+    with Progress() as progress:
+        return run_discovery(LACKING, out=folder, progress=progress.update)
+
+
+def save_picture(found: Discovery) -> Path:
+    """The README's picture, from the report's figures: before and after, of the training log and of a held-out one."""
     figures = Path(found.out) / "figures"
-    parts = [Image.open(figures / f"{name}.png") for name in ("signals_1_direct_collocation", "marginals")]
+    parts = [
+        Image.open(figures / f"{name}.png") for name in ("residuals_before_after", "before_after_1_direct_collocation")
+    ]
     whole = Image.new("RGB", (max(p.width for p in parts), sum(p.height for p in parts)), "white")
     for part, top in zip(parts, (0, parts[0].height), strict=True):
         whole.paste(part, (0, top))
@@ -98,8 +116,7 @@ def save_picture(found: Calibration) -> Path:
 
 
 def main() -> int:
-    found = calibrate()
-    save_picture(found)
+    found = fresh(calibrate, "demo")
     print_calibration(found)
     problem = prepare(CONFIG)
     if problem.holdout is None:
@@ -112,7 +129,10 @@ def main() -> int:
     rows = zip(problem.holdout.names, ours, published_errors(windows), weighed, strict=True)
     for name, *values in rows:
         print(f"{name:28}{values[0]:16.3f}{values[1]:12.3f}{values[2]:23.3f}")
-    print(f"\nreport: {Path(found.out).resolve() / 'report.html'}")
+    print(f"\nreport: {Path(found.out).resolve() / 'report.html'}\n")
+    lacking = fresh(discover, "demo-discover")
+    save_picture(lacking)
+    print_discovery(lacking)
     return 0
 
 

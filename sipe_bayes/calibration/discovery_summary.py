@@ -23,6 +23,7 @@ from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Sig
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.structures import Structures
@@ -44,7 +45,7 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
         if logs is not None:
             compared += _errors(use, before, after, logs)
             drawn += _signals(use, before, after, logs, seed)
-    user, added = len(problem.prior.space), after.summaries(seed)
+    added = [p for label in structures.best.labels for p in _added(structures, label, seed)]
     averaged = Marginals.of(structures.posterior, problem.prior, problem.prior.space, seed)
     return Discovery(
         name=name,
@@ -56,7 +57,8 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
         prior=problem.prior,
         parameters=tuple(averaged.summaries()),
         plain_parameters=tuple(before.summaries(seed)),
-        added=tuple(added[user:]),
+        added=tuple(added),
+        cost=structures.search.cost,
         best=after.values,
         errors=tuple(compared),
         comparison=_comparison(problem, before, after),
@@ -191,6 +193,12 @@ def _gain(structures: Structures, label: str) -> tuple[float | None, float | Non
     known = one.held_out is not None and rest.held_out is not None
     held_out = one.held_out - rest.held_out if known else None  # type: ignore[operator]
     return one.evidence - rest.evidence, held_out
+
+
+def _added(structures: Structures, label: str, seed: int) -> list[ParameterSummary]:
+    """Parameters of an extension of the best structure, averaged over the structures that have it."""
+    posterior = structures.posterior_of_piece(label)
+    return Marginals.of(posterior, default_prior(posterior.space), posterior.space, seed).summaries()
 
 
 def _promises(structures: Structures) -> tuple[Promise, ...]:

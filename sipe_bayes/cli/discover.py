@@ -63,9 +63,9 @@ def print_discovery(discovery: Discovery) -> None:
 def lines_of(discovery: Discovery) -> list[str]:
     """What is printed above the answer."""
     from sipe_bayes.report.discovery.words import (
+        chance,
         error_line,
         nats,
-        probability_text,
         structure_text,
         value_rows,
         warnings,
@@ -75,7 +75,7 @@ def lines_of(discovery: Discovery) -> list[str]:
     lines = [f"{discovery.name}, what the model lacks: {effort}"]
     tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]
     for one in discovery.rows:
-        cells = f"{nats(one.evidence):>9}{nats(one.held_out):>9}{probability_text(one.probability):>12}"
+        cells = f"{nats(one.evidence):>9}{nats(one.held_out):>9}{chance(one):>12}"
         tried.append(f"  {structure_text(one):58.58}{cells}")
     lines += _cut(tried, _TRIED)
     errors = [error for error in discovery.errors if error.use == "holdout"] or list(discovery.errors)

@@ -117,7 +117,8 @@ class Discovery:
         prior: of them.
         parameters: that posterior by parameter.
         plain_parameters: the posterior under the plain model.
-        added: parameters of the most probable structure's extensions.
+        added: parameters of the most probable structure's extensions, averaged over the structures that have them.
+        cost: nats of evidence that an extension has to gain, since there were so many to choose from.
         best: the optimum of the most probable structure, in units.
         errors: before and after, held-out logs first.
         comparison: of the held-out errors after with those before, from the starts that each model fits best; None
@@ -144,6 +145,7 @@ class Discovery:
     parameters: tuple[ParameterSummary, ...]
     plain_parameters: tuple[ParameterSummary, ...]
     added: tuple[ParameterSummary, ...]
+    cost: float
     best: Mapping[str, float]
     errors: tuple[ModelErrors, ...]
     comparison: Comparison | None
@@ -179,6 +181,7 @@ class Discovery:
             "parameters": [asdict(p) for p in self.parameters],
             "plain_parameters": [asdict(p) for p in self.plain_parameters],
             "added": [asdict(p) for p in self.added],
+            "cost": self.cost,
             "best": dict(self.best),
             "errors": [asdict(row) for row in self.errors],
             "comparison": None if self.comparison is None else self.comparison.to_dict(),

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.columns import Column
@@ -30,6 +31,7 @@ class StructureRow:
         held_out: nats of held-out pieces over the plain model; None where there are no pieces.
         probability: of the structure, given the logs.
         rollouts: that its fit took.
+        yardstick: whether it has a force without a name, and is no candidate itself.
     """
 
     sentences: tuple[str, ...]
@@ -38,6 +40,7 @@ class StructureRow:
     held_out: float | None
     probability: float
     rollouts: int
+    yardstick: bool
 
 
 @dataclass(frozen=True)
@@ -81,10 +84,13 @@ class Structures:
 
     def _counts(self, one: FittedStructure) -> bool:
         """Whether a structure of named pieces foretells held-out pieces better than every smaller one tried."""
-        if any(self.search.placed[label].extension.last_resort for label in one.labels):
+        if self._is_yardstick(one):
             return False
         smaller = [o for o in self.fitted if set(o.labels) < set(one.labels)]
         return all(one.held_out is None or o.held_out is None or one.held_out > o.held_out for o in smaller)
+
+    def _is_yardstick(self, one: FittedStructure) -> bool:
+        return any(self.search.placed[label].extension.last_resort for label in one.labels)
 
     @property
     def best(self) -> FittedStructure:
@@ -125,7 +131,8 @@ class Structures:
             if one.held_out is not None and plain.held_out is not None:
                 held_out = one.held_out - plain.held_out
             sentences = tuple(x.sentence for x in self.placed(one))
-            rows.append(StructureRow(sentences, one.labels, one.evidence - plain.evidence, held_out, p, one.rollouts))
+            gain = one.evidence - plain.evidence
+            rows.append(StructureRow(sentences, one.labels, gain, held_out, p, one.rollouts, self._is_yardstick(one)))
         return sorted(rows, key=lambda row: (-row.probability, -row.evidence))
 
     @property
@@ -135,7 +142,7 @@ class Structures:
         None where no such force was fitted.
         """
         for one in self.fitted:
-            if any(self.search.placed[label].extension.last_resort for label in one.labels):
+            if self._is_yardstick(one):
                 whole = max(one.evidence, self.best.evidence) - self.plain.evidence
                 return (self.best.evidence - self.plain.evidence) / whole if whole > 0 else None
         return None
@@ -144,12 +151,29 @@ class Structures:
     def posterior(self) -> GaussianMixture:
         """Of the user's parameters, averaged over the structures."""
         space = self.search.fitting.prior.space
-        n = len(space)
-        kept = [(p, o) for p, o in zip(self.probabilities, self.fitted, strict=True) if p > _NEGLIGIBLE]
-        weights = np.log([p for p, _ in kept])
-        means = np.stack([o.mean[:n] for _, o in kept])
-        covariances = np.stack([o.covariance[:n, :n] for _, o in kept])
-        return GaussianMixture(weights, means, covariances, space)
+        return self._averaged(space, [(p, one, 0) for p, one in self._weighed()])
+
+    def posterior_of_piece(self, label: str) -> GaussianMixture:
+        """Of the parameters of an extension of the best structure, averaged over the structures that have it."""
+        having = []
+        for p, one in self._weighed():
+            if label in one.labels:
+                before = sum(len(self.search.placed[o].parameters) for o in one.labels[: one.labels.index(label)])
+                having.append((p, one, len(self.search.fitting.prior.space) + before))
+        return self._averaged(ParameterSpace(self.search.placed[label].parameters), having)
+
+    def _weighed(self) -> list[tuple[float, FittedStructure]]:
+        """Structures that count, with their probabilities."""
+        pairs = zip(self.probabilities.tolist(), self.fitted, strict=True)
+        return [(p, one) for p, one in pairs if p > _NEGLIGIBLE]
+
+    @staticmethod
+    def _averaged(space: ParameterSpace, parts: Sequence[tuple[float, FittedStructure, int]]) -> GaussianMixture:
+        """The mixture of the normals that structures have for the parameters of a space, each from an index on."""
+        own = [(np.log(p), one, slice(first, first + len(space))) for p, one, first in parts]
+        means = np.stack([one.mean[at] for _, one, at in own])
+        covariances = np.stack([one.covariance[at, at] for _, one, at in own])
+        return GaussianMixture(np.array([weight for weight, _, _ in own]), means, covariances, space)
 
     def posterior_of(self, one: FittedStructure) -> GaussianMixture:
         """Of all parameters of one structure, the extensions' behind the user's."""

@@ -78,7 +78,7 @@ def test_folder_is_complete(case: tuple[Path, Discovery]) -> None:
 def test_discovered_model_has_the_values(case: tuple[Path, Discovery]) -> None:
     _, found = case
     model = mujoco.MjModel.from_xml_path(str(Path(found.out) / "discovered.xml"))
-    assert model.dof_frictionloss[0] == pytest.approx(found.added[0].mode, rel=1e-4)
+    assert model.dof_frictionloss[0] == pytest.approx(found.best["hinge.dry_friction"], rel=1e-4)
 
 
 def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Discovery]) -> None:

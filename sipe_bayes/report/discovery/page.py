@@ -13,11 +13,11 @@ from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors
 from sipe_bayes.report.discovery import plots
 from sipe_bayes.report.discovery.words import (
     alternatives,
+    chance,
     discovery_verdicts,
     nats,
     next_steps,
     piece_text,
-    probability_text,
     residual_lines,
     structure_text,
     value_rows,
@@ -72,7 +72,7 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
             "what": structure_text(row),
             "evidence": nats(row.evidence),
             "held_out": nats(row.held_out),
-            "probability": probability_text(row.probability),
+            "probability": chance(row),
             "rollouts": f"{row.rollouts:,}",
         }
         for row in discovery.rows
@@ -91,6 +91,7 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
         "laws": [piece for piece in discovery.kept if not piece.native],
         "references": {piece.sentence: piece.reference for piece in discovery.kept if len(piece.reference) > 1},
         "structures": structures,
+        "cost": nats(discovery.cost).lstrip("+"),
         "promises": [
             {"what": p.sentence, "gain": nats(p.gain), "fitted": "yes" if p.fitted else ""} for p in discovery.promises
         ],

@@ -71,7 +71,7 @@ def _labels(above: Axes, below: Axes, signal: Signal, row: ModelErrors | None) -
     above.set_ylabel(with_unit(shortened(signal.channel, 22), signal.unit))
     below.set_ylabel("error")
     if row is not None:
-        sizes = f"RMSE {error_text(row.before)} before, {error_text(row.after)} after {unit_text(row.unit)}"
+        sizes = f"RMSE {error_text(row.before)} {unit_text(row.unit)} before, {error_text(row.after)} after"
         above.set_title(f"{sizes}; model as given {error_text(row.given)}", loc="right", color="#444444", fontsize=8.5)
 
 
@@ -96,7 +96,7 @@ def _residual_figure(rows: Sequence[tuple[Residual, Residual]]) -> Figure:
         left.axhline(0, color=PRIOR, lw=0.7)
         left.set_xlim(first.time[0], first.time[-1])
         left.set_ylabel(with_unit("residual", first.unit))
-        left.set_title(f"{shortened(first.log, 36)}: {shortened(first.channel, 24)}", loc="left")
+        left.set_title(f"{shortened(first.log, 36)}: {shortened(first.channel, 24)}, training log", loc="left")
         right.axhline(0, color=PRIOR, lw=0.7)
         right.set_title("autocorrelation", loc="left")
         ticks(left.yaxis, 4)

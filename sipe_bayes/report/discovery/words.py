@@ -38,6 +38,11 @@ def found_values(discovery: Discovery, piece: Piece) -> str:
     return listed([*texts, *([f"{len(mine) - _VALUES} more"] if len(mine) > _VALUES else [])])
 
 
+def chance(row: StructureRow) -> str:
+    """The probability of a structure; none of one that is only a yardstick."""
+    return "–" if row.yardstick else probability_text(row.probability)
+
+
 def structure_text(row: StructureRow) -> str:
     """What a structure has."""
     return listed(row.sentences) or "the model as it was"
@@ -85,7 +90,9 @@ def held_out_verdict(discovery: Discovery) -> Verdict | None:
             return None
         return Verdict("fair", "No log was held out: only pieces of the training logs speak for it.")
     interval = f"95 % interval {1 / comparison.high:.2f} to {1 / comparison.low:.2f}"
-    margin = f"{1 / comparison.ratio:.2f} times that of the plain model, calibrated ({interval})"
+    margin = (
+        f"{1 / comparison.ratio:.2f} times that of the plain model, calibrated ({interval}), each from its best starts"
+    )
     words = {
         "better": ("good", f"On held-out logs its error falls to {margin}."),
         "worse": ("bad", f"On held-out logs its error is LARGER, {margin}."),
