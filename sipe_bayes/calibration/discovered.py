@@ -60,12 +60,16 @@ def _note(placed: list[Placed]) -> str:
     """What the model has that it had not, and what MuJoCo itself does not simulate of it."""
     if not placed:
         return "the model as it was, calibrated: nothing was found that it lacks"
-    lines = [f"with {one.sentence}{'' if one.extension.native else law_note(one)}" for one in placed]
+    lines = [f"with {one.sentence}{_reservation(one)}" for one in placed]
     return "\n     ".join(["the model, calibrated:", *lines])
 
 
-def law_note(placed: Placed) -> str:
-    """That an extension is not simulated by MuJoCo itself, and what comes nearest."""
+def _reservation(placed: Placed) -> str:
+    """Where MuJoCo by itself does not simulate an extension: who does, and what comes nearest."""
+    if placed.extension.kind == "channel":
+        return " (of the measurement, which has no place in a model: see discovered.toml)"
+    if placed.extension.native:
+        return ""
     nearest = f"; nearest element: {placed.extension.nearest}" if placed.extension.nearest else ""
     return f" (numbers in <numeric>, simulated by sipe_bayes and not by MuJoCo itself{nearest})"
 

@@ -171,6 +171,7 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
                 held_out,
                 kept,
                 not kept and paid and held_out is not None and held_out <= 0,
+                extension.kind,
                 extension.native,
                 extension.nearest,
                 tuple(p.name for p in placed.parameters),

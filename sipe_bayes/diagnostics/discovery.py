@@ -26,6 +26,7 @@ class Piece:
         held_out: nats of held-out pieces, likewise; None also where there are no pieces.
         kept: whether the most probable structure has it.
         undecided: whether it is out although its evidence pays for it, since held-out pieces speak against it.
+        kind: what it is placed at: ``joint``, ``actuator``, ``channel`` (a measurement) or ``world``.
         native: whether MJCF has an element for it.
         nearest: the element that comes nearest where it has none.
         parameters: names of its parameters.
@@ -39,6 +40,7 @@ class Piece:
     held_out: float | None
     kept: bool
     undecided: bool
+    kind: str
     native: bool
     nearest: str
     parameters: tuple[str, ...]

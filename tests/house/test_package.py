@@ -36,6 +36,7 @@ from sipe_bayes.diagnostics.catalogue import tasks
 from sipe_bayes.envs.sensing import NEUTRAL
 from sipe_bayes.envs.targets import ATTRIBUTES
 from sipe_bayes.inference import ESTIMATORS, estimator_class
+from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sipe_bayes"
@@ -203,6 +204,16 @@ def test_readme_lists_every_estimator() -> None:
     listed = {(name, re.findall(r"`(\w+)`", line)[1]) for name, line in rows("Estimators").items()}
     differing = listed ^ {(name, cls) for name, (_, cls) in ESTIMATORS.items()}
     assert not differing, "README, Estimators: a row for each with its class, and for no other"
+
+
+def test_readme_lists_every_extension() -> None:
+    wanted = {}
+    for name in EXTENSIONS:
+        one = get_extension(name)
+        wanted[name] = (
+            f"| `{name}` | {one.kind} | {one.sentence('NAME')} | {'yes' if one.native else one.nearest or 'no'} |"
+        )
+    assert rows("What a model lacks") == wanted, "README, What a model lacks: a row for each, and for no other"
 
 
 def test_readme_lists_every_environment() -> None:

@@ -74,7 +74,10 @@ def column_verdict(discovery: Discovery) -> Verdict | None:
 
 def headline(discovery: Discovery) -> Verdict:
     """What the model lacks, and how much of it."""
-    kept = [f"{p.sentence}, {found_values(discovery, p)}" for p in discovery.kept]
+    kept = [
+        f"{p.sentence}, {found_values(discovery, p)}, with probability {probability_text(p.probability)}"
+        for p in discovery.kept
+    ]
     if kept:
         return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
     if discovery.passes:
