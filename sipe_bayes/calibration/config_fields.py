@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -25,6 +25,8 @@ from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.structure.registry import EXTENSIONS
 
+_LISTED = 30  # words in a line
+
 
 class ConfigError(ValueError):
     """A configuration that cannot be used; the message is one line with key, value and remedy."""
@@ -36,9 +38,15 @@ def problem(message: str, *key: str | int) -> PydanticCustomError:
 
 
 def nearest(word: str, legal: Iterable[str]) -> str:
-    """The remedy for a word that is not in ``legal``: the nearest one, else all."""
+    """The remedy for a word that is not in ``legal``: the nearest one, else all, or the first of many."""
     words = [str(w) for w in legal]
-    return nearest_name(word, words).removeprefix("; ") or f"use one of {', '.join(map(repr, words))}"
+    return nearest_name(word, words).removeprefix("; ") or f"use one of {listed(list(map(repr, words)))}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words one after the other, of many the first."""
+    others = f" and {len(words) - _LISTED} others" if len(words) > _LISTED else ""
+    return ", ".join(words[:_LISTED]) + others
 
 
 def nearest_file(path: Path) -> str:

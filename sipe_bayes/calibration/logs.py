@@ -267,6 +267,7 @@ def _check_clock(name: str, time: FloatArray) -> None:
     if back.size:
         i = back[0]
         remedy = "drop duplicate rows" if time[i + 1] == time[i] else "sort the rows"
+        remedy = "use the recorder's clock, `time`" if name.endswith(".stamp") else remedy
         raise LogError(
             f"{name!r} must increase strictly, got {time[i + 1]!s} in row {i + 2} "
             f"after {time[i]!s} in row {i + 1}; {remedy}"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sipe_bayes.calibration.config_fields import nearest
+from sipe_bayes.calibration.config_fields import listed, nearest
 from sipe_bayes.calibration.readers.base import Columns, LogError, check_size
 from sipe_bayes.calibration.readers.ros_messages import Fields, Message
 
@@ -48,8 +48,8 @@ def _connections(path: Path, all_of_them: Collection[Connection], wanted: Collec
     kinds = {one.topic: one.msgtype for one in all_of_them}
     for name in wanted:
         if not any(name.startswith(f"{topic}.") for topic in kinds):
-            listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds.items())) or "none"
-            raise LogError(f"{path}: no topic for {name!r}; {nearest(name.split('.')[0], kinds)} (it has {listed})")
+            there = listed([f"{topic} ({kind})" for topic, kind in sorted(kinds.items())]) or "no topics"
+            raise LogError(f"{path}: no topic for {name!r}; {nearest(name.split('.')[0], kinds)} (it has {there})")
     for one in all_of_them:
         if not wanted or any(name.startswith(f"{one.topic}.") for name in wanted):
             yield one

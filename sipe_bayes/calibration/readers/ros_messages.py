@@ -84,11 +84,13 @@ class Message:
         """An array; returns the texts of one of strings."""
         (inner, of), claimed = detail
         count = self._room(claimed if what == _ARRAY else int(self._number("uint32")))
-        base = of[0] if inner == _BASE else ""
-        if base in _NUMBERS and count > WIDEST:
-            self._take(_NUMBERS[base], count)
+        names = labels if len(set(labels)) == len(labels) == count else range(count)
+        letter = _NUMBERS.get(of[0]) if inner == _BASE else None
+        if letter is not None:
+            values = self._take(letter, count) if count else ()
+            if count <= WIDEST:
+                self.numbers.update((f"{word}[{label}]", value) for label, value in zip(names, values, strict=True))
             return []
-        names = labels if len(set(labels)) == count else range(count)
         return [self._one(f"{word}[{label}]", inner, of) for label in names]
 
     def _number(self, base: str) -> float:

@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sipe_bayes.calibration.config_fields import nearest
 from sipe_bayes.calibration.readers.base import Columns, LogError, check_size
+
+if TYPE_CHECKING:
+    from pyulog import ULog
+
+_MOST = 0xFFFF  # bytes of a message
 
 
 def read_ulog(path: Path, wanted: Collection[str]) -> Columns:
@@ -22,8 +28,10 @@ def read_ulog(path: Path, wanted: Collection[str]) -> Columns:
     from pyulog import ULog
 
     check_size(path, path.stat().st_size)
-    messages = sorted({name.split(".")[0].split("[")[0] for name in wanted})
     with contextlib.redirect_stdout(io.StringIO()):  # it prints what it skips
+        _check_formats(path, ULog(str(path), parse_header_only=True).message_formats)
+    messages = sorted({name.split(".")[0].split("[")[0] for name in wanted})
+    with contextlib.redirect_stdout(io.StringIO()):
         log = ULog(str(path), messages or None)
     there = {data.name for data in log.data_list}
     for name in messages:
@@ -36,3 +44,23 @@ def read_ulog(path: Path, wanted: Collection[str]) -> Columns:
         columns.update({f"{name}.{field}": np.asarray(values) for field, values in data.data.items()})
         columns[f"{name}.time"] = 1e-6 * np.asarray(data.data["timestamp"], dtype=np.float64)
     return columns
+
+
+def _check_formats(path: Path, formats: Mapping[str, ULog.MessageFormat]) -> None:
+    """Refuse messages in messages that have more fields than a message has bytes, or that hold themselves."""
+    counts: dict[str, int] = {}
+
+    def count(name: str, around: tuple[str, ...]) -> int:
+        if name in around:
+            raise LogError(f"{path}: message {name!r} is defined by itself; record the log again")
+        if name not in counts:
+            fields = formats[name].fields if name in formats else ()
+            counts[name] = sum(max(times, 1) * count(kind, (*around, name)) for kind, times, _ in fields) or 1
+        if counts[name] > _MOST:
+            raise LogError(
+                f"{path}: message {name!r} claims {counts[name]} fields, the most is {_MOST}; record it again"
+            )
+        return counts[name]
+
+    for name in formats:
+        count(name, ())

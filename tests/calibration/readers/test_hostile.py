@@ -281,7 +281,7 @@ TYPES = {
     ("kind", "data", "message"),
     [
         ("p/msg/A", b"\0\1\0\0" + struct.pack("<I", 2**32 - 1), "claims 4294967295 bytes or entries and has 0"),
-        ("p/msg/A", b"\0\1\0\0" + struct.pack("<IId", 2, 0, 1.0), "claims 8 bytes or entries and has 0"),
+        ("p/msg/A", b"\0\1\0\0" + struct.pack("<IId", 2, 0, 1.0), "claims 16 bytes or entries and has 8"),
         ("p/msg/A", b"\0\7\0\0", "not encoded as plain CDR"),
         ("p/msg/A", b"", "not encoded as plain CDR"),
         ("p/msg/Many", b"\0\1\0\0" + bytes(99), "claims 1000000000 bytes or entries and has 99"),
@@ -310,6 +310,27 @@ def test_a_bag_whose_tables_compute_is_refused(tmp_path: Path) -> None:
         database.execute(f"CREATE VIEW messages AS {endless}")
     with pytest.raises(LogError, match="'messages' is no plain table"):
         read_table(written.path)
+
+
+@pytest.mark.parametrize(
+    ("formats", "message"),
+    [
+        ("wide:uint64_t timestamp;float[65000] x;|joint:wide[65000] y;", "'joint' claims 4225065000 fields, the most"),
+        ("joint:uint64_t timestamp;joint x;", "'joint' is defined by itself"),
+        (
+            "|".join(f"m{k}:m{k + 1}[2] a;m{k + 1}[2] b;" for k in range(60)),
+            r"'m\d+' claims \d+ fields, the most is 65535",
+        ),
+        ("joint:uint64_t timestamp;float[1000000000] x;", "no message 'joint' was logged"),
+    ],
+)
+def test_ulog_that_claims(formats: str, message: str, tmp_path: Path) -> None:
+    parts = [b"ULog\x01\x12\x35\x01" + bytes(8)]
+    parts += [struct.pack("<HB", len(text), ord("F")) + text.encode() for text in formats.split("|")]
+    parts += [struct.pack("<HBBH", 8, ord("A"), 0, 0) + b"joint"]
+    (tmp_path / "x.ulg").write_bytes(b"".join(parts))
+    with pytest.raises(LogError, match=message):
+        read_table(tmp_path / "x.ulg", ["joint.x[0]"])
 
 
 @pytest.mark.parametrize(
