@@ -16,6 +16,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.envs.contact_targets import pair_index
+from sipe_bayes.envs.elastic import ELASTIC, NUMBERS, motor_side
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
@@ -127,6 +128,8 @@ def _copy(spec: mujoco.MjSpec, model: mujoco.MjModel, target: str) -> None:
         _copy_numeric(spec, model, f"{kind}:{name}.{LAW_OF[kind, attribute][0].name}")
     elif kind == "body":
         _copy_inertial(spec, model, name)
+    elif kind == "joint" and attribute in {number.attribute for number in NUMBERS}:
+        _copy_elastic(spec, model, name)
     elif kind == "joint":
         _copy_joint(spec, model, name, attribute)
     elif kind == "actuator":
@@ -182,8 +185,22 @@ def _copy_joint(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str, attribute
         value = float(model.qpos_spring[int(model.jnt_qposadr[index])])
         hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
         joint.springref = np.degrees(value) if hinge and spec.compiler.degree else value
+    elif attribute == "armature" and motor_side(model, name) >= 0:
+        spec.tendon(model.tendon(motor_side(model, name)).name).armature = model.tendon_armature[
+            motor_side(model, name)
+        ]
     else:
         setattr(joint, attribute, float(getattr(model, f"dof_{attribute}")[dof]))
+
+
+def _copy_elastic(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> None:
+    _copy_numeric(spec, model, f"joint:{name}.{ELASTIC}")
+    for attribute in ("stiffness", "damping", "armature"):
+        _copy_joint(spec, model, name, attribute)
+    joint, index = spec.joint(name), model.joint(name).id
+    hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    joint.limited = bool(model.jnt_limited[index])
+    joint.range = np.degrees(model.jnt_range[index]) if hinge and spec.compiler.degree else model.jnt_range[index]
 
 
 def _copy_actuator(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> None:

@@ -11,10 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import mujoco
-import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.envs.base import START_SD
 
 _START = ".start"
 
@@ -25,9 +23,9 @@ def declare_start(spec: mujoco.MjSpec, owner: str, sd: Sequence[float]) -> None:
         spec.add_numeric(name=owner + _START, data=list(sd), size=len(sd))
 
 
-def start_sd(model: mujoco.MjModel) -> FloatArray:
-    """Prior sds (2 nv + na,) of a window's start: positions, velocities, activations."""
-    sd = np.repeat(START_SD, [model.nv, model.nv, model.na])
+def start_sd(model: mujoco.MjModel, wide: FloatArray) -> FloatArray:
+    """Prior sds (2 nv + na,) of a window's start, what the model says in place of ``wide`` (2 nv + na,)."""
+    sd = wide.copy()
     for kind, index, declared in _declared(model):
         if kind == "joint":
             dof = int(model.jnt_dofadr[index])

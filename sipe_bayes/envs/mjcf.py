@@ -262,7 +262,7 @@ class MjcfEnvironment(Environment):
 
     def start_sd(self, model: mujoco.MjModel) -> FloatArray:
         """What the model says of its internal states, and else any state's."""
-        return start_sd(model)
+        return start_sd(model, super().start_sd(model))
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Two physics steps of a delay, as far as they lie in the cube."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
+from sipe_bayes.envs.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.laws.base import Number
 from sipe_bayes.envs.laws.registry import LAW_OF
@@ -66,6 +67,9 @@ def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) 
         size = sizes.get(int(model.jnt_type[joint]), 1)
         unit = hinge_unit if _hinge(model, joint) else slide_unit
         value = float(getattr(model, field)[start])
+        tendon = motor_side(model, split(spec)[1]) if field == "dof_armature" else -1
+        if tendon >= 0:
+            return _entry("tendon_armature", unit, constants=True, minimum=0.0)(model, spec, tendon)
 
         def write(other: mujoco.MjModel, number: float) -> None:
             getattr(other, field)[start : start + size] = number
@@ -243,27 +247,33 @@ def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     return replace(target, step=2 * float(model.opt.timestep))  # shorter ones than a physics step act alike
 
 
-def _law(number: Number, label: str, slot: int) -> Maker:
-    """A number of a law (``envs.laws``), which stands among the model's numerics."""
+def _numeric(number: Number, label: str, slot: int) -> Maker:
+    """A number of a law (``envs.laws``) or of an elastic joint, which stands among the model's numerics."""
+    elastic = label == ELASTIC
 
     def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
         numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{spec.rpartition('.')[0]}.{label}")
         if numeric < 0:
-            raise TargetError(f"target {spec!r}: the model does not declare this law; build an MjcfEnvironment of it")
+            remedy = "the model does not declare this law; build an MjcfEnvironment of it"
+            if elastic:
+                remedy = "the joint is no elastic one; name one that an extension has brought, or use stiffness"
+            raise TargetError(f"target {spec!r}: {remedy}")
         at = int(model.numeric_adr[numeric]) + slot
 
         def write(other: mujoco.MjModel, value: float) -> None:
             other.numeric_data[at] = value
+            if elastic:
+                realise(other, index, at - slot)
 
         value = float(model.numeric_data[at])
-        return Target(spec, number.unit, value, write, minimum=number.minimum, shape=number.shape)
+        return Target(spec, number.unit, value, write, constants=elastic, minimum=number.minimum, shape=number.shape)
 
     return make
 
 
 def _laws(kind: str) -> dict[str, Maker]:
     rows = ((attribute, *of) for (at, attribute), of in LAW_OF.items() if at == kind)
-    return {attribute: _law(law.numbers[slot], law.name, slot) for attribute, law, slot in rows}
+    return {attribute: _numeric(law.numbers[slot], law.name, slot) for attribute, law, slot in rows}
 
 
 ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds it
@@ -282,6 +292,7 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         "damping_cubic": _joint_polynomial("dof_dampingpoly", 1, 3),
         "stiffness_quadratic": _joint_polynomial("jnt_stiffnesspoly", 0, 2),
         "stiffness_cubic": _joint_polynomial("jnt_stiffnesspoly", 1, 3),
+        **{number.attribute: _numeric(number, ELASTIC, slot) for slot, number in enumerate(NUMBERS)},
         **_laws("joint"),
     },
     "actuator": {

@@ -20,10 +20,11 @@ def test_a_models_own_states_have_any_states_prior_and_declared_ones_theirs() ->
     FilteredCommand("m2", 0.3)(spec)
     declare_start(spec, "actuator:m2", [7.0])  # said already
     model = mujoco.MjModel.from_xml_string(spec.compile() and spec.to_xml())
-    np.testing.assert_allclose(start_sd(model), [10, 0.1, 100, 2.0, 0.3])
+    wide = np.array([10.0, 10.0, 100.0, 100.0, 10.0])
+    np.testing.assert_allclose(start_sd(model, wide), [10, 0.1, 100, 2.0, 0.3])
     assert filtered_commands(model) == [(1, 1 + 2 + 2)]
     plain = mujoco.MjModel.from_xml_string(MACHINES["double"].xml)
-    np.testing.assert_allclose(start_sd(plain), [10, 10, 100, 100])
+    np.testing.assert_array_equal(start_sd(plain, wide[:4]), wide[:4])
 
 
 def test_windows_start_at_the_command_before_them() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs import targets
+from sipe_bayes.envs.elastic import NUMBERS, Elastic, Link
 from sipe_bayes.envs.export import write_identified
 from sipe_bayes.envs.inertia import body_frame_inertia, check_inertia
 from sipe_bayes.envs.laws.bound import declare
@@ -118,6 +119,26 @@ def inertia(row: int, column: int) -> Edit:
     return edit
 
 
+def elastic(slot: int) -> Edit:
+    """One number of the joint that gives way, and what stiffness, damping, inertia and range then are."""
+
+    def edit(spec: Any, value: float) -> None:
+        numeric, joint = next(n for n in spec.numerics if n.name == "joint:hinge2.link.elastic"), spec.joint(TWIST)
+        vector("data", slot)(numeric, value)
+        compliance, loss, inertia, play = np.array(numeric.data)[:4]
+        joint.stiffness, joint.damping = [1 / compliance, 0, 0], [loss / compliance, 0, 0]
+        joint.armature, joint.limited, joint.range = inertia, play > 0, np.degrees([-play / 2, play / 2])
+
+    return edit
+
+
+def give_way(spec: Any) -> None:
+    """A link behind hinge2 that gives way by 0.1 rad/(N m)."""
+    Link("hinge2", Elastic(stiffest=50.0, idle=0.02, start=(0.1, 1.0), inertia=0.03, loss=0.01))(spec)
+    elastic(0)(spec, 0.1)
+
+
+TWIST = "hinge2.link"
 LAW_AT = {"joint": "joint:hinge", "actuator": "actuator:motor"}
 # (target, value, unit, how the spec is edited)
 CASES: list[tuple[str, float, str, Edit]] = [
@@ -197,12 +218,14 @@ CASES: list[tuple[str, float, str, Edit]] = [
         (f"{LAW_AT[kind]}.{attribute}", 0.3, law.numbers[slot].unit, vector("data", slot))
         for (kind, attribute), (law, slot) in LAW_OF.items()
     ),
+    *((f"joint:{TWIST}.{number.attribute}", 0.2, number.unit, elastic(k)) for k, number in enumerate(NUMBERS)),
 ]
 
 
 def frozen_spec() -> Any:
     """The spec with its bodies' inertia written out, so that it may be edited, and every law."""
     spec = mujoco.MjSpec.from_string(XML)
+    give_way(spec)
     for law in LAWS.values():
         declare(spec, law.kind, LAW_AT[law.kind].partition(":")[2], law)
     model = spec.compile()
@@ -221,6 +244,8 @@ def element(spec: Any, target: str) -> Any:
         return next(numeric for numeric in spec.numerics if numeric.name == label)
     if kind == "pair":
         return spec.pairs[0]
+    if name == TWIST:
+        return spec
     return spec.option if kind == "option" else getattr(spec, kind)(name)
 
 
@@ -301,7 +326,7 @@ def test_an_exported_model_has_the_value(target: str, value: float, tmp_path: Pa
     model = frozen_spec().compile()
     low, high = sorted((bind(model, target).value, value))
     environment = MjcfEnvironment.build(
-        XML, [Parameter("p", low, high, targets=(target,))], [], ["joint:hinge.position"]
+        XML, [Parameter("p", low, high, targets=(target,))], [], ["joint:hinge.position"], [give_way]
     )
     assert write_identified(environment, np.array([value]), tmp_path / "identified.xml") == []
     exported = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))

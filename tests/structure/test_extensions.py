@@ -13,6 +13,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.elastic import NUMBERS as ELASTIC_NUMBERS
 from sipe_bayes.envs.export import write_identified
 from sipe_bayes.envs.laws.registry import LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -77,7 +78,8 @@ def test_every_extension_has_a_place() -> None:
         assert any(placed(name, each) for each in MACHINES), name
 
 
-SHAPES = {number.attribute for law in LAWS.values() for number in law.numbers if number.shape}
+NUMBERS = [*ELASTIC_NUMBERS, *(number for law in LAWS.values() for number in law.numbers)]
+SHAPES = {number.attribute for number in NUMBERS if number.shape}
 
 
 @pytest.mark.parametrize(("name", "where"), PLACES)

@@ -1,0 +1,1 @@
+"""Extensions of gears, links and bases that give way."""

@@ -1,0 +1,54 @@
+"""A gap behind the joint where the position is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.elastic import Link
+from sipe_bayes.structure.elastic_sizes import elastic_sizes
+from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.machine import Machine
+
+_SIZES = 0.03, 0.1, 0.3  # of the widest gap: its effect is far from linear
+_ROTOR = 0.2
+
+
+class LinkBacklash(Extension):
+    """A gap behind the joint where the position is measured.
+
+    The position is measured before it, at the motor.
+    """
+
+    name, kind = "link_backlash", "joint"
+    reference = "M. Nordin, P.-O. Gutman 2002, https://doi.org/10.1016/S0005-1098(02)00047-X"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"backlash behind {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to half the usual position."""
+        sizes = elastic_sizes(machine, site)
+        if sizes is None:
+            return ()
+        joint = f"{site}.link"
+        play = Parameter(
+            f"{site}.link_backlash",
+            0.0,
+            0.5 * machine.joints[site].position,
+            targets=(f"joint:{joint}.play",),
+            description="width of the gap",
+        )
+        return (play, *sizes.rotor)
+
+    def edit(self, machine: Machine, site: str) -> Link | None:
+        """The spring."""
+        sizes = elastic_sizes(machine, site)
+        return None if sizes is None else Link(site, sizes.elastic)
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """Three gaps."""
+        others = (_ROTOR,)[: len(parameters) - 1]
+        return np.array([[[size, *others]] for size in _SIZES])
