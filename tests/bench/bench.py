@@ -27,6 +27,7 @@ import batch
 import ddpg
 import envs
 import fits
+import laws
 import mdn
 import mujoco
 import mujoco.rollout
@@ -240,7 +241,10 @@ def chain() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    tables = ("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "transfer")
+    tables = (
+        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws"),
+        "transfer",
+    )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
     given = parser.parse_args()
@@ -263,6 +267,8 @@ def main() -> None:
             fits.table()
         elif name == "ddpg":
             ddpg.table(given.pairs, side_by_side)
+        elif name == "laws":
+            laws.table(given.pairs, side_by_side)
         elif name == "transfer":
             transfer.table(given.pairs, side_by_side)
         elif name == "batch":
