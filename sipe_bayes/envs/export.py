@@ -211,5 +211,8 @@ def _copy_actuator(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Non
     actuator.biastype = mujoco.mjtBias(int(model.actuator_biastype[index]))
     actuator.dynprm[:] = model.actuator_dynprm[index]
     actuator.delay = float(model.actuator_delay[index])
+    control = int(model.actuator_ctrladr[index])
+    if control >= 0 and model.actuator_ctrllimited[control]:
+        actuator.ctrllimited, actuator.ctrlrange[:] = True, model.actuator_ctrlrange[control]
     if model.actuator_forcelimited[index]:
         actuator.forcelimited, actuator.forcerange[:] = True, model.actuator_forcerange[index]

@@ -1,12 +1,11 @@
 """What a parameter may change in a MuJoCo model: targets such as ``"body:rod.mass"``, read and written in place.
 
-A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's options). ``bind`` looks it up in a
-compiled model and returns a ``Target`` that knows its unit, its present value and how to write another one
-into any copy of that model. Writing is always relative to the model the target was bound to, so it may be
-repeated in any order of values. Mass scales the inertia with it; an inertia component is set in the body's
-own frame, about its centre of mass, and must stay physical: no principal moment may exceed the sum of the
-other two. Several inertia components of a body compose, each leaving the others as they stand;
-``restore_inertia`` brings back the model's own before them.
+A target is ``KIND:NAME.ATTRIBUTE`` (``option.ATTRIBUTE`` for the model's options). ``bind`` looks it up in a compiled
+model and returns a ``Target`` that knows its unit, its present value and how to write another one into any copy of that
+model. Writing is always relative to the model the target was bound to, so it may be repeated in any order of values.
+Mass scales the inertia with it; an inertia component is set in the body's own frame, about its centre of mass, and must
+stay physical: no principal moment may exceed the sum of the other two. Several inertia components of a body compose,
+each leaving the others as they stand; ``restore_inertia`` brings back the model's own before them.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
 from sipe_bayes.envs.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.inertia import body_frame_inertia
-from sipe_bayes.envs.laws.base import Number
+from sipe_bayes.envs.laws.base import SINGLE, Number
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.target import Maker, Target, TargetError, entry, named
 
@@ -85,8 +84,7 @@ def _joint_stiffness(model: mujoco.MjModel, spec: str, joint: int) -> Target:
 
 
 def _joint_springref(model: mujoco.MjModel, spec: str, joint: int) -> Target:
-    kind = int(model.jnt_type[joint])
-    if kind not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+    if int(model.jnt_type[joint]) not in SINGLE:
         raise TargetError(f"target {spec!r}: only hinge and slide joints have this attribute")
     unit = "rad" if _hinge(model, joint) else "m"
     return entry("qpos_spring", unit)(model, spec, int(model.jnt_qposadr[joint]))
@@ -228,16 +226,21 @@ def _joint_polynomial(field: str, slot: int, power: int) -> Maker:
     return make
 
 
-def _force_limit(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
-    """The largest force either way; without one in the model its value is endless."""
+def _limit(field: str, unit: str, at: str = "") -> Maker:
+    """The largest force or command either way; without one in the model its value is endless."""
 
-    def write(other: mujoco.MjModel, value: float) -> None:
-        other.actuator_forcelimited[actuator] = True
-        other.actuator_forcerange[actuator] = -value, value
+    def make(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+        index = int(getattr(model, at)[actuator]) if at else actuator
 
-    limited = bool(model.actuator_forcelimited[actuator])
-    present = float(np.abs(model.actuator_forcerange[actuator]).max()) if limited else np.inf
-    return Target(spec, "force", present, write, minimum=0.0)
+        def write(other: mujoco.MjModel, value: float) -> None:
+            getattr(other, f"{field}limited")[index] = True
+            getattr(other, f"{field}range")[index] = -value, value
+
+        limited = bool(getattr(model, f"{field}limited")[index])
+        present = float(np.abs(getattr(model, f"{field}range")[index]).max()) if limited else np.inf
+        return Target(spec, unit, present, write, minimum=0.0)
+
+    return make
 
 
 def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
@@ -254,10 +257,8 @@ def _numeric(number: Number, label: str, slot: int) -> Maker:
     def make(model: mujoco.MjModel, spec: str, index: int) -> Target:
         numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{spec.rpartition('.')[0]}.{label}")
         if numeric < 0:
-            remedy = "the model does not declare this law; build an MjcfEnvironment of it"
-            if elastic:
-                remedy = "the joint is no elastic one; name one that an extension has brought, or use stiffness"
-            raise TargetError(f"target {spec!r}: {remedy}")
+            remedy = "an extension brings such a joint" if elastic else "build an MjcfEnvironment of it"
+            raise TargetError(f"target {spec!r}: the model does not declare it; {remedy}")
         at = int(model.numeric_adr[numeric]) + slot
 
         def write(other: mujoco.MjModel, value: float) -> None:
@@ -305,7 +306,8 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         "bias_velocity": _actuator_bias(2, "force/velocity"),
         "offset": _actuator_offset,
         "delay": _actuator_delay,
-        "force_limit": _force_limit,
+        "force_limit": _limit("actuator_force", "force"),
+        "command_limit": _limit("actuator_ctrl", "command", "actuator_ctrladr"),
         "lag": _lag,
         **_laws("actuator"),
     },

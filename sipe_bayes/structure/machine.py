@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.envs.laws.base import SINGLE
 from sipe_bayes.envs.laws.bound import driven_joint
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 _SAMPLES = 400  # of the logs, of which forces are computed
-_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Machine:
 
     def is_hinge(self, joint: str) -> bool:
         """Whether it turns."""
-        return int(self.model.joint(joint).type[0]) == _SINGLE[0]
+        return int(self.model.joint(joint).type[0]) == SINGLE[0]
 
     def joint_of(self, actuator: str) -> str | None:
         """The hinge or slide joint that an actuator drives by itself."""
@@ -109,7 +109,7 @@ def machine_of(windows: Windows, theta: FloatArray, starts: FloatArray) -> Machi
     commands = {a: float(np.abs(windows.actions[..., k]).max()) for k, a in enumerate(environment.actuators)}
     joints = {}
     for joint in range(model.njnt):
-        if int(model.jnt_type[joint]) in _SINGLE and model.joint(joint).name:
+        if int(model.jnt_type[joint]) in SINGLE and model.joint(joint).name:
             dof, address = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
             inertia = float(own.inertia[dof])
             sizes = (_rms(states[:, 1 + address]), _rms(states[:, 1 + model.nq + dof]), own.size[dof], inertia)

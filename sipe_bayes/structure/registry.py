@@ -33,6 +33,7 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "offset": "actuator.offset:Offset",
     "back_emf": "actuator.back_emf:BackEmf",
     "force_limit": "actuator.force_limit:ForceLimit",
+    "command_limit": "actuator.command_limit:CommandLimit",
     "force_drop": "actuator.force_drop:ForceDrop",
     "cogging": "actuator.cogging:Cogging",
     "log_gain": "actuator.log_gain:LogGain",

@@ -115,5 +115,5 @@ def test_what_a_joint_cannot_have_is_refused_in_a_line(edits: tuple[Edit, ...], 
 
 def test_a_joint_of_the_model_has_no_compliance() -> None:
     parameter = Parameter("give", 0.0, 1.0, targets=("joint:hinge.compliance",))
-    with pytest.raises(TargetError, match="is no elastic one; name one that an extension has brought"):
+    with pytest.raises(TargetError, match="does not declare it; an extension brings such a joint"):
         MjcfEnvironment.build(PLAIN, [parameter], ["motor"], ["joint:hinge.position"])

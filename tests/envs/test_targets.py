@@ -43,6 +43,7 @@ XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><world
   <velocity name="velocity" joint="hinge" kv="3"/>
   <motor name="late" joint="hinge2" nsample="10" delay=".004"/>
   <motor name="weak" joint="hinge2" forcerange="-3 3"/>
+  <position name="wary" joint="hinge2" kp="1" ctrlrange="-.7 .7"/>
   <general name="slow" joint="hinge2" dyntype="filterexact" dynprm=".02" actearly="true"/></actuator></mujoco>"""
 
 Edit = Callable[[Any, float], None]
@@ -96,6 +97,10 @@ def sliding(element: Any, value: float) -> None:
 def rolling(element: Any, value: float) -> None:
     vector("friction", 3)(element, value)
     vector("friction", 4)(element, value)
+
+
+def command_limit(element: Any, value: float) -> None:
+    element.ctrllimited, element.ctrlrange = True, [-value, value]
 
 
 def mass(element: Any, value: float) -> None:
@@ -185,6 +190,7 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("actuator:general.offset", -0.2, "command", offset),
     ("actuator:late.delay", 0.01, "s", scalar("delay")),
     ("actuator:weak.force_limit", 2.0, "force", limit),
+    ("actuator:wary.command_limit", 0.4, "command", command_limit),
     ("actuator:slow.lag", 0.05, "s", vector("dynprm", 0)),
     ("geom:box.friction", 0.3, "1", vector("friction", 0)),
     ("geom:box.friction_torsional", 0.01, "m", vector("friction", 1)),

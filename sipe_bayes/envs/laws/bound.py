@@ -18,10 +18,9 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.envs.internal import declare_start
-from sipe_bayes.envs.laws.base import Law, LawError, Now
+from sipe_bayes.envs.laws.base import SINGLE, Law, LawError, Now
 from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 
-_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _MEMORY = int(mujoco.mjtDyn.mjDYN_USER)  # an actuator whose activations nothing in MuJoCo changes
 _SURE = 10.0  # at a tenth of the usual speed a direction counts
 _MEMORY_SD = 0.6  # of what a law remembers, which lies between -1 and 1
@@ -89,9 +88,9 @@ def declare(spec: mujoco.MjSpec, kind: str, name: str, law: Law) -> None:
         spec.add_sensor(name=label, type=sensor, objtype=mujoco.mjtObj.mjOBJ_ACTUATOR, objname=name)
     elif law.senses == "torque":
         joint = spec.joint(name)
-        if joint is None or int(joint.type) not in _SINGLE:
+        if joint is None or int(joint.type) not in SINGLE:
             raise LawError(f"target {label!r}: only hinge and slide joints have this attribute")
-        along, hinge = np.empty(4), int(joint.type) == _SINGLE[0]
+        along, hinge = np.empty(4), int(joint.type) == SINGLE[0]
         mujoco.mju_quatZ2Vec(along, np.asarray(joint.axis, float))
         joint.parent.add_site(name=label, pos=joint.pos, quat=along)
         sensor = mujoco.mjtSensor.mjSENS_TORQUE if hinge else mujoco.mjtSensor.mjSENS_FORCE
@@ -151,7 +150,7 @@ def _bound(model: mujoco.MjModel, law: Law, owner: str, numbers: slice, label: s
         joint, actuator = index, _driver(model, index)
     else:
         joint, actuator = driven_joint(model, index), index
-    if joint < 0 or int(model.jnt_type[joint]) not in _SINGLE:
+    if joint < 0 or int(model.jnt_type[joint]) not in SINGLE:
         raise LawError(f"target {label!r}: only hinge and slide joints, and actuators of one, have this attribute")
     sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, label) if law.senses else -1
     if law.senses and sensor < 0:
