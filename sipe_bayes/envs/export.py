@@ -16,7 +16,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.envs.contact_targets import pair_index
-from sipe_bayes.envs.elastic import ELASTIC, NUMBERS, motor_side
+from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split

@@ -32,7 +32,7 @@ from sipe_bayes.envs.channels import (
     state_column,
 )
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
-from sipe_bayes.envs.internal import filtered_commands, start_sd
+from sipe_bayes.envs.internal.states import filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import BoundLaw, declare, laws_of, moving_on
 from sipe_bayes.envs.laws.registry import LAW_OF

@@ -18,8 +18,8 @@ import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
-from sipe_bayes.envs.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.inertia import body_frame_inertia
+from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.laws.base import SINGLE, Number
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.target import Maker, Target, TargetError, entry, named
@@ -68,7 +68,7 @@ def _dof(field: str, hinge_unit: str, slide_unit: str, constants: bool = False) 
         value = float(getattr(model, field)[start])
         tendon = motor_side(model, split(spec)[1]) if field == "dof_armature" else -1
         if tendon >= 0:
-            return _entry("tendon_armature", unit, constants=True, minimum=0.0)(model, spec, tendon)
+            return entry("tendon_armature", unit, constants=True, minimum=0.0)(model, spec, tendon)
 
         def write(other: mujoco.MjModel, number: float) -> None:
             getattr(other, field)[start : start + size] = number

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.elastic import Elastic
+from sipe_bayes.envs.internal.elastic import Elastic
 from sipe_bayes.structure.machine import Machine
 
 _ROTOR = 0.2  # of the inertia that the joint moves, where the model gives the motor none

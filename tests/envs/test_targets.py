@@ -13,9 +13,9 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs import targets
-from sipe_bayes.envs.elastic import NUMBERS, Elastic, Link
 from sipe_bayes.envs.export import write_identified
-from sipe_bayes.envs.inertia import body_frame_inertia, check_inertia
+from sipe_bayes.envs.inertia import body_frame_inertia
+from sipe_bayes.envs.internal.elastic import NUMBERS, Elastic, Link
 from sipe_bayes.envs.laws.bound import declare
 from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -341,31 +341,6 @@ def test_an_exported_model_has_the_value(target: str, value: float, tmp_path: Pa
     assert bind(exported, target).value == pytest.approx(expected, rel=1e-5)
 
 
-def test_mass_before_inertia_in_any_earlier_state() -> None:
-    """Mass brings the model's own inertia and axes back, so an earlier tilt leaves nothing behind."""
-    model = frozen_spec().compile()
-    writes = [("body:aligned.mass", 0.4), ("body:aligned.inertia_xy", 0.0002)]
-    once = written(model, *writes)
-    again = written(model, ("body:aligned.inertia_xy", 0.0009), ("body:aligned.com_z", -0.2), *writes)
-    assert_same(again, once)
-    body = model.body("aligned").id
-    expected = np.diag([0.004, 0.003, 0.002]) * 4 / 3
-    expected[0, 1] = expected[1, 0] = 0.0002
-    np.testing.assert_allclose(body_frame_inertia(once, body), expected, atol=1e-16)
-
-
-def test_inertia_components_compose_in_the_body_frame() -> None:
-    model = frozen_spec().compile()
-    full = np.array([[0.011, 0.0005, 0.001], [0.0005, 0.013, -0.0007], [0.001, -0.0007, 0.009]])
-    names = {(i, j): f"body:tilted.inertia_{'xyz'[i]}{'xyz'[j]}" for i in range(3) for j in range(i, 3)}
-    orders = [list(names), list(names)[::-1]]
-    for order in orders:
-        other = written(model, *[(names[slot], float(full[slot])) for slot in order])
-        np.testing.assert_allclose(body_frame_inertia(other, model.body("tilted").id), full, atol=1e-15)
-        for slot in order:
-            assert bind(other, names[slot]).value == pytest.approx(full[slot], abs=1e-15)
-
-
 def test_offset_is_gain_times_command() -> None:
     model = frozen_spec().compile()
     torque = []
@@ -386,16 +361,6 @@ def test_a_limit_that_the_model_has_not_is_endless(tmp_path: Path) -> None:
     assert environment.space[0].default == 5.0
     assert write_identified(environment, np.array([1.5]), tmp_path / "identified.xml") == []
     assert bind(mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")), target).value == 1.5
-
-
-@pytest.mark.parametrize(
-    ("moments", "physical"),
-    [([1, 1, 1], True), ([1, 2, 3], True), ([3, 1, 2], True), ([1, 1, 2.1], False), ([-0.1, 1, 1], False)],
-)
-def test_physical_inertia(moments: list[float], physical: bool) -> None:
-    model = frozen_spec().compile()
-    model.body_inertia[1] = moments
-    assert check_inertia(model, [1]) is physical
 
 
 WRONG = [

@@ -13,8 +13,8 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.elastic import NUMBERS as ELASTIC_NUMBERS
 from sipe_bayes.envs.export import write_identified
+from sipe_bayes.envs.internal.elastic import NUMBERS as ELASTIC_NUMBERS
 from sipe_bayes.envs.laws.registry import LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.settings import Segments

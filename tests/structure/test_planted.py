@@ -12,7 +12,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.elastic import Base, Elastic, Gear, Link
+from sipe_bayes.envs.internal.elastic import Base, Elastic, Gear, Link
 from sipe_bayes.envs.mjcf import Edit
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, discover

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.envs.internal import declare_start
+from sipe_bayes.envs.internal.states import declare_start
 from sipe_bayes.envs.laws.base import SINGLE, Law, LawError, Now
 from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 

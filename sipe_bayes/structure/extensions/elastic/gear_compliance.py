@@ -6,7 +6,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.elastic import Gear
+from sipe_bayes.envs.internal.elastic import Gear
 from sipe_bayes.structure.elastic_sizes import elastic_sizes
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine

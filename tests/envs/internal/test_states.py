@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.internal import declare_start, filtered_commands, start_sd
+from sipe_bayes.envs.internal.states import declare_start, filtered_commands, start_sd
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.elastic import Base, Elastic, Gear, Link
 from sipe_bayes.envs.export import write_identified
+from sipe_bayes.envs.internal.elastic import Base, Elastic, Gear, Link
 from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
 from sipe_bayes.envs.targets import TargetError
 from sipe_bayes.simulation.simulator import Simulator

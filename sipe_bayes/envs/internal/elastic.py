@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.envs.internal import declare_start
+from sipe_bayes.envs.internal.states import declare_start
 from sipe_bayes.envs.laws.base import Number
 
 NUMBERS = (

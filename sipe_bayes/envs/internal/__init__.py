@@ -1,0 +1,1 @@
+"""What an extension brings into a model: states that nothing measures, joints that give way."""
