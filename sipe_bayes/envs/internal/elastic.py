@@ -3,7 +3,8 @@
 An edit of the MJCF brings such a joint, with ``<numeric name="joint:NAME.elastic" data="..."/>``: its compliance; the
 time constant of its loss, damping over stiffness; its own inertia; the gap in which it moves freely; the largest
 stiffness that the physics step resolves, at which a compliance ends; and its axis. Written without compliance and gap
-it is rigid: it has no axis and moves nothing, so that the machine moves as the plain model to the last bits.
+it is rigid: it has no axis and moves nothing, so that the machine moves as the plain model to the last bits. Until it
+is written to it has the stiffest spring.
 
 - ``Gear``: between the motor and the joint, whose position is measured behind it. A fixed tendon ``NAME.motor`` is the
   motor's side, the joint's position and the twist ``NAME.gear`` together; it carries the actuators and the armature.
@@ -63,7 +64,7 @@ class Elastic:
         """Give a body the joint, rigid, behind those that it has."""
         joint, zero = body.add_joint(), np.zeros(3)
         joint.name, joint.type, joint.axis, joint.pos = like.name, mujoco.mjtJoint(like.kind), like.axis, like.pos
-        joint.damping, joint.stiffness, joint.range, joint.limited = zero, zero, [0.0, 0.0], False
+        joint.damping, joint.stiffness, joint.range, joint.limited = zero, [self.stiffest, 0.0, 0.0], [0.0, 0.0], False
         joint.frictionloss = joint.ref = joint.springref = joint.springyield = joint.margin = 0.0
         joint.armature, joint.solref_limit = self.idle, [_STIFF_STEPS * spec.option.timestep, 1.0]
         joint.solimp_limit = _HARD

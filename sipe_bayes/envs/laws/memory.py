@@ -12,6 +12,9 @@ r"""Friction that remembers where it came from: before it slides it is a spring.
 
 Deviations:
 
+- MuJoCo's ``dcmotor`` has the LuGre model too, with the bristles' deflection in rad as its state: how far it may be
+  from rest where a window starts is then known only to the factor by which the distance is unknown, and a window pays
+  for that. Here it is a share.
 - ``presliding`` is the LuGre model without damping of the bristles and without its Stribeck curve, a law of its own.
 - A step goes on with the distance that the joint has moved in it.
 """
