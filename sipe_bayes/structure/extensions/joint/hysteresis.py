@@ -16,6 +16,7 @@ class Hysteresis(Extension):
     name, kind = "hysteresis", "joint"
     reference = "W. D. Iwan 1966; F. Al-Bender, V. Lampaert, J. Swevers 2005, https://doi.org/10.1109/TAC.2005.858676"
     native = False
+    nearest = "joint springyield, one elasto-plastic spring"
 
     def sentence(self, site: str) -> str:
         """What it is."""

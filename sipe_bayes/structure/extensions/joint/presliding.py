@@ -18,6 +18,7 @@ class Presliding(Extension):
         "P. R. Dahl 1968, A solid friction model; C. Canudas de Wit et al. 1995, https://doi.org/10.1109/9.376053"
     )
     native = False
+    nearest = 'actuator/dcmotor with input="none", LuGre friction'
 
     def sentence(self, site: str) -> str:
         """What it is."""

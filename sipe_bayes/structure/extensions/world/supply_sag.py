@@ -16,6 +16,7 @@ class SupplySag(Extension):
     name, kind = "supply_sag", "world"
     reference = "-"
     native = False
+    nearest = "actuator gain, at its mean over the motion"
 
     def sentence(self, site: str) -> str:
         """What it is."""
