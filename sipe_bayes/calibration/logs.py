@@ -253,7 +253,7 @@ def _fitted(name: str, values: FloatArray, samples: int) -> FloatArray:
         return np.append(values, np.nan)
     if len(values) != samples:
         lengths = f"column {name!r} has {len(values)} samples, the time {samples}"
-        raise LogError(f"{lengths}; they must be equal, or one fewer")
+        raise LogError(f"{lengths}; they must be equal, or one fewer: rows are samples")
     return values
 
 

@@ -214,8 +214,8 @@ class Code(Enum):
     LOG_MISSING = note("{channel}: {missing} of {samples} samples missing, masked")
     LOG_BLANK_COMMANDS = note("{channel}: {blank} blank commands, the one before is held")
     LOG_CLOCKS = note(
-        "{count} of {of} columns have clocks of their own and were put on the grid of the others; the first "
-        "{late:.3g} s, before all commands had begun, are left out"
+        "{count} of {of} columns have clocks of their own and were put on the grid of the others, which begins "
+        "{late:.3g} s after the first sample, with the last of the commands"
     )
     LOG_COMMAND_ENDS = caution(
         "{channel}: no command in the last {silent:.3g} s, the one before is held; cut the log there with `span` if "

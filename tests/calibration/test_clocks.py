@@ -12,11 +12,13 @@ from sipe_bayes.calibration.logs import load_log, load_logs
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.many import clock_of, digest, matching
 from sipe_bayes.core.findings import Code
+from sipe_bayes.core.toml import to_toml
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
 from tests.problems.log_files import (
     ROS_NAMES,
     START,
+    WRITERS,
     Messages,
     Written,
     command,
@@ -61,7 +63,9 @@ def test_topics_come_onto_the_grid_of_the_measurement(tmp_path: Path) -> None:
     np.testing.assert_array_equal(trajectory.actions[:, 0], expected)
     assert trajectory.dt == pytest.approx(0.01, rel=1e-9)
     assert {Code.LOG_CLOCKS, Code.LOG_CLOCK} <= codes(report)
-    assert any("1 of 2 columns have clocks of their own" in note and "first 0.01 s" in note for note in report.notes)
+    assert any(
+        "1 of 2 columns have clocks of their own" in note and "begins 0.01 s after" in note for note in report.notes
+    )
 
 
 def test_a_measurement_of_another_clock_is_interpolated_and_never_invented(tmp_path: Path) -> None:
@@ -149,6 +153,30 @@ def test_wrong_clocks(positions: Messages, commands: Messages, clock: str, messa
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("kind", sorted(set(WRITERS) - {".mcap", ".db3", "metadata.yaml"}))
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([0, 2, 1, 3], "must increase strictly, got .* in row 3 after .* in row 2; sort the rows"),
+        ([0, 1, 1, 2], "must increase strictly, got .* in row 3 after .* in row 2; drop duplicate rows"),
+        ([5, 6, 0, 1], "must increase strictly, got .* in row 3 after .* in row 2; sort the rows"),
+    ],
+)
+def test_a_clock_that_jumps_back(kind: str, rows: list[int], message: str, tmp_path: Path) -> None:
+    """In every format but a bag, whose messages its reader sorts."""
+    table = {name: values[rows] for name, values in regular(9).items()}
+    config = configured(WRITERS[kind](tmp_path, table), tmp_path)
+    with pytest.raises(LogError, match=message) as caught:
+        load_logs(config, config.logs)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_clock_beyond_all_times(tmp_path: Path) -> None:
+    for scale, words in ((1e300, "steps of 1e\\+298 s"), (1e-300, "steps of 1e-302 s")):
+        with pytest.raises(LogError, match=f"'t' goes on for .* in {words}; correct the clock or its unit"):
+            load(tmp_path, {**regular(), "t": regular()["t"] * scale})
+
+
 def test_a_stamp_that_jumps_back(tmp_path: Path) -> None:
     bag = ros_bag(tmp_path, states(T[:25], T[:25]) + states(T[25:], T[25:], delay=10**9) + efforts(T + 0.5, T))
     config = configured(Written(bag, {**ROS_NAMES, "t": "stamp"}), tmp_path)
@@ -198,6 +226,13 @@ def test_episodes_are_logs(tmp_path: Path) -> None:
     assert [len(trajectory) for trajectory, _ in loaded] == [49, 39, 29]
     np.testing.assert_array_equal(loaded[1][0].observations[:, 0], regular(40)["q"])
     assert len({report.sha256 for _, report in loaded}) == 3
+
+
+def test_what_a_configuration_became_is_one_again(tmp_path: Path) -> None:
+    config = many(tmp_path, episodes())
+    data = config.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    (tmp_path / "again.toml").write_text(to_toml(data))
+    assert load_config(tmp_path / "again.toml").logs == config.logs
 
 
 def test_episodes_are_held_out_by_number(tmp_path: Path) -> None:

@@ -75,6 +75,25 @@ def test_a_file_of_another_format(kind: str, tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("kind", [".csv", ".parquet", ".npz", ".h5", ".mat", "MATLAB 7.3"])
+def test_words_where_numbers_were_expected(kind: str, tmp_path: Path) -> None:
+    table = {**regular(), "q": np.array(["left", "right"] * 25)}
+    if kind == ".npz":
+        np.savez(tmp_path / "log.npz", **table)
+        written = Written(tmp_path / "log.npz")
+    elif kind == ".h5":
+        with h5py.File(tmp_path / "log.h5", "w") as file:
+            for name, values in table.items():
+                file[name] = values.astype("S") if name == "q" else values
+        written = Written(tmp_path / "log.h5")
+    else:
+        written = ALL[kind](tmp_path, {**table, "q": table["q"].astype("S" if kind == "MATLAB 7.3" else object)})
+    config = configured(written, tmp_path)
+    with pytest.raises(LogError, match=r"expected numbers; correct it|no column '.*q'") as caught:
+        load_logs(config, config.logs)
+    assert "\n" not in str(caught.value)
+
+
 # npz
 
 
