@@ -12,6 +12,7 @@ import scipy.signal
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.internal.states import joints_at_rest
 from sipe_bayes.envs.poses import PoseReading, has_pose
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
@@ -20,7 +21,7 @@ STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
 
 
 def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = False) -> FloatArray:
-    """A first guess of the states (T+1, S) along a log: recorded ones, else measured ones.
+    """A first guess of the states (T+1, S) along a log: recorded ones of such a model, else measured ones.
 
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
     the slopes of the positions. Orientations are smoothed likewise, in rotation vectors from each sample; the joint's
@@ -32,7 +33,7 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         trajectory: the log.
         raw: whether positions and measured velocities are those of the samples, not smoothed.
     """
-    if trajectory.states is not None:
+    if trajectory.states is not None and are_states(simulator, trajectory.states):
         return trajectory.states
     model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
     columns = simulator.environment.state_columns(model)
@@ -53,6 +54,11 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         told = [r for r in readings if r.joint == joint and _seen(trajectory, r)]
         _put_pose(model, {r.quantity: r for r in told}, trajectory, states, raw)
     return states
+
+
+def are_states(simulator: Simulator, states: FloatArray | None) -> bool:
+    """Whether recorded states (..., S) are of such a model, not of one with fewer joints, filters or delays."""
+    return states is not None and states.shape[-1] >= simulator.engine.physics_size
 
 
 def velocity_columns(model: mujoco.MjModel) -> dict[int, int]:
@@ -136,15 +142,18 @@ def _parents(model: mujoco.MjModel, joint: int, states: FloatArray) -> FloatArra
 
 
 def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
-    """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state."""
+    """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state.
+
+    Not those of which the model itself says how far from rest they start.
+    """
     model, environment = simulator.model, simulator.environment
-    if trajectories.states is not None:
+    if are_states(simulator, trajectories.states):
         return []
     seen = np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
     columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
     told = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
-    missing = []
-    for joint in range(model.njnt):
+    missing, resting = [], joints_at_rest(model)
+    for joint in (joint for joint in range(model.njnt) if joint not in resting):
         if has_pose(model, joint):
             known = (joint, "orientation") in told
             if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):

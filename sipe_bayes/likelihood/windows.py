@@ -24,12 +24,14 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.envs.internal.states import activations_at_rest
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
+    are_states,
     estimate_states,
     moved,
     past_commands,
@@ -114,8 +116,10 @@ class Windows:
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
         self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
         self.scales = noise_scales(len(self.channels), self.rotations)
-        if settings.starts == "recorded" and trajectories.states is None:
-            raise ValueError("starts: 'recorded' needs trajectories with states; use 'estimated' for a measured log")
+        if settings.starts == "recorded" and not are_states(simulator, trajectories.states):
+            raise ValueError(
+                "starts: 'recorded' needs trajectories with states of this model; use 'estimated' for a measured log"
+            )
         self._cut(trajectories)
         self._read_samples(trajectories)
 
@@ -285,9 +289,11 @@ class Windows:
     @property
     def starts_measured(self) -> bool:
         """Whether the log tells where every window starts: recorded states, or a measured position of each joint."""
-        if self.trajectories.states is not None:
+        if are_states(self.simulator, self.trajectories.states):
             return True
-        return not self.simulator.model.na and not unmeasured_joints(self.simulator, self.trajectories)
+        model = self.simulator.model
+        known = activations_at_rest(model) == model.na
+        return known and not unmeasured_joints(self.simulator, self.trajectories)
 
     def linearise(
         self,

@@ -110,18 +110,23 @@ def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: li
     environment = windows.simulator.environment
     assert isinstance(environment, MjcfEnvironment)
     batches = [group]
-    if not _possible(environment, group):  # two of them write the same number
-        batches = [[one] for one in group if _possible(environment, [one])]
+    if not _possible(windows, environment, group):  # two of them write the same number
+        batches = [[one] for one in group if _possible(windows, environment, [one])]
     return [effect for batch in batches for effect in _simulated(windows, theta, starts, batch, environment)]
 
 
-def _possible(environment: MjcfEnvironment, group: list[Placed]) -> bool:
-    """Whether the model can have them all, beside the extensions that it has."""
+def _possible(windows: Windows, environment: MjcfEnvironment, group: list[Placed]) -> bool:
+    """Whether the model can have them all, beside the extensions that it has.
+
+    None that has states of its own, where the logs' recorded states are to be held to.
+    """
     try:
-        extended(environment, group)
+        larger = extended(environment, group)
     except ValueError:
         return False
-    return True
+    before, after = windows.simulator.model, larger.compile()
+    sizes = [(model.nq, model.nv, model.na, model.nhistory) for model in (before, after)]
+    return windows.settings.starts == "estimated" or sizes[0] == sizes[1]
 
 
 def _simulated(

@@ -36,6 +36,16 @@ def start_sd(model: mujoco.MjModel, wide: FloatArray) -> FloatArray:
     return sd
 
 
+def joints_at_rest(model: mujoco.MjModel) -> frozenset[int]:
+    """Ids of the joints of which the model says how far from rest windows may start."""
+    return frozenset(index for kind, index, _ in _declared(model) if kind == "joint")
+
+
+def activations_at_rest(model: mujoco.MjModel) -> int:
+    """How many activations the model says this of."""
+    return sum(len(declared) for kind, _, declared in _declared(model) if kind == "actuator")
+
+
 def filtered_commands(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """(actuator, column of the physics state) of each command that goes through a declared filter."""
     filters = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
