@@ -1,4 +1,8 @@
-"""The sizes of a gear or link that gives way, from those of a joint's motion."""
+"""The sizes of a gear or link that gives way, from those of a joint's motion.
+
+Between a motor without inertia and its joint nothing can give way that shows: where the model has no armature there,
+the extension ``armature`` is found first, and these beside it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.internal.elastic import Elastic
 from sipe_bayes.structure.machine import Machine
 
-_ROTOR = 0.2  # of the inertia that the joint moves, where the model gives the motor none
+_ROTOR = 0.2  # of the inertia that the joint moves, taken for the motor's where the model has none
 _SOFTEST = 2.0  # times the motion's own frequency: the lowest resonance
 _LEAST_RANGE = 20.0  # of the softest spring to the stiffest that the physics step resolves
 _START = 0.15  # of the softest spring's usual twist, where windows may start
@@ -23,13 +27,11 @@ class ElasticSizes:
         elastic: what the elastic joint begins with.
         most: compliance, rad/(N m) or m/N.
         losses: shortest and longest time constant of the loss, in seconds.
-        rotor: the motor's inertia as a parameter, where neither the model nor the user has one.
     """
 
     elastic: Elastic
     most: float
     losses: tuple[float, float]
-    rotor: tuple[Parameter, ...]
 
     def loss(self, joint: str, site: str) -> Parameter:
         """The loss of the elastic ``joint``, named after the ``site`` of the extension."""
@@ -59,9 +61,5 @@ def elastic_sizes(machine: Machine, site: str) -> ElasticSizes | None:
     twist = _START * sizes.force / softest
     start = (min(twist, sizes.position), min(twist * _SOFTEST * frequency, sizes.velocity))
     low, high = (share / frequency for share in _LOSSES)
-    target = f"joint:{site}.armature"
-    free = () if own or target in machine.written() else (target,)
-    inertia = tuple(
-        Parameter(f"{site}.rotor", 0.0, sizes.inertia, targets=(t,), description="the motor's inertia") for t in free
-    )
-    return ElasticSizes(Elastic(stiffest, reduced, start, loss=(low * high) ** 0.5), 1 / softest, (low, high), inertia)
+    elastic = Elastic(stiffest, reduced, start, loss=(low * high) ** 0.5)
+    return ElasticSizes(elastic, 1 / softest, (low, high))

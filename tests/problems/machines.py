@@ -20,7 +20,7 @@ _DOUBLE = """<mujoco><option timestep="0.004" integrator="implicitfast"><flag co
   <actuator><motor name="m1" joint="shoulder" gear="2"/><position name="m2" joint="elbow" kp="4" kv=".3"/></actuator>
   </mujoco>"""
 _SLIDE = """<mujoco><option timestep="0.004"><flag contact="disable"/></option><worldbody>
-  <body name="carriage"><joint name="slider" type="slide" axis="1 0 1" damping="0.5" frictionloss="0.1"/>
+  <body name="carriage"><joint name="slider" type="slide" axis="1 0 1" damping="0.5" frictionloss="0.1" armature="0.3"/>
   <geom type="box" size=".1 .1 .05" mass="2"/></body></worldbody>
   <actuator><motor name="drive" joint="slider" gear="3"/></actuator></mujoco>"""
 

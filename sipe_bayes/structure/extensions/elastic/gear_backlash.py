@@ -12,14 +12,12 @@ from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
 
 _SIZES = 0.03, 0.1, 0.3  # of the widest gap: its effect is far from linear
-_ROTOR = 0.2
 
 
 class GearBacklash(Extension):
     """A gap in the gear between a motor and its joint.
 
-    The position is measured behind it, at the joint. Where neither the model nor the user gives the motor an inertia of
-    its own, that is a parameter too: without one a gap changes nothing.
+    The position is measured behind it, at the joint.
     """
 
     name, kind = "gear_backlash", "joint"
@@ -42,7 +40,7 @@ class GearBacklash(Extension):
             targets=(f"joint:{joint}.play",),
             description="width of the gap",
         )
-        return (play, *sizes.rotor)
+        return (play,)
 
     def edit(self, machine: Machine, site: str) -> Gear | None:
         """The spring."""
@@ -51,5 +49,4 @@ class GearBacklash(Extension):
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """Three gaps."""
-        others = (_ROTOR,)[: len(parameters) - 1]
-        return np.array([[[size, *others]] for size in _SIZES])
+        return np.array([[[size]] for size in _SIZES])

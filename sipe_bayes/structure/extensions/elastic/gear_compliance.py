@@ -12,14 +12,13 @@ from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
 
 _SIZES = 0.05, 0.15, 0.4  # of the softest spring: its effect is far from linear
-_LOSS, _ROTOR = 0.5, 0.2
+_LOSS = 0.5
 
 
 class GearCompliance(Extension):
     """A gear or belt that gives way between a motor and its joint.
 
-    The position is measured behind it, at the joint. Where neither the model nor the user gives the motor an inertia of
-    its own, that is a parameter too: without one a spring changes nothing.
+    The position is measured behind it, at the joint.
     """
 
     name, kind = "gear_compliance", "joint"
@@ -42,7 +41,7 @@ class GearCompliance(Extension):
             targets=(f"joint:{joint}.compliance",),
             description="twist per force",
         )
-        return (compliance, sizes.loss(joint, f"{site}.gear_compliance"), *sizes.rotor)
+        return (compliance, sizes.loss(joint, f"{site}.gear_compliance"))
 
     def edit(self, machine: Machine, site: str) -> Gear | None:
         """The spring."""
@@ -51,5 +50,4 @@ class GearCompliance(Extension):
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """Three springs."""
-        others = (_LOSS, _ROTOR)[: len(parameters) - 1]
-        return np.array([[[size, *others]] for size in _SIZES])
+        return np.array([[[size, _LOSS]] for size in _SIZES])

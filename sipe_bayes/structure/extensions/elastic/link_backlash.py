@@ -12,7 +12,6 @@ from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
 
 _SIZES = 0.03, 0.1, 0.3  # of the widest gap: its effect is far from linear
-_ROTOR = 0.2
 
 
 class LinkBacklash(Extension):
@@ -41,7 +40,7 @@ class LinkBacklash(Extension):
             targets=(f"joint:{joint}.play",),
             description="width of the gap",
         )
-        return (play, *sizes.rotor)
+        return (play,)
 
     def edit(self, machine: Machine, site: str) -> Link | None:
         """The spring."""
@@ -50,5 +49,4 @@ class LinkBacklash(Extension):
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """Three gaps."""
-        others = (_ROTOR,)[: len(parameters) - 1]
-        return np.array([[[size, *others]] for size in _SIZES])
+        return np.array([[[size]] for size in _SIZES])

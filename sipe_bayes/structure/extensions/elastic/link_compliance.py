@@ -12,7 +12,7 @@ from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
 
 _SIZES = 0.05, 0.15, 0.4  # of the softest spring: its effect is far from linear
-_LOSS, _ROTOR = 0.5, 0.2
+_LOSS = 0.5
 
 
 class LinkCompliance(Extension):
@@ -41,7 +41,7 @@ class LinkCompliance(Extension):
             targets=(f"joint:{joint}.compliance",),
             description="twist per force",
         )
-        return (compliance, sizes.loss(joint, f"{site}.link_compliance"), *sizes.rotor)
+        return (compliance, sizes.loss(joint, f"{site}.link_compliance"))
 
     def edit(self, machine: Machine, site: str) -> Link | None:
         """The spring."""
@@ -50,5 +50,4 @@ class LinkCompliance(Extension):
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """Three springs."""
-        others = (_LOSS, _ROTOR)[: len(parameters) - 1]
-        return np.array([[[size, *others]] for size in _SIZES])
+        return np.array([[[size, _LOSS]] for size in _SIZES])
