@@ -230,10 +230,11 @@ def past_commands(
 
     Of starts at samples ``start`` (W,) of the logs ``log`` (W,), whose control steps take ``dt`` (W,) seconds.
     """
+    longest = 2000 if simulator.model.nhistory else 1  # longer than any actuator's delay
     past = []
     for k, first, seconds in zip(log, start, dt, strict=True):
         skip = simulator.physics_steps(float(seconds))[0]
-        rows = trajectories.actions[k, max(0, first - 2000) : first]  # longer than any actuator's delay
+        rows = trajectories.actions[k, max(0, first - longest) : first]
         past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
     return past
 

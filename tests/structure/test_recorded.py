@@ -17,7 +17,7 @@ from sipe_bayes.structure.probes import effects
 from sipe_bayes.structure.registry import get_extension
 from tests.problems.pendulums import log, pendulum
 
-NAMES = ("dry_friction", "lag", "presliding", "link_compliance", "delay")
+NAMES = ("dry_friction", "lag", "presliding", "base_compliance", "delay")
 THETA = np.array([0.4, 0.4])
 
 

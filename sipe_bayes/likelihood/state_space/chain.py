@@ -83,7 +83,7 @@ class Chain:
         reference = np.concatenate([estimate_states(simulator, t, raw=True) for t in measured])
         if known:
             reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
-        past = past_commands(simulator, trajectories, self.log, self.sample, self.dt) if model.nhistory else []
+        past = past_commands(simulator, trajectories, self.log, self.sample, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt)
         self.sizes = (model.nv, model.nv, model.na)
         start_sd = np.repeat(KNOWN_SD, self.sizes) if known else environment.start_sd(model)

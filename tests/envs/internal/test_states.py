@@ -5,9 +5,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.states import declare_start, filtered_commands, start_sd
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extensions.actuator.lag import FilteredCommand
@@ -36,4 +38,21 @@ def test_windows_start_at_the_command_before_them() -> None:
     recorded = Trajectories.stack([Trajectory(run.observations[0], actions, 0.008, channels=channels)])
     windows = Windows(Segments(window=0.16), simulator, recorded)
     np.testing.assert_array_equal(windows.reference[:, 5], actions[[0, 19, 39], 1])
+    chain = Chain(StateSpace(), simulator, recorded)
+    np.testing.assert_array_equal(chain.reference[:, 5], actions[[0, *range(60)], 1])
     np.testing.assert_allclose(windows.start_precision, np.array([10, 10, 100, 100, 0.3]) ** -2.0)
+
+
+def test_laws_remember_that_the_motion_has_gone_on() -> None:
+    """From the direction where the joint moves; friction that is built up over a distance wholly, long springs not."""
+    drive = MACHINES["pendulum"]
+    bounds = {"presliding_friction": 0.0, "presliding_range": 0.1, "hysteresis_force": 0.0, "hysteresis_range": 0.1}
+    parameters = [Parameter(name, low, 1.0, targets=(f"joint:hinge.{name}",)) for name, low in bounds.items()]
+    simulator = Simulator(environment(drive, parameters), 1)
+    model, states = simulator.model, np.tile(simulator.default_state(), (3, 1))
+    states[:, 2] = [2.0, 0.0, -2.0]
+    begun = simulator.environment.history(model, states, [], np.full(3, 0.004))[:, 3:]
+    np.testing.assert_allclose(begun[0], [1, 1, 0.5, 0], atol=1e-4)
+    np.testing.assert_array_equal(begun[1], 0.0)
+    np.testing.assert_array_equal(begun[2], -begun[0])
+    np.testing.assert_allclose(simulator.environment.start_sd(model)[2:], 0.6)
