@@ -22,7 +22,9 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 
 import numpy as np
 
@@ -32,9 +34,9 @@ from sipe_bayes.calibration.config_tables import Command, LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, control_grid, held, sampled
 from sipe_bayes.calibration.log_report import report_of
 from sipe_bayes.calibration.readers.base import Columns, LogError
-from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode
+from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode, episode_numbers
 from sipe_bayes.calibration.readers.tables import read_table
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import aligned, continued, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert
@@ -71,12 +73,11 @@ def load_logs(
     wanted += [config.columns.episode] if config.columns.episode else []
     loaded = []
     for file, parts in groupby(logs, key=lambda log: log.file):
-        table, sha256 = None, ""
+        opened = None
         for log in parts:
             try:
-                if table is None:
-                    table, sha256 = read_table(file, wanted), digest(file)
-                loaded.append(_loaded(config, log, table, sha256))
+                opened = opened or _Opened.of(file, wanted, config.columns.episode)
+                loaded.append(_loaded(config, log, opened))
             except LogError as error:
                 raise LogError(f"log {log.name!r}: {error}") from None
     return loaded
@@ -89,11 +90,26 @@ def load_log(
     return load_logs(config, [log], dimensions)[0]
 
 
-def _loaded(config: Config, log: LogEntry, table: Columns, sha256: str) -> tuple[Trajectory, LogReport]:
-    if config.columns.episode:
+@dataclass(frozen=True)
+class _Opened:
+    """A file's columns and SHA-256, and where it holds episodes, of which one each row (n,) is."""
+
+    table: Columns
+    sha256: str
+    episodes: IntArray | None
+
+    @classmethod
+    def of(cls, file: Path, wanted: Sequence[str], episode: str | None) -> _Opened:
+        table = read_table(file, wanted)
+        return cls(table, digest(file), None if episode is None else episode_numbers(file, table, episode))
+
+
+def _loaded(config: Config, log: LogEntry, opened: _Opened) -> tuple[Trajectory, LogReport]:
+    table, sha256 = opened.table, opened.sha256
+    if opened.episodes is not None:
         if log.episodes is None or len(log.episodes) != 1:
             raise LogError(f"expected one number in `episodes`, got {log.episodes}; use load_config, which names them")
-        table = episode(log.file, table, config.columns.episode, log.episodes[0])
+        table = episode(table, opened.episodes, log.episodes[0])
         sha256 = combined([sha256, str(log.episodes[0])])
     raw = _read_log(config, log, table)
     grid = control_grid(raw.time, config.resample.rate)

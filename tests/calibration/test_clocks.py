@@ -261,7 +261,7 @@ WRONG_EPISODES = [
     ({"k": np.array(["a"] * 120)}, "", r"column 'k' is to number the episodes; expected whole numbers"),
     ({"k": np.r_[np.zeros(119), np.nan]}, "", r"expected whole numbers in every row"),
     ({"k": np.full(120, 1e300)}, "", r"expected whole numbers in every row"),
-    ({}, '[[logs]]\nfile = "log.csv"\nepisodes = [9]\n', r"log 'log-9': no episode 9 in 'k'; it goes from 3 to 7"),
+    ({}, '[[logs]]\nfile = "log.csv"\nepisodes = [9]\n', r"log 'log-9': no episode 9; they go from 3 to 7"),
     ({}, '[[logs]]\nfile = "log.csv"\nepisodes = [3, 3]\n', r"`logs\[0\].episodes`: names an episode twice"),
     ({}, '[[logs]]\nfile = "log.csv"\nepisodes = []\n', r"`logs\[0\].episodes`"),
     ({}, '[[logs]]\nfile = "log.csv"\nepisodes = [1.5]\n', r"`logs\[0\].episodes\[0\]`"),

@@ -129,7 +129,11 @@ WRONG: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
         [],
         ["parameters[1].targets", "'body:rod.mass'", "drop it from one"],
     ),
-    "held-out samples train": (text("[2.01, 3.0]", "[1.0, 3.0]"), [], ["logs[1].use", "'log'", "give spans apart"]),
+    "held-out samples train": (
+        text("[2.01, 3.0]", "[1.0, 3.0]"),
+        [],
+        ["logs[1].use", "'log'", "give spans or episodes apart"],
+    ),
     "unknown estimator": (nothing, ["--estimator", "laplase"], ["estimator", "'laplase'", "did you mean 'laplace'?"]),
     "negative seed": (nothing, ["--seed", "-1"], ["--seed -1", "at least 0", "raise it"]),
     "no budget": (nothing, ["--budget", "0"], ["--budget 0", "at least 1", "raise it"]),

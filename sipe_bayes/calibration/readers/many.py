@@ -9,11 +9,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sipe_bayes.calibration.config_fields import nearest
 from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.tables import READERS, read_table
+from sipe_bayes.core.arrays import IntArray
 
 _ABOUT = (".json", ".yaml")  # beside the logs of a folder, what tells about them
 
@@ -44,7 +44,7 @@ def names_of(paths: list[Path]) -> list[str]:
 
 def episodes_of(path: Path, column: str) -> list[int]:
     """The numbers of the episodes in a file, in the order in which they begin; raises LogError where it has none."""
-    numbers = _numbers(path, read_table(path, [column]), column)
+    numbers = episode_numbers(path, read_table(path, [column]), column)
     found = np.unique(numbers, return_index=True)
     episodes = [int(number) for number in found[0][np.argsort(found[1])]]
     if 2 * len(episodes) > len(numbers):
@@ -55,17 +55,18 @@ def episodes_of(path: Path, column: str) -> list[int]:
     return episodes
 
 
-def episode(path: Path, table: Columns, column: str, number: int) -> Columns:
-    """The rows of one episode; columns of another length are left as they are."""
-    numbers = _numbers(path, table, column)
-    rows = numbers == number
-    if not rows.any():
-        numbers = np.unique(numbers)
-        raise LogError(f"no episode {number} in {column!r}; it goes from {numbers[0]} to {numbers[-1]}")
-    return {name: values[rows] if len(values) == len(rows) else values for name, values in table.items()}
+def episode(table: Columns, numbers: IntArray, number: int) -> Columns:
+    """The rows of one episode; columns of another length than its numbers (n,) are left as they are."""
+    found = np.flatnonzero(numbers == number)
+    if not found.size:
+        raise LogError(f"no episode {number}; they go from {numbers.min()} to {numbers.max()}")
+    first, last = int(found[0]), int(found[-1]) + 1
+    rows = slice(first, last) if last - first == found.size else found  # no copies where they stand together
+    return {name: values[rows] if len(values) == len(numbers) else values for name, values in table.items()}
 
 
-def _numbers(path: Path, table: Columns, column: str) -> NDArray[np.int64]:
+def episode_numbers(path: Path, table: Columns, column: str) -> IntArray:
+    """The number of the episode that each row (n,) is of; raises LogError where a column holds none."""
     if column not in table:
         raise LogError(f"{path}: no column {column!r}; {nearest(column, table)}")
     try:
