@@ -14,11 +14,17 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, Severity, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.envs.poses import has_pose
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.starts import unmeasured_joints
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.simulation.simulator import Simulator
 
+_FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
 
 
@@ -87,6 +93,28 @@ class Marginals:
                 bound = p.low if value - p.low < p.high - value else p.high
                 noticed.append(about(Code.MODE_AT_BOUND, bound=bound))
         return noticed
+
+
+def unmeasured_starts(
+    simulator: Simulator, logs: Trajectories, likelihood: Segments | StateSpace, holdout: bool
+) -> list[Finding]:
+    """Free and ball joints whose pose no channel tells, so that windows start them where the model has them.
+
+    With a ``StateSpace`` these are those of the logs in ``holdout`` alone.
+    """
+    if isinstance(likelihood, StateSpace) and not holdout:
+        return []
+    model = simulator.model
+    joints = [joint for joint in unmeasured_joints(simulator, logs) if has_pose(model, joint)]
+    said = []
+    for joint in joints:
+        body = model.body(int(model.jnt_bodyid[joint])).name or f"body {int(model.jnt_bodyid[joint])}"
+        name = model.joint(joint).name or f"of {body}"
+        place = f"body:{body}.position and " if int(model.jnt_type[joint]) == _FREE else ""
+        needed = f"{place}body:{body}.orientation"
+        code = Code.HELD_OUT_AT_REST if isinstance(likelihood, StateSpace) else Code.STARTS_AT_REST
+        said.append(finding(code, joint=name, needed=needed))
+    return said
 
 
 def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.calibration.gathered import Marginals, not_better, of_logs, uneven_targets
+from sipe_bayes.calibration.gathered import Marginals, not_better, of_logs, uneven_targets, unmeasured_starts
 from sipe_bayes.calibration.output import CHECKPOINT, claim, describe_run, release, write_all
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
@@ -30,6 +30,8 @@ from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -70,9 +72,12 @@ def calibrate(
     # what the parameters do and whether the logs agree about them
     tell("checking what each parameter changes")
     theta, space = posterior.mode.numpy(), problem.environment.space
+    logs, problem = problem.train, _from_fitted_states(problem, method)
     fitted = bind(problem.segments, problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
-    conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, method.seed, tell)
+    conflict, skipped = None, list[str]()
+    if not grows(fitted):  # a log of a body that tumbles says too little by itself; its scatter is in the posterior
+        conflict, skipped = compare_logs(problem.simulator, problem.likelihood, logs, theta, method.seed, tell)
     unknown = [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
     # what the model lacks
     noise = _noise_of(method, fitted, theta)
@@ -87,6 +92,7 @@ def calibrate(
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
         *problem.findings,
+        *unmeasured_starts(problem.simulator, logs, problem.likelihood, problem.holdout is not None),
         *_own(method),
         *unknown,
         *uneven_targets(problem.environment),
@@ -119,6 +125,12 @@ def calibrate(
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
     )
+
+
+def _from_fitted_states(problem: Problem, method: Estimator) -> Problem:
+    """The problem with the training logs in the states where a fit with a ``StateSpace`` says that they were."""
+    states = method.fitted_states(problem.train) if isinstance(method, Laplace) else None
+    return problem if states is None else replace(problem, train=replace(problem.train, states=states))
 
 
 @dataclass(frozen=True)
@@ -184,6 +196,9 @@ def _residuals(
     if isinstance(problem.likelihood, StateSpace):
         return None, []
     starts = best_starts(fitted, theta, noise)
+    if {Code.SCATTER, Code.SCATTER_UNKNOWN} & {item.code for item in method.findings}:
+        unknown.append(finding(Code.MISFIT_NOT_ASKED))
+        return None, fitted_residuals(fitted, theta, noise, starts)
     try:
         prior = QuadraticPrior.of(problem.prior)
         lacks = misfit(fitted, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed)

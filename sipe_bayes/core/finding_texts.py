@@ -120,6 +120,22 @@ class Code(Enum):
         "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the "
         "intervals"
     )
+    STARTS_AT_REST = blocking(
+        "the measurements do not tell the pose of joint {joint}: every window starts it where the model has it at "
+        "rest; measure {needed}, or use likelihood = 'state_space'"
+    )
+    HELD_OUT_AT_REST = caution(
+        "the measurements do not tell the pose of joint {joint}: simulations of held-out logs start it where the model "
+        "has it at rest; measure {needed} to believe their errors"
+    )
+    SCATTER = note(
+        "impacts make the simulation rough: the intervals are not those of the curvature but of the scatter of "
+        "{groups} groups of windows fitted apart ({lost} of them lost)"
+    )
+    SCATTER_UNKNOWN = blocking(
+        "impacts make the simulation rough, and {windows} windows are too few to see by their scatter how well the "
+        "parameters are known: the intervals may be far too narrow; give at least 8, without parameters per log"
+    )
     ROUGH_EVERYWHERE = blocking(
         "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse "
         "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim"
@@ -167,6 +183,9 @@ class Code(Enum):
     MISFIT = caution(_NOT_NOISE + "; do not trust the intervals' width: {remedy}", "model lacks something")
     MISFIT_SHIFTS = caution(
         _NOT_NOISE + "; with it in the model the estimate would move, {moved}: {remedy}", "model lacks something"
+    )
+    MISFIT_NOT_ASKED = note(
+        "whether the residuals are noise is not asked: through impacts no linearisation says what other physics does"
     )
     MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
     RESIDUALS_LEFT_OUT = note(

@@ -17,6 +17,8 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
+from sipe_bayes.inference.laplace.growing_windows import grown_starts, grows
+from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.starts import velocity_columns
@@ -261,6 +263,8 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
 
 def best_starts(windows: Windows, theta: FloatArray, noise: Noise, iterations: int = 4) -> FloatArray:
     """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,)."""
+    if grows(windows):
+        return grown_starts(windows, theta, noise, GrowingTuning())
     starts = windows.no_starts()
     for _ in range(iterations):
         linearisation = windows.linearise(theta, starts, with_theta=False)

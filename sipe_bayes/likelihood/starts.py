@@ -5,6 +5,8 @@ A tangent is (dq (nv), dv (nv), dact (na)).
 
 from __future__ import annotations
 
+import functools
+
 import mujoco
 import numpy as np
 import scipy.signal
@@ -185,6 +187,13 @@ def _span(count: int, dt: float) -> int:
     return min(max(5, 2 * round(0.06 / dt / 2) + 1), count - (count + 1) % 2)
 
 
+@functools.lru_cache(maxsize=64)
+def _weights(span: int, derivative: int, dt: float) -> FloatArray:
+    """Weights (span, span) of a local quadratic's samples, for its value or slope at each of them."""
+    rows = [scipy.signal.savgol_coeffs(span, 2, derivative, dt, pos=place, use="dot") for place in range(span)]
+    return np.stack(rows)
+
+
 def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors (T+1, 3) smoothed as ``smoothed`` does, and angular velocities (T+1, 3) about axes that stay.
 
@@ -198,11 +207,8 @@ def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, Floa
     neighbours = begin[:, None] + np.arange(span)
     ways = between(vectors[neighbours], vectors[:, None])
     place = np.arange(count) - begin
-    out = []
-    for derivative in (0, 1):
-        weights = np.stack([scipy.signal.savgol_coeffs(span, 2, derivative, dt, pos=p, use="dot") for p in range(span)])
-        out.append((weights[place][..., None] * ways).sum(1))
-    return added(vectors, out[0]), out[1]
+    smooth, slope = ((_weights(span, derivative, dt)[place][..., None] * ways).sum(1) for derivative in (0, 1))
+    return added(vectors, smooth), slope
 
 
 def moved(model: mujoco.MjModel, states: FloatArray, tangent: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.internal.states import activations_at_rest
@@ -178,14 +178,33 @@ class Windows:
         if np.bincount(self.log).min() < 4:
             return self
         if self._subset is None:
-            self._subset = self._cut_subset()
+            within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
+            self._subset = self.part(np.flatnonzero(within % 2 == 0))
         self._subset.rollouts, self._subset.budget = self.rollouts, self.budget
         return self._subset
 
-    def _cut_subset(self) -> Windows:
-        within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
-        view, keep = copy.copy(self), np.flatnonzero(within % 2 == 0)
-        vars(view).pop("spread", None)
+    def beginnings(self, steps: int) -> Windows:
+        """The first control ``steps`` of every window; the windows themselves where none is longer.
+
+        Its rollouts are counted by themselves, as if whole.
+        """
+        if steps >= self.steps.max():
+            return self
+        view = copy.copy(self)
+        for name in ("spread", "rounding"):
+            vars(view).pop(name, None)
+        view.steps, view.actions = np.minimum(self.steps, steps), self.actions[:, :steps]
+        for name in ("owned", "measured", "observed"):
+            setattr(view, name, getattr(self, name)[:, : steps + 1])
+        sample = view.start[:, None] + np.arange(steps + 1)
+        view.sequences = sequences(view.observed, sample, view.log, view.dt)
+        return view
+
+    def part(self, keep: IntArray) -> Windows:
+        """Some of the windows, by number. Their rollouts are counted by themselves, as if all were simulated."""
+        view = copy.copy(self)
+        for name in ("spread", "rounding"):
+            vars(view).pop(name, None)
         for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]

@@ -12,7 +12,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from sipe_bayes.report.verdicts import improvement, parameter_verdict, verdicts
 from sipe_bayes.report.words import error_text, number, significant, times, unit_text
 
 _GAPS = 4  # that a row of the logs lists
+_DRAWN = 12  # logs whose signals are drawn, half of them held out, where there are more
 
 # Rows of the tables
 
@@ -156,11 +157,17 @@ def pictures(calibration: Calibration) -> list[Picture]:
     """Every figure of the report, rendered."""
     drawn = [("marginals", "marginals", "Marginal of each parameter", plots.marginals(calibration))]
     drawn.append(("pairs", "pairs", "Pairs of parameters", plots.pairs(calibration)))
-    for i, (log, use) in enumerate(_logs(calibration)):
+    logs = _logs(calibration)
+    if len(logs) > _DRAWN:  # of many logs some stand for all; the tables have each
+        by_use = [[item for item in logs if item[1] == use] for use in ("holdout", "train")]
+        logs = [item for items in by_use for item in items[: _DRAWN // 2]]
+    shown = {log for log, _ in logs}
+    for i, (log, use) in enumerate(logs):
         slug = re.sub(r"[^A-Za-z0-9]+", "_", log).strip("_")[:40]
         alt = f"Measured and simulated signals of {log}"
         drawn.append((f"signals_{use}", f"signals_{i + 1}_{slug}", alt, plots.signals(calibration, log)))
-    drawn.append(("residuals", "residuals", "Residuals and their autocorrelation", plots.residuals(calibration)))
+    fitted = replace(calibration, residuals=[row for row in calibration.residuals if row.log in shown])
+    drawn.append(("residuals", "residuals", "Residuals and their autocorrelation", plots.residuals(fitted)))
     drawn.append(("chains", "chains", "Traces of the Markov chains", plots.chains(calibration)))
     return [
         Picture(section, f"{file}{f'_{k + 1}' if len(figures) > 1 else ''}.png", png(figure), alt)

@@ -175,6 +175,19 @@ class Laplace(Estimator[LaplaceState]):
         if len(kept) > 1:
             self.find(Code.SEPARATE_OPTIMA, count=len(kept))
 
+    def fitted_states(self, trajectories: Trajectories) -> FloatArray | None:
+        """States (R, T+1, S) of the logs of ``fit`` at the best optimum of a ``StateSpace``; of windows None.
+
+        Beyond a shorter log's end they stay where they are.
+        """
+        kept = [] if self.state is None else distinct(self.state.search.optima)
+        if not kept or not isinstance(kept[0], ChainOptimum):
+            return None
+        length = trajectories.length
+        ends = np.cumsum(length + 1)
+        sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
+        return np.asarray(kept[0].states[(ends - length - 1)[:, None] + sample])
+
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
         kept = [] if self.state is None else distinct(self.state.search.optima)

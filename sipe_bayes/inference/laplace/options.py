@@ -14,7 +14,7 @@ from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 
 @dataclass(frozen=True)
 class ScreeningTuning(Options):
-    """How starting points are chosen among candidates; see ``window_search.screen``."""
+    """How starting points are chosen among candidates; see ``screening``."""
 
     generations_from: int = option(40, "candidates from which on later ones are drawn around the best", least=1)
     generations: int = option(10, "generations of the cross-entropy method", least=1)
@@ -43,12 +43,31 @@ class WindowTuning(Options):
 
 
 @dataclass(frozen=True)
+class GrowingTuning(Options):
+    """How beginnings of windows grow."""
+
+    first: float = option(0.25, "share of the longest window that they begin with", above=0, most=1)
+    growth: float = option(1.25, "factor by which they grow: little enough that one impact comes at a time", above=1)
+    enough: float = option(1e-3, "gain of a step below which they grow", "of the energy", above=0)
+    most_steps: int = option(12, "steps after which they grow all the same", least=1)
+    start_steps: int = option(4, "the same where only the starts are looked for", least=1)
+    damping: float = option(1e-2, "of the first step of longer ones, at most", above=0)
+    shares: tuple[float, ...] = option((1.0, 0.4, 0.1, 0.0), "of its step, of which a start takes the best")
+    groups: int = option(8, "groups of windows fitted apart at most, two windows each at least", least=4)
+    fewest: int = option(4, "groups whose scatter says something", least=4)
+    reliable: int = option(6, "groups among which some may be told to be lost", least=4)
+    rough: float = option(3.0, "scatter over what the linearisation says from which that is not believed", above=1)
+    lost: float = option(10.0, "distance from the median of a group whose search was lost", "robust sds", above=0)
+
+
+@dataclass(frozen=True)
 class LaplaceTuning(Options):
     """Numbers of the search that users hardly ever change."""
 
     damping: DampingRule = option(DampingRule(), "how steps are damped")
     screening: ScreeningTuning = option(ScreeningTuning(), "how starting points are chosen")
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
+    growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
     pattern: PatternTuning = option(PatternTuning(), "how the surroundings of an optimum are looked at")
     state_space: ChainTuning = option(ChainTuning(), "how the searches over a chain of states go")

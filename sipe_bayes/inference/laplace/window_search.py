@@ -9,6 +9,9 @@ already known.
 Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ
 from place to place, and the place would otherwise be an accident of the start.
 
+Of bodies that tumble and land, theta and the starts descend together on beginnings of the windows that grow
+(``growing_windows``).
+
 An optimum at which differences have been too short to see what a parameter does (a delay below two physics steps) is
 searched on with longer ones.
 
@@ -32,13 +35,23 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.growing_windows import (
+    ManyStarts,
+    first_horizon,
+    group,
+    grown,
+    grows,
+    num_groups,
+    scattered,
+    touches,
+)
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST, pattern_size
+from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.window_energy import (
     LinearisedWindows,
@@ -109,6 +122,7 @@ class WindowSearch:
     def step(self, state: WindowState) -> WindowState:
         """One linearisation and one accepted step; what it does is the phase's."""
         phases: dict[Phase, Callable[[WindowState], WindowState]] = {
+            Phase.GROW: self._grow,
             Phase.SUBSET: self._subset,
             Phase.WHOLE: self._whole,
             Phase.ROUGH: self._rough,
@@ -116,6 +130,46 @@ class WindowSearch:
             Phase.NOISE: self._noise,
         }
         return phases[state.here.phase](state)
+
+    def _grow(self, state: WindowState) -> WindowState:
+        """A step on beginnings of the windows, or of a group of them; see ``growing_windows``."""
+        tuning, prior, before = self._tuning, self.problem.quadratic_prior, state.here
+        if before.group is None:
+            state = replace(
+                state, here=grown(self.windows, self.windows, prior, before, tuning.growing, tuning.damping)
+            )
+            return self._next(state) if state.here.phase is not Phase.GROW and state.known else state
+        count = num_groups(self.windows, tuning.growing)
+        part = group(self.windows, before.group, count)
+        here = grown(self.windows, part, prior, before, tuning.growing, tuning.damping)
+        if here.phase is Phase.GROW:
+            return replace(state, here=here)
+        state = replace(state, estimates=(*state.estimates, here.theta))
+        if before.group + 1 < count:
+            return replace(state, here=self._apart(before.group + 1, state))
+        best = max(state.aside, key=lambda optimum: optimum.evidence)
+        return replace(state, optima=(scattered(best, np.stack(state.estimates), tuning.growing),), done=True)
+
+    def _next(self, state: WindowState) -> WindowState:
+        """At the next starting point; after the last, groups of windows that tumble are fitted apart."""
+        onward = state.next_point(self._begin)
+        if not (onward.done and grows(self.windows)) or not state.optima:
+            return onward
+        if num_groups(self.windows, self._tuning.growing):
+            cut_short = tuple(replace(o, finding=finding(Code.SEARCH_CUT_SHORT)) for o in state.optima)  # until then
+            return replace(state, here=self._apart(0, state), optima=cut_short, aside=state.optima)
+        if not touches(self.windows):
+            return onward
+        said = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
+        return replace(onward, optima=tuple(replace(optimum, finding=said) for optimum in state.optima))
+
+    def _apart(self, number: int, state: WindowState) -> Position:
+        """Where a group of windows is fitted from: the best optimum's theta, and the measured starts."""
+        best = max(state.optima, key=lambda optimum: optimum.evidence)
+        part = group(self.windows, number, num_groups(self.windows, self._tuning.growing))
+        here = Position.at(part, best.theta, self._tuning.damping, subset=False)
+        horizon = first_horizon(part, self._tuning.growing)
+        return replace(here, phase=Phase.GROW, horizon=horizon, group=number)
 
     def _subset(self, state: WindowState) -> WindowState:
         """A step of theta alone, the starts as the log tells them, on every other window.
@@ -212,6 +266,8 @@ class WindowSearch:
         point = WindowPoint(here.theta, here.starts, lin.residual)
         energy = WindowEnergy(windows, noise, self.problem.quadratic_prior)
         linearised = LinearisedWindows(energy, point, moments)
+        if grows(windows):
+            linearised = ManyStarts(energy, point, moments, self._tuning.growing.shares)
         tolerance = tuning.tolerance
         if here.phase in _ROUGH:
             tolerance = max(tuning.rough_tolerance * linearised.energy, tolerance)
@@ -250,7 +306,7 @@ class WindowSearch:
         ends = self._unrecorded(state) and (step.cut_short or self._leaves_no_room())
         if settled or ends or after.iteration >= self._tuning.windows.most_steps:
             return self._recorded(onward, state.here, step, settled, ends)
-        return onward.next_point(self._begin) if not after.revisits and onward.known else onward
+        return self._next(onward) if not after.revisits and onward.known else onward
 
     def _recorded(
         self, state: WindowState, before: Position, step: Step, settled: bool, cut_short: bool
@@ -292,7 +348,7 @@ class WindowSearch:
         if around is not None and around.other is not None and len(state.points) < tuning.windows.most_points:
             state = replace(state, points=np.concatenate([state.points, around.other[None]]))
         if around is None or around.better is None or here.patterns >= tuning.windows.most_patterns:
-            return state.next_point(self._begin)
+            return self._next(state)
         size = min(here.theta_step, max(float(np.abs(around.better - theta).max()), SHORTEST))
         better = replace(here.afresh(tuning.damping), theta=around.better, theta_step=size, iteration=0)
         return replace(state, here=replace(better, patterns=here.patterns + 1))
@@ -300,7 +356,10 @@ class WindowSearch:
     def _begin(self, theta: FloatArray, subset: bool = True) -> Position:
         """At a starting point theta (N,); subset: whether every other window may be tried first."""
         subset = subset and self.windows.starts_measured
-        return Position.at(self.windows, theta, self._tuning.damping, subset)
+        here = Position.at(self.windows, theta, self._tuning.damping, subset)
+        if not grows(self.windows):
+            return here
+        return replace(here, phase=Phase.GROW, horizon=first_horizon(self.windows, self._tuning.growing))
 
     def _unrecorded(self, state: WindowState) -> bool:
         """Whether theta alone is searched and no optimum is known yet, so that the budget must leave room for one."""
@@ -327,52 +386,3 @@ class WindowSearch:
 def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
     """Whether a step gained what the linearisation foretold."""
     return abs(fit.gained - fit.expected) < tuning.foretold * max(fit.expected, tuning.tolerance)
-
-
-def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
-    """Starting points (R, N): the model as given and the best candidates, by their plain residuals.
-
-    From many candidates on, only the first ones are drawn from the prior, the others in generations from a normal
-    around the best ones so far: the cross-entropy method, which finds the narrow valleys that contact leaves.
-
-    Raises:
-        ValueError: when every one of the first diverges.
-    """
-    tuning, count = problem.options.tuning.screening, problem.options.candidates
-    generator = torch.Generator().manual_seed(problem.seed)
-    later: list[int] = []
-    if count >= tuning.generations_from:
-        ends = np.linspace(int(tuning.first_share * count), count, tuning.generations + 1)
-        later = np.diff(ends.astype(int)).tolist()
-    draws = problem.prior.sample((count - sum(later),), generator=generator).numpy()
-    points = np.concatenate([problem.space.default_theta[None], draws])
-    loss = _plain_loss(windows, points)
-    if not np.isfinite(loss).any():
-        raise ValueError(
-            f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
-            "shorten the model's timestep or the window"
-        )
-    rng = np.random.default_rng([problem.seed, 1])
-    for size in later:
-        best = points[_by_loss(loss)[: tuning.elite]]
-        drawn = best.mean(0) + (best.std(0) + tuning.least_spread) * rng.standard_normal((size, points.shape[1]))
-        points = np.concatenate([points, np.clip(drawn, 0.0, 1.0)])
-        loss = np.concatenate([loss, _plain_loss(windows, points[-size:])])
-    chosen = _by_loss(loss)
-    if np.isfinite(loss[0]):
-        chosen = np.concatenate([[0], chosen[chosen != 0]])
-    else:
-        problem.find(finding(Code.DIVERGES_AS_GIVEN))
-    return points[chosen[: problem.options.restarts]]
-
-
-def _plain_loss(windows: Windows, points: FloatArray) -> FloatArray:
-    """Squared residuals (B,) of points (B, N), in units of each channel's spread; infinite where one diverges."""
-    residual, valid = windows.residuals(points, np.tile(windows.no_starts(), (len(points), 1, 1, 1)))
-    spread = np.maximum(windows.spread, 1e-12)
-    return np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
-
-
-def _by_loss(loss: FloatArray) -> IntArray:
-    """Places of the finite ones, the least first."""
-    return np.argsort(loss, kind="stable")[: int(np.isfinite(loss).sum())]

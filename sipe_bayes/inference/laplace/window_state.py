@@ -19,6 +19,8 @@ from sipe_bayes.likelihood.windows import Windows
 class Phase(StrEnum):
     """What the next step of a search does; ``WindowSearch`` has a function for each."""
 
+    GROW = auto()
+    """Of bodies that tumble: theta and the starts on beginnings of the windows, ever longer."""
     SUBSET = auto()
     """Theta alone, on every other window, the starts as the log tells them."""
     WHOLE = auto()
@@ -67,6 +69,8 @@ class Position:
         centred: whether the search has gone to the middle of a ridge.
         long: whether differences are as long as the environment asks for.
         patterns: pattern searches that have led on.
+        horizon: control steps of the beginnings of windows that are looked at; zero for whole ones.
+        group: which group of windows is fitted apart; None while all are searched.
     """
 
     phase: Phase
@@ -81,6 +85,8 @@ class Position:
     centred: bool = False
     long: bool = False
     patterns: int = 0
+    horizon: int = 0
+    group: int | None = None
 
     @classmethod
     def at(cls, windows: Windows, theta: FloatArray, rule: DampingRule, subset: bool) -> Self:
@@ -124,10 +130,17 @@ class WindowOptimum(Optimum):
 
 @dataclass(frozen=True)
 class WindowState(StrategyState[Position]):
-    """A search over windows."""
+    """A search over windows.
+
+    Args:
+        estimates: (N,) each, of groups of windows that were fitted apart.
+        aside: the optima as they were recorded, while these are.
+    """
 
     here: Position
     optima: tuple[WindowOptimum, ...] = ()
+    estimates: tuple[FloatArray, ...] = ()
+    aside: tuple[WindowOptimum, ...] = ()
 
     @property
     def known(self) -> bool:

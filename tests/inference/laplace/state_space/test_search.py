@@ -197,6 +197,9 @@ def test_quaternions_stay_of_length_one() -> None:
     assert isinstance(optimum, ChainOptimum)
     lengths = np.linalg.norm(optimum.states[:, 1:5], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-9)
+    states = estimator.fitted_states(Trajectories.stack(log))
+    assert states is not None
+    np.testing.assert_array_equal(states[0], optimum.states)
     print(float(posterior.mean[0]), float(posterior.stddev[0]))
     assert abs(float(posterior.mean[0]) - 0.3) < 4 * float(posterior.stddev[0]) < 0.2
     chain = bind(StateSpace(), simulator, Trajectories.stack(log))

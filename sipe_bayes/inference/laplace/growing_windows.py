@@ -1,0 +1,182 @@
+"""Windows of bodies that tumble: their beginnings first, ever longer, and each window's start the best of several.
+
+A measured pose tells nearly where such a window starts, but an impact magnifies what is left, the next one that, and a
+simulation that misses a corner's touch has no slope towards the one that does not. A beginning with one impact is
+nearly smooth; fitted, it foretells the next impact nearly enough (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear
+dynamical system identification from uncertain and indirect measurements", 2004,
+https://doi.org/10.1142/S0218127404010345). So theta and the starts descend together on beginnings that grow. And since
+windows meet in theta alone, each takes as much of a step of its start as serves it best: one that misses an impact on
+the way holds back itself, not the search.
+
+The noise meanwhile is white, of the size that the samples' roughness shows whatever the model.
+
+Through impacts the likelihood has valleys within valleys, each far narrower than they lie apart, and no search is sure
+to end in the deepest. So the curvature where it ended says little of how well theta is known. Groups of windows are
+fitted apart, each from the measured starts. Where their estimates scatter by more than the curvature says, the
+posterior is a normal half way between their mean and the estimate of all windows together. Its covariance is that of a
+mean of so few (batch means, as Student's t has it), and holds both of these.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
+from sipe_bayes.inference.laplace.options import GrowingTuning
+from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint
+from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowOptimum
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, pooled
+from sipe_bayes.likelihood.noise_level import NORMAL_MAD, noise_level
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.restricted import marginal
+from sipe_bayes.likelihood.windows import Windows
+
+
+class ManyStarts(LinearisedWindows):
+    """As ``LinearisedWindows``; of a step each window's start takes the best of several shares."""
+
+    def __init__(self, of: WindowEnergy, point: WindowPoint, moments: Moments, shares: tuple[float, ...]) -> None:
+        super().__init__(of, point, moments)
+        self.shares = np.array(shares)
+
+    def simulated(self, theta: FloatArray, change: FloatArray) -> tuple[WindowPoint, float]:
+        """The point at theta (N,) with the starts changed by shares of (W, D), and its energy."""
+        windows, noise = self.of.windows, self.of.noise
+        tried = self.point.starts + self.shares[:, None, None] * change
+        predicted, _ = windows.predict(np.tile(theta, (len(tried), 1)), tried)
+        residual = np.where(windows.observed, windows.measured - predicted, 0.0)
+        square = ((residual / noise.sd) ** 2).sum((2, 3)) + tried**2 @ windows.start_precision
+        square = np.where(np.isfinite(square), square, np.inf)  # NaN where a window diverged
+        best, each = square.argmin(0), np.arange(windows.num_windows)
+        point = WindowPoint(theta, tried[best, each], residual[best, each])
+        if not np.isfinite(square.min(0)).all():
+            return point, np.inf
+        return point, self.of(theta, point.starts, point.residual)
+
+
+def grows(windows: Windows) -> bool:
+    """Whether windows are searched by their beginnings: a measured free or ball joint, and starts to estimate."""
+    return bool(windows.num_start and windows.simulator.environment.poses and windows.starts_measured)
+
+
+def first_horizon(windows: Windows, tuning: GrowingTuning) -> int:
+    """Control steps of the first beginnings."""
+    return max(2, math.ceil(tuning.first * int(windows.steps.max())))
+
+
+def level(windows: Windows) -> Noise:
+    """White noise of the size that the samples' roughness shows, or as given."""
+    rough = noise_level(windows.trajectories, windows.settings)[windows.channels]
+    rough = pooled(np.maximum(rough, windows.rounding), windows.scales)
+    return Noise(np.where(np.isnan(windows.fixed_sd), rough, windows.fixed_sd), np.zeros(len(rough)))
+
+
+def grown(
+    windows: Windows, part: Windows, prior: QuadraticPrior, here: Position, tuning: GrowingTuning, rule: DampingRule
+) -> Position:
+    """The search after a step on the present beginnings; then on longer ones, or in the phase that follows.
+
+    Args:
+        windows: all of them, which count the rollouts.
+        part: those that are searched.
+        prior: of theta.
+        here: where the search stands.
+        tuning: how they grow.
+        rule: how steps are damped.
+
+    Raises:
+        BudgetExhausted: where there is no budget for the step.
+    """
+    longest = int(part.steps.max())
+    view = part.beginnings(here.horizon)
+    before = windows.rollouts
+    view.rollouts, view.budget = before, windows.budget
+    lin = view.linearise(here.theta, here.starts, theta_step=view.theta_step)
+    point = WindowPoint(here.theta, here.starts, lin.residual)
+    energy = WindowEnergy(view, level(windows), prior)
+    linearised = ManyStarts(energy, point, view.moments(lin, white=True), tuning.shares)
+    fit = descend(linearised, here.damping, max(tuning.enough * linearised.energy, 0.02), rule)
+    share = view.steps.sum() / windows.steps.sum()
+    windows.rollouts = before + math.ceil((view.rollouts - before) * share)
+    point, steps = fit.point or point, here.iteration + 1
+    here = replace(here, theta=point.theta, starts=point.starts, damping=fit.damping, iteration=steps)
+    on = fit.converged or fit.gained < tuning.enough * linearised.energy or steps >= tuning.most_steps
+    if not on and lin.valid:
+        return here
+    damping = min(here.damping, tuning.damping)
+    if here.horizon >= longest or not lin.valid:
+        return replace(here, phase=Phase.ROUGH, damping=damping, iteration=0, kept=Kept())
+    horizon = min(longest, math.ceil(tuning.growth * here.horizon))
+    return replace(here, horizon=horizon, damping=damping, iteration=0)
+
+
+def grown_starts(windows: Windows, theta: FloatArray, noise: Noise, tuning: GrowingTuning) -> FloatArray:
+    """Starts (W, D) that fit best at a fixed theta (N,), found on beginnings that grow."""
+    starts, horizon = windows.no_starts(), first_horizon(windows, tuning)
+    white, flat = Noise(noise.sd, np.zeros_like(noise.tau)), QuadraticPrior(theta, np.zeros((len(theta), len(theta))))
+    while True:
+        view = windows.beginnings(horizon)
+        energy = WindowEnergy(view, white, flat)
+        for _ in range(tuning.start_steps):
+            lin = view.linearise(theta, starts, with_theta=False)
+            if not lin.valid:
+                return starts
+            moments = view.moments(lin, white=True)
+            linearised = ManyStarts(energy, WindowPoint(theta, starts, lin.residual), moments, tuning.shares)
+            change = marginal(moments, white, starts, view.start_precision)[1]
+            point, after = linearised.simulated(theta, change)
+            gained = linearised.energy - after
+            starts = point.starts if gained > 0 else starts
+            if gained < tuning.enough * linearised.energy:
+                break
+        if horizon >= windows.steps.max():
+            return starts
+        horizon = math.ceil(tuning.growth * horizon)
+
+
+def num_groups(windows: Windows, tuning: GrowingTuning) -> int:
+    """How many groups of windows are fitted apart; zero where there are too few, or parameters of single logs."""
+    count = min(tuning.groups, windows.num_windows // 2)
+    shared = all(p.log is None for p in windows.simulator.space)
+    return count if shared and count >= tuning.fewest else 0
+
+
+def group(windows: Windows, number: int, count: int) -> Windows:
+    """The windows of one group, taken in turn."""
+    return windows.part(np.arange(number, windows.num_windows, count))
+
+
+def touches(windows: Windows) -> bool:
+    """Whether anything in the model may touch something else."""
+    model = windows.simulator.model
+    return bool(model.npair or (model.ngeom > 1 and model.geom_contype.any() and model.geom_conaffinity.any()))
+
+
+def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuning) -> WindowOptimum:
+    """The optimum with the normal that the scatter of estimates (G, N) gives, where the linearisation's is too narrow.
+
+    Estimates far from the others, whose search was lost, count for nothing while ``tuning.reliable`` are left.
+    """
+    gap = np.abs(estimates - np.median(estimates, axis=0))
+    scale = NORMAL_MAD * np.median(gap, axis=0)
+    kept = estimates[(gap <= tuning.lost * np.maximum(scale, 1e-9)).all(1)]
+    if len(kept) < tuning.reliable:
+        kept = estimates
+    n, freedom = estimates.shape[1], len(kept) - 1
+    covariance = np.atleast_2d(np.cov(kept.T)) / len(kept)
+    excess = float(np.trace(np.linalg.solve(optimum.covariance, covariance))) / n
+    if excess < tuning.rough:
+        return optimum
+    if freedom < 2 * n:  # so few say nothing of correlations
+        covariance = np.diag(np.diag(covariance))
+    covariance *= freedom / (freedom - 2)  # of Student's t
+    half = 0.5 * (kept.mean(0) - optimum.theta)
+    covariance = covariance + np.outer(half, half)
+    said = finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
+    return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=said)
