@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -75,10 +76,7 @@ def calibrate(
     logs, problem = problem.train, _from_fitted_states(problem, method)
     fitted = bind(problem.segments, problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
-    conflict, skipped = None, list[str]()
-    if not grows(fitted):  # a log of a body that tumbles says too little by itself; its scatter is in the posterior
-        conflict, skipped = compare_logs(problem.simulator, problem.likelihood, logs, theta, method.seed, tell)
-    unknown = [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
+    disagreement, unknown = _agreement(replace(problem, train=logs), fitted, theta, method.seed, tell)
     # what the model lacks
     noise = _noise_of(method, fitted, theta)
     tell("checking what the model lacks")
@@ -96,14 +94,13 @@ def calibrate(
         *_own(method),
         *unknown,
         *uneven_targets(problem.environment),
-        *([] if conflict is None else [conflict.finding]),
+        *disagreement,
         *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
         *marginals.findings(dead, combinations),
         *predictions.findings(),
         *of_logs(problem.reports),
         *_left_out(problem, method),
     )
-    measured = method.diagnostics.get("mixing")
     return Calibration(
         name=run_name(problem.config.path),
         estimator=method.name,
@@ -120,7 +117,7 @@ def calibrate(
         misfit=lacks,
         outside=outside,
         noise=_channel_noise(fitted, noise),
-        mixing=Mixing.of(measured, method.space.names) if measured else None,
+        mixing=_mixing(method),
         logs=list(problem.reports),
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
@@ -166,6 +163,25 @@ class _Predictions:
 def _every_channel(problem: Problem, logs: Trajectories) -> Windows:
     """Windows of logs by which they are scored and drawn, in all channels."""
     return Windows(replace(problem.segments, fit=None), problem.simulator, logs)
+
+
+def _agreement(
+    problem: Problem, fitted: Windows, theta: FloatArray, seed: int, tell: Callable[[str], None]
+) -> tuple[list[Finding], list[Finding]]:
+    """Whether the logs agree, and of which this is unknown.
+
+    Not asked of bodies that tumble: one log says too little of them by itself, and its scatter is in the posterior.
+    """
+    if grows(fitted):
+        return [], []
+    conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, seed, tell)
+    unknown = [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
+    return [] if conflict is None else [conflict.finding], unknown
+
+
+def _mixing(method: Estimator) -> Mixing | None:
+    measured = method.diagnostics.get("mixing")
+    return Mixing.of(measured, method.space.names) if measured else None
 
 
 def _own(method: Estimator) -> list[Finding]:

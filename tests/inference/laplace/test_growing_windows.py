@@ -155,8 +155,15 @@ def test_few_windows_say_that_their_intervals_are_not_to_be_trusted(windows: Win
     assert Code.SCATTER_UNKNOWN in {item.code for item in estimator.findings}
 
 
-def test_a_budget_that_ends_early_is_said(windows: Windows) -> None:
+def test_a_budget_that_ends_early_is_said() -> None:
     """Where it ends among the groups, the curvature's narrow intervals do not stand without a word."""
-    short = Laplace(windows.simulator, likelihood=windows.settings, budget=2600, restarts=1, candidates=0)
-    short.fit(windows.trajectories)
-    assert any(item.severity == "blocking" for item in short.findings), [str(item.code) for item in short.findings]
+    simulator = cube()
+    logs, _ = tosses(simulator, 8, 30, seed=5, noise=NOISE)
+    settings, found = Segments(None, "white"), []
+    for short in (0, 60):
+        budget = 20000 if not found else found[0].rollouts - short
+        estimator = Laplace(simulator, likelihood=settings, budget=budget, restarts=1, candidates=0)
+        estimator.fit(logs)
+        found.append(estimator)
+    codes = [{item.code for item in estimator.findings} for estimator in found]
+    assert Code.SEARCH_CUT_SHORT in codes[1] - codes[0], codes
