@@ -28,6 +28,9 @@ def read_bag(path: Path, wanted: Collection[str]) -> Columns:
     _check_databases(path)
     topics: dict[str, _Topic] = {}
     with Reader(path) as bag:
+        for storage in getattr(bag.storage, "storages", [bag.storage]):
+            for chunk in getattr(storage, "chunks", ()):  # of MCAP, each unpacked as a whole
+                check_size(path, chunk.uncompressed_size)
         connections = list(_connections(path, bag.connections, wanted))
         if not connections:
             raise LogError(f"{path}: holds no messages; record the log again or drop it")

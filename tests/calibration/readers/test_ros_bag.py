@@ -112,6 +112,25 @@ def test_only_topics_that_are_asked_for_are_read(tmp_path: Path) -> None:
         read_table(bag, ["/efort.data[0]"])
 
 
+@pytest.mark.parametrize("single", [False, True])
+def test_a_chunk_that_unpacks_to_more_than_a_log_is_refused(
+    single: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four megabytes of zeros in a file of three kilobytes, of a topic that nobody asked for."""
+    bag = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+    bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag:
+        zeros = bag.add_connection("/zeros", "std_msgs/msg/Float64MultiArray", typestore=ROS)
+        effort = bag.add_connection("/effort", "std_msgs/msg/Float64MultiArray", typestore=ROS)
+        bag.write(zeros, START, command(np.zeros(500_000)))
+        bag.write(effort, START, command(np.ones(1)))
+    path = tmp_path / "bag" / "bag.mcap" if single else tmp_path / "bag"
+    assert read_table(path, ["/effort.data[0]"])["/effort.data[0]"].tolist() == [1.0]
+    monkeypatch.setattr("sipe_bayes.calibration.readers.base.LARGEST", 10**6)
+    with pytest.raises(LogError, match=r"claims 0.00373 GiB of columns, the most is 0.00093"):
+        read_table(path, ["/effort.data[0]"])
+
+
 def test_of_many_topics_the_first_are_listed(tmp_path: Path) -> None:
     bag = ros_bag(
         tmp_path, [(f"/t{k:02}", "std_msgs/msg/Float64MultiArray", START, command(np.ones(1))) for k in range(40)]
