@@ -65,7 +65,7 @@ class DiscoverOptions(Options):
     width: int = option(3, "candidates that are fitted in a round", least=1)
     most: int = option(5, "extensions that a structure may have", least=1)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
-    sparsity: float = option(3.0, "against any extension: one model in twenty lacks a given kind", "nats", least=0)
+    sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
     gross: float = option(0.25, "of a channel's spread left from which signs and units are tried", least=0)
     column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
