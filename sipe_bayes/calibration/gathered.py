@@ -54,16 +54,24 @@ class Marginals:
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
         return cls(space, posterior.mode.numpy(), sd, contraction, draws)
 
-    def summaries(self) -> list[ParameterSummary]:
-        """One for each parameter."""
+    def summaries(self, further: Posterior | None = None) -> list[ParameterSummary]:
+        """One for each parameter.
+
+        Args:
+            further: of the theta that a further log would have.
+        """
         mode = self.space.values(self.theta)
+        beyond = None if further is None else further.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy()
         quantiles = np.quantile(self.draws, [0.05, 0.5, 0.95], axis=0)
         summaries = []
         for j, p in enumerate(self.space):
             drawn, determined = self.draws[:, j], float(self.contraction[j])
             mean, sd, q05, q50, q95, best = (float(x) for x in (drawn.mean(), drawn.std(), *quantiles[:, j], mode[j]))
             marginal = (mean, sd, q05, q50, q95, best, p.default, determined, p.log is not None)
-            summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal))
+            ends = None
+            if beyond is not None and p.log is None:
+                ends = float(p.value(float(beyond[0, j]))), float(p.value(float(beyond[1, j])))
+            summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends))
         return summaries
 
     def findings(self, dead: dict[str, list[tuple[float, float]]], ridges: Sequence[Ridge]) -> list[Finding]:

@@ -196,14 +196,20 @@ def print_calibration(calibration: Calibration) -> None:
     for verdict in verdicts(calibration):
         console.print(Text(verdict.text, style=_TONES[verdict.tone]))
     findings, table = Findings(calibration.findings), Table()
-    for heading in ("parameter", "value", "90 % interval", "unit", "verdict"):
-        table.add_column(heading, justify="right" if heading in ("value", "90 % interval") else "left")
+    numbers, words = ["value", "90 % interval"], ["unit", "verdict"]
+    numbers += ["a further log's"] * any(p.further is not None for p in calibration.parameters)
+    for heading in ("parameter", *numbers, *words):
+        table.add_column(heading, justify="right" if heading in numbers else "left")
     for p in calibration.parameters:
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
         verdict = parameter_verdict(p, findings)
+        cells = [value, f"{low} .. {high}"]
+        if len(numbers) > len(cells):
+            ends = [] if p.further is None else [significant(x, p.sd, scale) for x in p.further]
+            cells.append(" .. ".join(ends))
         # brackets of a name are not markup
-        table.add_row(Text(p.name), value, f"{low} .. {high}", p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
+        table.add_row(Text(p.name), *cells, p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     console.print(table)
     lines = []
     for title, scores in (("held out", calibration.holdout), ("train", calibration.train)):

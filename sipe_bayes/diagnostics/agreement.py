@@ -28,25 +28,11 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION
 from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 _BUDGET = 5000  # rollouts for each log
-
-
-@dataclass(frozen=True)
-class LogEstimate:
-    """One log by itself.
-
-    Args:
-        name: of the log.
-        mean: (N,) in theta.
-        information: (N, N) in theta.
-    """
-
-    name: str
-    mean: FloatArray
-    information: FloatArray
 
 
 @dataclass(frozen=True)
@@ -90,26 +76,26 @@ class Disagreement:
         return self.finding.text
 
 
-def compare_logs(
+def log_estimates(
     simulator: Simulator,
     likelihood: Segments | StateSpace,
     trajectories: Trajectories,
     theta: FloatArray,
     seed: int = 0,
     tell: Callable[[str], object] = lambda _: None,
-) -> tuple[Disagreement | None, list[str]]:
-    """Fit each log by itself, and compare.
+) -> tuple[list[LogEstimate], list[str]]:
+    """Fit each log by itself.
 
     Args:
         simulator: of the model.
         likelihood: of the fits.
-        trajectories: the logs; one alone agrees with itself.
+        trajectories: the logs.
         theta: (N,) where each fit starts.
         seed: of the fits.
         tell: called with what is being done.
 
     Returns:
-        The disagreement, or None, and the names of logs that could not be fitted alone.
+        What they say, none for a single log, and the names of logs that could not be fitted alone.
     """
     estimates, skipped = [], []
     for trajectory in trajectories if len(trajectories) > 1 else ():
@@ -121,7 +107,7 @@ def compare_logs(
             skipped.append(trajectory.name)
             continue
         estimates.append(LogEstimate(trajectory.name, *alone.information()))
-    return disagreement(simulator.space, estimates), skipped
+    return estimates, skipped
 
 
 def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:

@@ -52,6 +52,8 @@ class ParameterSummary:
         default: of the model as given, if it has one.
         contraction: 1 - sd / prior sd.
         nuisance: whether it holds for one log alone.
+        further: (2,) 5 and 95 % quantiles of what a further log would ask for, where the logs ask for different values
+            or the model lacks something; None for a single log.
     """
 
     name: str
@@ -66,6 +68,7 @@ class ParameterSummary:
     default: float | None
     contraction: float
     nuisance: bool = False
+    further: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ def _parameter_row(summary: ParameterSummary, parameter: Parameter, calibration:
         "contraction": f"{100 * summary.contraction:.0f} %" if math.isfinite(summary.contraction) else "–",
         "bar": f"{100 * min(max(np.nan_to_num(summary.contraction), 0.0), 1.0):.1f}",
         "default": number(summary.default, 4),
+        "further": " to ".join(significant(x, summary.sd, abs(x)) for x in summary.further or ()),
         "outside": summary.default is not None and not summary.q05 <= summary.default <= summary.q95,
         "tone": verdict.tone,
         "verdict": verdict.text,

@@ -178,4 +178,12 @@ def verdicts(calibration: Calibration) -> list[Verdict]:
     mixing = mixing_verdict(calibration)
     if mixing is not None and mixing.tone == "bad" and any(f.code is Code.NOT_MIXED for f in findings.blocking):
         mixing = None  # the headline says it
-    return [v for v in (*first, lack(calibration), mixing) if v]
+    return [v for v in (*first, lack(calibration), between_logs(calibration), mixing) if v]
+
+
+def between_logs(calibration: Calibration) -> Verdict | None:
+    """What the column beside the intervals holds, where there is one."""
+    if all(p.further is None for p in calibration.parameters):
+        return None
+    text = "Beside each interval: the one for what a further log would ask for. It holds what differs between the logs"
+    return Verdict("fair", f"{text}, not what the model lacks in all of them.")

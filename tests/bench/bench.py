@@ -32,6 +32,7 @@ import mdn
 import mujoco
 import mujoco.rollout
 import numpy as np
+import searches
 import transfer
 
 from sipe_bayes.calibration.problem import prepare
@@ -243,7 +244,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
         *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws"),
-        "transfer",
+        *("discover", "transfer"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
@@ -269,6 +270,8 @@ def main() -> None:
             ddpg.table(given.pairs, side_by_side)
         elif name == "laws":
             laws.table(given.pairs, side_by_side)
+        elif name == "discover":
+            searches.table(prepare(PENDULUM))
         elif name == "transfer":
             transfer.table(given.pairs, side_by_side)
         elif name == "batch":

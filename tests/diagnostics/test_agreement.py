@@ -7,7 +7,8 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import LogEstimate, compare_logs, disagreement
+from sipe_bayes.diagnostics.agreement import disagreement, log_estimates
+from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.likelihood.settings import Segments
 from tests.problems.pendulums import log, pendulum
 
@@ -28,7 +29,7 @@ def alarms(heavier: float, rho: float) -> list[str]:
             ]
         )
         start = simulator.space.normalise(np.array([mass, damping, coulomb]))
-        found, _ = compare_logs(simulator, Segments(0.5), logs, start)
+        found = disagreement(simulator.space, log_estimates(simulator, Segments(0.5), logs, start)[0])
         named.append("" if found is None else found.parameter if "disagree about" in found.text else "no single one")
     return named
 

@@ -1,0 +1,170 @@
+r"""Parameters that differ between logs: what they share, how far they spread, what a new log would have.
+
+A model that lacks something asks for other values in every log, each with an interval that is too narrow. Here the
+parameters of log k are drawn around common ones,
+
+.. math:: \theta_k \sim \mathcal N(\mu, \operatorname{diag}(\tau^2)), \qquad \tau_j \sim |\mathcal N(0, s^2)|,
+
+with mu uniform on the cube, or as the prior has it, and s in units of the range. Log k enters by its optimum m_k and
+information L_k, exp(-(theta_k - m_k)' L_k (theta_k - m_k) / 2), whose theta_k is integrated in closed form. With S =
+diag(tau) that leaves
+
+.. math::
+
+    p(y_k \mid \mu, \tau) \propto |I + S L_k S|^{-1/2} e^{-(\mu - m_k)' P_k (\mu - m_k) / 2}, \qquad
+    P_k = L_k - L_k S (I + S L_k S)^{-1} S L_k ,
+
+normal in mu, so that only tau is sampled (emcee). A. Gelman, "Prior distributions for variance parameters in
+hierarchical models", Bayesian Analysis 1 (2006), 515-533, https://doi.org/10.1214/06-BA117A, section 5, on the
+half-normal's kin.
+
+Deviations:
+
+- Each log's likelihood is its normal at its own optimum.
+- A new log's theta is restricted to the cube; those of the logs at hand are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior.truncated_normal import interval_quantile
+
+_MIDDLE = 3.0  # precision around the cube's middle, by which mu is drawn and which the draws' weights take away again
+
+
+@dataclass(frozen=True)
+class RandomEffectsOptions(Options):
+    """How the spread between logs is sampled."""
+
+    spread: float = option(0.25, "of a value between logs, as the prior's scale has it", "of the range", above=0)
+    walkers: int = option(4, "for each parameter: emcee asks for twice as many as dimensions", least=2)
+    warmup: int = option(300, "steps until the walkers have spread", "steps", least=1)
+    steps: int = option(400, "steps that are kept, every tenth of them", "steps", least=10)
+    tries: int = option(4, "draws of mu for each tau, of which those in the cube are kept", least=1)
+
+
+@dataclass(frozen=True)
+class LogEstimate:
+    """One log by itself.
+
+    Args:
+        name: of the log.
+        mean: (N,) in theta.
+        information: (N, N) in theta.
+    """
+
+    name: str
+    mean: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class RandomEffects:
+    """What logs that differ have to say.
+
+    Args:
+        common: of mu, what the logs share.
+        new_log: of the theta that a further log would have.
+        spread: (M, N) draws of tau, which weigh as those of ``common`` do.
+    """
+
+    common: Particles
+    new_log: Particles
+    spread: FloatArray
+
+
+def random_effects(
+    logs: Sequence[LogEstimate], prior: Posterior, seed: int = 0, options: RandomEffectsOptions | None = None
+) -> RandomEffects:
+    """The posterior of what several logs share, and of what a further one would have.
+
+    Args:
+        logs: each by itself.
+        prior: of theta.
+        seed: of the draws.
+        options: of the sampling.
+
+    Raises:
+        ValueError: for fewer than two logs, or where no draw lies in the cube.
+    """
+    if len(logs) < 2:
+        raise ValueError(f"logs: expected two or more, got {len(logs)}; one log tells nothing of what differs")
+    options = options or RandomEffectsOptions()
+    model = _Model(
+        np.stack([log.information for log in logs]),
+        np.stack([log.mean for log in logs]),
+        QuadraticPrior.of(prior),
+        options.spread,
+    )
+    random = np.random.default_rng(seed)
+    tau = np.repeat(model.sampled(options, random), options.tries, axis=0)
+    common, new_log, kept = model.drawn(tau, random)
+    if not kept.any():
+        raise ValueError("logs: expected estimates near the cube, got none; widen the parameters' bounds")
+    space, weights = prior.space, np.exp(0.5 * _MIDDLE * ((common[kept] - 0.5) ** 2).sum(1))
+    shared = Particles(common[kept], space, weights=weights)
+    return RandomEffects(shared, Particles(new_log[kept], space, weights=weights), tau[kept])
+
+
+@dataclass(frozen=True)
+class _Model:
+    """K logs: information (K, N, N) and mean (K, N); scale of tau's prior."""
+
+    information: FloatArray
+    mean: FloatArray
+    prior: QuadraticPrior
+    scale: float
+
+    def shared(self, tau: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Given tau (W, N): log-likelihood (W,) without mu, precision (W, N, N) and pull (W, N) of mu."""
+        n = tau.shape[-1]
+        scaled = tau[:, None, :, None] * self.information  # S L
+        inner = np.eye(n) + scaled * tau[:, None, None, :]
+        marginal = self.information - np.swapaxes(scaled, -1, -2) @ np.linalg.solve(inner, scaled)
+        marginal = 0.5 * (marginal + np.swapaxes(marginal, -1, -2))
+        pulls = np.einsum("wkij,kj->wki", marginal, self.mean)
+        level = -0.5 * np.linalg.slogdet(inner)[1].sum(1) - 0.5 * np.einsum("wki,ki->w", pulls, self.mean)
+        flat = _MIDDLE * np.eye(n)
+        precision = marginal.sum(1) + self.prior.precision + flat
+        pull = pulls.sum(1) + self.prior.precision @ self.prior.mean + flat @ np.full(n, 0.5)
+        return level, precision, pull
+
+    def log_density(self, log_tau: FloatArray) -> FloatArray:
+        """Of log tau (W, N), up to a constant (W,)."""
+        tau = np.exp(log_tau)
+        level, precision, pull = self.shared(tau)
+        mean = np.linalg.solve(precision, pull[..., None])[..., 0]
+        level = level + 0.5 * (pull * mean).sum(1) - 0.5 * np.linalg.slogdet(precision)[1]
+        density: FloatArray = level + (log_tau - 0.5 * (tau / self.scale) ** 2).sum(1)
+        return density
+
+    def sampled(self, options: RandomEffectsOptions, random: np.random.Generator) -> FloatArray:
+        """Draws of tau (M, N)."""
+        n = self.mean.shape[1]
+        walkers = max(options.walkers * n, 32)
+        start = np.log(self.scale * random.uniform(0.02, 1.0, (walkers, n)))
+        seed = int(random.integers(2**32))
+        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
+        moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+        sampler = emcee.EnsembleSampler(walkers, n, self.log_density, vectorize=True, moves=moves)
+        sampler.run_mcmc(state, options.warmup + options.steps)
+        tau: FloatArray = np.exp(sampler.get_chain(discard=options.warmup, thin=10, flat=True))
+        return tau
+
+    def drawn(self, tau: FloatArray, random: np.random.Generator) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """For each tau (M, N) a mu (M, N), a new log's theta (M, N) within the cube, and whether mu is in it (M,)."""
+        _, precision, pull = self.shared(tau)
+        mean = np.linalg.solve(precision, pull[..., None])[..., 0]
+        root = np.linalg.cholesky(np.linalg.inv(precision))
+        mu = mean + (root @ random.standard_normal((*tau.shape, 1)))[..., 0]
+        theta = mu + tau * interval_quantile(-mu / tau, (1 - mu) / tau, random.uniform(size=tau.shape))
+        return mu, theta, np.asarray(((mu >= 0) & (mu <= 1)).all(1))
