@@ -1,12 +1,12 @@
 """What extensions would do to the predictions of a fit: the rows of score tests.
 
 Every extension is simulated a small step away from the plain model, from the same starts. Those that need no more than
-parameters are simulated in one batch, those that are laws in another, those that change the model's states each by
-itself.
+parameters are simulated in one batch, laws and those that change the model's states each by itself.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +20,8 @@ from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended, placements
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
+
+_ROWS = 32  # simulated at once: all the states of a batch are in memory
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,9 @@ def _simulated(
             rows.append(row)
         first += len(one.plain)
     mapped = mapped_starts(windows.simulator.model, simulator.model, starts)
-    predicted, valid = bound.predict(np.stack(rows), np.tile(mapped, (len(rows), 1, 1)))
+    pieces = np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS))
+    runs = [bound.predict(piece, np.tile(mapped, (len(piece), 1, 1))) for piece in pieces]
+    predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
     windows.rollouts += bound.rollouts
     out, at = [], 1
     for one in group:
