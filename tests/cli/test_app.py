@@ -65,6 +65,7 @@ def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
     assert found["warnings"] == []
     wanted = {"name", "unit", "targets", "mean", "sd", "q05", "q50", "q95", "contraction", "flags"}
     assert [wanted - set(p) for p in found["parameters"]] == [set(), set()]
+    assert [p["further"] for p in found["parameters"]] == [None, None]  # a single log
     for use, name in (("holdout", "rest"), ("train", "log")):
         assert [set(s) for s in found[use]] == [{"log", "channel", "unit", "rmse", "rmse_default"}]
         assert (found[use][0]["log"], found[use][0]["channel"], found[use][0]["unit"]) == (name, "angle", "rad")
@@ -224,6 +225,23 @@ def test_what_the_model_lacks_is_a_warning(tmp_path: Path, log: pd.DataFrame) ->
     flagged = {p["name"] for p in found["parameters"] if "misfit" in p["flags"]}
     assert flagged
     assert "model lacks something" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log: pd.DataFrame) -> None:
+    """The second log's torque is logged 1.2 times too small, so that its mass is, too."""
+    config = write_case(tmp_path, log)
+    log.assign(torque=log["torque"] / 1.2).to_csv(tmp_path / "other.csv", index=False)
+    text('file = "log.csv"\nname = "rest"\nuse = "holdout"', 'file = "other.csv"\nname = "other"')(tmp_path)
+    result = call(config, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    assert "a further" in result.stdout
+    assert "a further log's" in (tmp_path / "out" / "report.html").read_text()
+    found = strict_json((tmp_path / "out" / "result.json").read_text())
+    assert any("logs disagree" in said for said in found["doubts"])
+    (mass,) = (p for p in found["parameters"] if p["name"] == "mass")
+    low, high = mass["further"]
+    assert low < TRUTH["mass"] / 1.2 < TRUTH["mass"] < high
+    assert high - low > 3 * (mass["q95"] - mass["q05"])
 
 
 @pytest.mark.parametrize("part", ["misfit", "outside_prior"])
