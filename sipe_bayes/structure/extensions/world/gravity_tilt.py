@@ -20,8 +20,8 @@ class GravityTilt(Extension):
         return "a base that is tilted"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """Up to six degrees either way."""
-        most = 0.1 * float(np.linalg.norm(machine.model.opt.gravity))
+        """Up to three degrees either way: bases are put up with a level."""
+        most = 0.05 * float(np.linalg.norm(machine.model.opt.gravity))
         if not most:
             return ()
         names = ("gravity_x", "gravity_y")
