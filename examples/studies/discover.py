@@ -10,11 +10,12 @@ root-mean-square, white or AR(1) with rho 0.9; commands are sums of sines. Plant
 one joint, in three sizes: what its force (or what it does to the command) is of the joint's usual force, 5, 10 and 20
 %; delays of 1, 2 and 4 samples. A slide has no cogging. The null is the right model.
 
-A cause is named where the structures that hold it have together at least a quarter of the probability: several that
-explain a log about as well are all named (a slide's motor with a zero error moves as one on a tilted rail); at the
-right joint where they hold it there. ``first`` asks for it in the most probable structure. Coverage is that of 90 %
-intervals of the masses, without the search and averaged over its structures. Every search is one line in runs/, so an
-interrupted study goes on; results/discover.json holds the tables, results/discover.png what was named where.
+A cause is named where the structures that hold it have together a probability of at least 5 %, as in the report:
+several that explain a log about as well are all named (a slide's motor with a zero error moves as one on a tilted
+rail); at the right joint where they hold it there. ``first`` asks for it in the most probable structure. Coverage is
+that of 90 % intervals of the masses, without the search and averaged over its structures. Every search is one line in
+runs/, so an interrupted study goes on; results/discover.json holds the tables, results/discover.png what was named
+where.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from _kept import fits, keep
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.settings import Segments
@@ -88,7 +90,6 @@ EFFECTS = (
     "force_drop",
     "cogging",
 )
-NAMED = 0.25  # probability from which an extension is part of the answer
 
 
 def plain(machine: str) -> sipe.Simulator:
@@ -201,7 +202,7 @@ def searched(name: str, effect: str, size: str, noise: str, seed: int) -> dict[s
 
 def answer(row: dict[str, Any]) -> list[str]:
     """The extensions that a search names, most probable first."""
-    return [label for label, p in row["inclusion"].items() if p >= NAMED]
+    return [label for label, p in row["inclusion"].items() if p >= THRESHOLDS.open_structure]
 
 
 def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -77,6 +77,10 @@ class Thresholds(Options):
         1.0, "a parameter that would move further if the model had the cause is not to be trusted", "posterior sds"
     )
 
+    open_structure: float = option(
+        0.05, "a piece that the best structure does without is named beside it from this probability on", "probability"
+    )
+
     # predictions of held-out logs
     comparison: float = option(0.05, "false alarms of two models that predict alike", "p-value of the paired t-test")
     method_comparison: float = option(

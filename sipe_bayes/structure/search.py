@@ -62,7 +62,8 @@ class Phase(enum.Enum):
 class DiscoverOptions(Options):
     """How structures are searched."""
 
-    width: int = option(3, "candidates that are fitted in a round", least=1)
+    width: int = option(3, "candidates that are fitted in a round; twice as many where they promise the same", least=1)
+    tied: float = option(0.05, "of the best gain, within which candidates promise the same", least=0)
     most: int = option(5, "extensions that a structure may have", least=1)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
     sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
@@ -269,10 +270,16 @@ class StructureSearch:
         ranked = self._ranked(here, last_resort=False)
         offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
-        tried = [c.placed.label for c in promising if state.of([*state.present, c.placed.label]) is None]
-        queue = tuple(tried[: self.options.width])
+        untried = [c for c in promising if state.of([*state.present, c.placed.label]) is None]
+        queue = tuple(c.placed.label for c in self._worth(untried))
         phase = Phase.FIT if queue else Phase.PRUNE
         return replace(state, offers=state.offers + offers, queue=queue, phase=phase)
+
+    def _worth(self, ranked: list[Candidate]) -> list[Candidate]:
+        """The first few, and those that promise as much as the first: a linear promise does not decide between them."""
+        width = self.options.width
+        level = (1 - self.options.tied) * ranked[0].gain if ranked else 0.0
+        return ranked[:width] + [c for c in ranked[width : 2 * width] if c.gain >= level]
 
     def _ranked(self, here: FittedStructure, last_resort: bool) -> list[Candidate]:
         fitting, own = self.fitting, self.structure(here.labels)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from sipe_bayes.core.findings import Findings
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
 from sipe_bayes.report.verdicts import Verdict
 from sipe_bayes.report.words import error_text, listed, number, significant, unit_text
 from sipe_bayes.structure.structures import StructureRow
 
 _SURE = 0.995  # a probability from which no more digits are told
-_OPEN = 0.05  # and below which a piece is no alternative
 _VALUES, _NAMED = 3, 2  # that a sentence lists
 
 
@@ -61,7 +61,9 @@ def piece_text(piece: Piece) -> str:
 
 def alternatives(discovery: Discovery) -> tuple[Piece, ...]:
     """Pieces that the most probable structure does without, and that are not out of the question."""
-    return tuple(p for p in discovery.pieces if not p.kept and (p.undecided or p.probability > _OPEN))
+    return tuple(
+        p for p in discovery.pieces if not p.kept and (p.undecided or p.probability >= THRESHOLDS.open_structure)
+    )
 
 
 def column_verdict(discovery: Discovery) -> Verdict | None:
