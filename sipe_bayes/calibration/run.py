@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import compare_logs
+from sipe_bayes.diagnostics.agreement import disagreement, log_estimates
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
     channel_scores,
@@ -33,6 +34,7 @@ from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
+from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -65,18 +67,15 @@ def calibrate(
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
-
-    def tell(what: str) -> None:
-        if progress is not None:
-            progress(what, method.rollouts, method.budget)
-
+    tell = functools.partial(_tell, method, progress)
     # what the parameters do and whether the logs agree about them
     tell("checking what each parameter changes")
     theta, space = posterior.mode.numpy(), problem.environment.space
     logs, problem = problem.train, _from_fitted_states(problem, method)
     fitted = bind(problem.segments, problem.simulator, problem.train)
     dead = dead_ranges(fitted, theta)
-    disagreement, unknown = _agreement(replace(problem, train=logs), fitted, theta, method.seed, tell)
+    alone, unknown = _one_by_one(replace(problem, train=logs), fitted, theta, method.seed, tell)
+    conflict = disagreement(space, alone)
     # what the model lacks
     noise = _noise_of(method, fitted, theta)
     tell("checking what the model lacks")
@@ -86,6 +85,8 @@ def calibrate(
     tell("simulating the posterior's band")
     marginals = Marginals.of(posterior, problem.prior, space, method.seed)
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
+    doubted = conflict is not None or (lacks is not None and lacks.alarm)
+    further = random_effects(alone, problem.prior, method.seed).new_log if doubted and alone[1:] else None
     predictions = _Predictions.of(problem, theta)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
@@ -94,7 +95,7 @@ def calibrate(
         *_own(method),
         *unknown,
         *uneven_targets(problem.environment),
-        *disagreement,
+        *([] if conflict is None else [conflict.finding]),
         *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
         *marginals.findings(dead, combinations),
         *predictions.findings(),
@@ -106,7 +107,7 @@ def calibrate(
         estimator=method.name,
         posterior=posterior,
         prior=problem.prior,
-        parameters=marginals.summaries(),
+        parameters=marginals.summaries(further),
         train=predictions.train,
         holdout=predictions.holdout,
         findings=noticed,
@@ -165,18 +166,22 @@ def _every_channel(problem: Problem, logs: Trajectories) -> Windows:
     return Windows(replace(problem.segments, fit=None), problem.simulator, logs)
 
 
-def _agreement(
+def _tell(method: Estimator, progress: Progress | None, what: str) -> None:
+    if progress is not None:
+        progress(what, method.rollouts, method.budget)
+
+
+def _one_by_one(
     problem: Problem, fitted: Windows, theta: FloatArray, seed: int, tell: Callable[[str], None]
-) -> tuple[list[Finding], list[Finding]]:
-    """Whether the logs agree, and of which this is unknown.
+) -> tuple[list[LogEstimate], list[Finding]]:
+    """What each of several logs says by itself, and a finding for each that could not be fitted.
 
     Not asked of bodies that tumble: one log says too little of them by itself, and its scatter is in the posterior.
     """
     if grows(fitted):
         return [], []
-    conflict, skipped = compare_logs(problem.simulator, problem.likelihood, problem.train, theta, seed, tell)
-    unknown = [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
-    return [] if conflict is None else [conflict.finding], unknown
+    alone, skipped = log_estimates(problem.simulator, problem.likelihood, problem.train, theta, seed, tell)
+    return alone, [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
 
 
 def _mixing(method: Estimator) -> Mixing | None:
