@@ -169,8 +169,8 @@ class Discovery:
 
     @property
     def passes(self) -> bool:
-        """Whether what the most probable structure leaves passes for noise."""
-        return self.after.misfit is not None and not self.after.misfit.alarm
+        """Whether what the most probable structure leaves passes for noise, or for something small beside it."""
+        return self.after.misfit is not None and not self.after.misfit.matters
 
     def to_dict(self) -> dict[str, object]:
         """As JSON has it, without signals and residuals."""

@@ -170,10 +170,12 @@ class Structures:
     @staticmethod
     def _averaged(space: ParameterSpace, parts: Sequence[tuple[float, FittedStructure, int]]) -> GaussianMixture:
         """The mixture of the normals that structures have for the parameters of a space, each from an index on."""
-        own = [(np.log(p), one, slice(first, first + len(space))) for p, one, first in parts]
-        means = np.stack([one.mean[at] for _, one, at in own])
-        covariances = np.stack([one.covariance[at, at] for _, one, at in own])
-        return GaussianMixture(np.array([weight for weight, _, _ in own]), means, covariances, space)
+        own = [(one, slice(first, first + len(space))) for _, one, first in parts]
+        means = np.stack([one.mean[at] for one, at in own])
+        covariances = np.stack([one.covariance[at, at] for one, at in own])
+        # a draw is to come from a structure with its probability, however much of its normal the cube cuts off
+        masses = GaussianMixture(np.zeros(len(own)), means, covariances, space).log_masses.numpy()
+        return GaussianMixture(np.log([p for p, _, _ in parts]) - masses, means, covariances, space)
 
     def posterior_of(self, one: FittedStructure) -> GaussianMixture:
         """Of all parameters of one structure, the extensions' behind the user's."""

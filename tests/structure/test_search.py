@@ -58,6 +58,28 @@ def test_two_effects_are_found_one_after_the_other() -> None:
     structures = searched(recorded)
     print(structures.table())
     assert set(structures.best.labels) == {"dry_friction:hinge", "quadratic_damping:hinge"}
+    for label, truth in (("dry_friction:hinge", 0.15), ("quadratic_damping:hinge", 0.06)):
+        (value,) = structures.posterior_of_piece(label).values(2000).mean(0)
+        assert value == pytest.approx(truth, rel=0.25), label
+
+
+def test_a_piece_is_averaged_over_the_structures_that_have_it() -> None:
+    """Each counts with its probability, wherever its parameters stand and however much its bounds cut off."""
+    structures = searched(log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.15, 0.06], 6))
+    cost, label = structures.search.cost, "dry_friction:hinge"
+    alike = [replace(one, evidence=cost * len(one.labels), held_out=None) for one in structures.fitted]
+    having = [one for one in alike if label in one.labels]
+    assert len({one.labels.index(label) for one in having}) > 1  # it stands at different places
+    index = [structures.simulator(one).space.index("hinge.dry_friction") for one in having]
+    pressed = having[0].mean.copy()
+    pressed[index[0]] = 0.0  # half of it is cut off
+    alike = [replace(one, mean=pressed) if one is having[0] else one for one in alike]
+    posterior = Structures(
+        structures.search, replace(structures.state, fitted=tuple(alike), columns=())
+    ).posterior_of_piece(label)
+    means = [0.0, *(one.mean[k] for one, k in zip(having[1:], index[1:], strict=True))]
+    assert posterior.means.numpy()[:, 0] == pytest.approx(means)
+    assert posterior.probabilities.numpy() == pytest.approx(np.full(len(having), 1 / len(having)))
 
 
 def test_what_the_same_motion_has_is_not_decided() -> None:

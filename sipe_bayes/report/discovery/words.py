@@ -83,7 +83,7 @@ def headline(discovery: Discovery) -> Verdict:
     if kept:
         return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
     if discovery.passes:
-        return Verdict("good", "Nothing is lacking that these logs would show: the residuals pass for noise.")
+        return Verdict("good", "Nothing is lacking that these logs would show.")
     return Verdict("bad", "The residuals are not noise, and nothing that was tried is what the model lacks.")
 
 
@@ -95,9 +95,7 @@ def held_out_verdict(discovery: Discovery) -> Verdict | None:
             return None
         return Verdict("fair", "No log was held out: only pieces of the training logs speak for it.")
     interval = f"95 % interval {1 / comparison.high:.2f} to {1 / comparison.low:.2f}"
-    margin = (
-        f"{1 / comparison.ratio:.2f} times that of the plain model, calibrated ({interval}), each from its best starts"
-    )
+    margin = f"{1 / comparison.ratio:.2f} times that of the plain model, calibrated ({interval}, from best starts)"
     words = {
         "better": ("good", f"On held-out logs its error falls to {margin}."),
         "worse": ("bad", f"On held-out logs its error is LARGER, {margin}."),
@@ -111,11 +109,15 @@ def undecided(discovery: Discovery) -> Verdict | None:
     open_pieces = alternatives(discovery)
     if not open_pieces:
         return None
-    named = [
-        f"{p.sentence} (evidence {nats(p.evidence)} nats, held-out pieces {nats(p.held_out)})" for p in open_pieces
-    ]
+    named = [f"{p.sentence} ({_why_open(p)})" for p in open_pieces]
     more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
     return Verdict("fair", f"Not decided: {listed([*named[:_NAMED], *more])}; more or longer logs would tell.")
+
+
+def _why_open(piece: Piece) -> str:
+    if piece.undecided:
+        return f"evidence {nats(piece.evidence)} nats, but held-out pieces {nats(piece.held_out)}"
+    return f"probability {probability_text(piece.probability)}"
 
 
 def remains(discovery: Discovery) -> Verdict | None:
@@ -126,12 +128,12 @@ def remains(discovery: Discovery) -> Verdict | None:
         explained = f" Pieces with a name explain {100 * share:.0f} % of what a force without one would."
     if misfit is None:
         return Verdict("fair", f"Whether the residuals pass for noise cannot be told.{explained}")
+    p = f"(p = {misfit.p:.2g})"
     if not misfit.alarm:
-        told = Verdict("good", f"What remains passes for noise (p = {misfit.p:.2g}).{explained}")
-        return told if discovery.kept else None
-    return Verdict(
-        "bad", f"What remains is not noise (p = {misfit.p:.2g}); it looks most like {misfit.cause}.{explained}"
-    )
+        return Verdict("good", f"What remains passes for noise {p}.{explained}")
+    if discovery.passes:
+        return Verdict("fair", f"What remains is not quite noise {p}: something small, like {misfit.cause}.{explained}")
+    return Verdict("bad", f"What remains is not noise {p}; it looks most like {misfit.cause}.{explained}")
 
 
 def trust(discovery: Discovery) -> Verdict:
@@ -140,10 +142,8 @@ def trust(discovery: Discovery) -> Verdict:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
         return Verdict("good", "Values may be trusted within the intervals averaged over the structures, no narrower.")
-    return Verdict(
-        "bad",
-        "No value may be trusted within its interval yet: the intervals are those of models that are still wrong.",
-    )
+    text = "No value may be trusted within its interval yet: the intervals are those of models that are still wrong."
+    return Verdict("bad", text)
 
 
 def discovery_verdicts(discovery: Discovery) -> list[Verdict]:

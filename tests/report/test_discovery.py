@@ -1,0 +1,149 @@
+"""What is thought of a search over structures and in which words; its page and its twenty printed lines."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from sipe_bayes.cli.discover import print_discovery
+from sipe_bayes.core.findings import Code, Finding, Severity
+from sipe_bayes.diagnostics.discovery import Discovery
+from sipe_bayes.diagnostics.records import Comparison
+from sipe_bayes.report.discovery.page import discovery_pictures, render_discovery
+from sipe_bayes.report.discovery.words import discovery_verdicts, next_steps
+from tests.problems.calibrations import EVIL, Page
+from tests.problems.discoveries import LARGE, SMALL, make_discovery, piece, row
+
+FRICTION = piece("friction", kept=True)
+LAW = piece("stribeck", kept=True, native=False, nearest="LuGre", parameters=("hinge.size", "hinge.speed"))
+GAINS = piece("gain", "motor", kept=True, parameters=tuple(f"motor.gain[{k}]" for k in range(6)))
+
+
+def changed(*pieces: Any, **changes: Any) -> Discovery:
+    return dataclasses.replace(make_discovery(*pieces), **changes)
+
+
+def left(misfit: Any) -> dict[str, Any]:
+    return {"after": dataclasses.replace(make_discovery().after, misfit=misfit)}
+
+
+VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words of the sentence
+    "found": (
+        make_discovery(FRICTION),
+        "good",
+        "lacks friction at hinge, 0.1000 N m (0.0920 to 0.1080), with",
+    ),
+    "probable": (make_discovery(FRICTION), "good", "with probability 0.97."),
+    "two numbers": (make_discovery(LAW), "good", "size 0.1000 N m (0.0920 to 0.1080) and speed 0.1000 N m ("),
+    "many numbers": (make_discovery(GAINS), "good", "and 3 more, with probability"),
+    "two pieces": (make_discovery(FRICTION, LAW), "good", "0.97; and stribeck at hinge, size"),
+    "found, wrong": (changed(FRICTION, **left(LARGE)), "fair", "The model lacks friction at hinge"),
+    "nothing": (make_discovery(), "good", "Nothing is lacking that these logs would show."),
+    "nothing, wrong": (changed(**left(LARGE)), "bad", "nothing that was tried is what the model lacks"),
+    "a column": (
+        changed(columns=("the command of motor has the opposite sign: multiply it by -1",)),
+        "bad",
+        "do not say what the configuration says: the command of motor has the opposite sign: multiply it by -1.",
+    ),
+    "better": (
+        make_discovery(FRICTION),
+        "good",
+        "falls to 0.50 times that of the plain model, calibrated (95 %",
+    ),
+    "worse": (changed(FRICTION, comparison=Comparison(0.5, 0.4, 0.6, 1e-4, 20)), "bad", "LARGER, 2.00 times"),
+    "not better": (changed(FRICTION, comparison=Comparison(1.2, 0.9, 1.6, 0.2, 20)), "fair", "NOT shown to be better"),
+    "no log held out": (changed(FRICTION, comparison=None, errors=()), "fair", "No log was held out"),
+    "open": (
+        make_discovery(FRICTION, piece("drag", probability=0.3)),
+        "fair",
+        "drag at hinge (probability 0.30);",
+    ),
+    "contradiction": (
+        make_discovery(piece("cogging", undecided=True, evidence=27.0, held_out=-2.2)),
+        "fair",
+        "cogging at hinge (evidence +27 nats, but held-out pieces -2.2); more or longer logs would tell.",
+    ),
+    "noise": (make_discovery(FRICTION), "good", "What remains passes for noise (p = 0.4)."),
+    "share": (make_discovery(FRICTION), "good", "Pieces with a name explain 80 %"),
+    "small": (changed(FRICTION, **left(SMALL)), "fair", "something small, like drag at hinge"),
+    "large": (changed(FRICTION, **left(LARGE)), "bad", "it looks most like drag at hinge"),
+    "unknown": (changed(FRICTION, **left(None)), "fair", "cannot be told"),
+    "trusted": (make_discovery(FRICTION), "good", "Values may be trusted within the intervals averaged"),
+    "small, trusted": (changed(FRICTION, **left(SMALL)), "good", "Values may be trusted within"),
+    "not trusted": (changed(FRICTION, **left(LARGE)), "bad", "No value may be trusted within its interval yet"),
+    "unknown, not trusted": (changed(FRICTION, **left(None)), "bad", "No value may be trusted within its interval yet"),
+    "not settled": (changed(FRICTION, settled=False), "bad", "raise its budget"),
+}
+
+
+@pytest.mark.parametrize(("discovery", "tone", "words"), VERDICTS.values(), ids=VERDICTS)
+def test_verdicts(discovery: Discovery, tone: str, words: str) -> None:
+    said = [verdict for verdict in discovery_verdicts(discovery) if words in verdict.text]
+    assert [verdict.tone for verdict in said] == [tone], [verdict.text for verdict in discovery_verdicts(discovery)]
+
+
+def test_a_piece_that_is_out_of_the_question_is_not_open() -> None:
+    sentences = [v.text for v in discovery_verdicts(make_discovery(FRICTION, piece("drag")))]
+    assert not [text for text in sentences if "drag" in text]
+
+
+NEXT = {
+    "found": (make_discovery(FRICTION), "sipe calibrate runs/pendulum-discover/discovered.toml"),
+    "a column": (changed(columns=("a",)), "sipe calibrate runs/pendulum-discover/discovered.toml"),
+    "nothing": (make_discovery(), "go on with the configuration"),
+    "nothing, wrong": (changed(**left(LARGE)), "structure.extra"),
+}
+
+
+@pytest.mark.parametrize(("discovery", "words"), NEXT.values(), ids=NEXT)
+def test_what_to_do_next(discovery: Discovery, words: str) -> None:
+    assert words in next_steps(discovery)
+
+
+def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixture[str]) -> None:
+    full = make_discovery(FRICTION, LAW, GAINS, *[piece(f"drag{k}", probability=0.3) for k in range(9)], rows=12)
+    full = dataclasses.replace(
+        full,
+        columns=("a", "b"),
+        errors=full.errors * 5,
+        parameters=full.parameters * 4,
+        findings=tuple(Finding(Code.NOT_EXPORTED, Severity.CAUTION, f"{k}") for k in range(5)),
+        settled=False,
+        **left(LARGE),
+    )
+    print_discovery(full)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 20
+    assert [line for line in lines if "more, in the report" in line]
+    assert lines[-1].startswith("next: ")
+
+
+def test_a_yardstick_has_no_probability(capsys: pytest.CaptureFixture[str]) -> None:
+    discovery = changed(FRICTION, rows=(row("friction", probability=1.0), row("residual", yardstick=True)))
+    print_discovery(discovery)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  residual")]
+    assert line.split()[-1] == "–"
+    assert "–" in render_discovery(discovery, [])
+
+
+def test_page_says_it_all_and_escapes_names() -> None:
+    measured = piece("delay", "angle", kept=True, kind="channel", native=False)
+    discovery = changed(FRICTION, LAW, measured, piece("drag", probability=0.3), name=EVIL, columns=(EVIL,))
+    images = discovery_pictures(discovery)
+    assert {image.section for image in images} == {"signals_holdout", "signals_train", "residuals", "values"}
+    html = render_discovery(discovery, images)
+    page = Page(html)
+    assert "script" not in page.tags
+    for verdict in discovery_verdicts(discovery):
+        assert verdict.text in page.text
+    for words in (
+        "each piece pays 6.2 nats",
+        "MJCF has no element for stribeck at hinge",
+        "The nearest element is LuGre",
+        "Delay at angle is of the measurement and has no place in discovered.xml",
+        "Not decided: drag at hinge: probability 0.30",
+        "Next: sipe calibrate runs/pendulum-discover/discovered.toml",
+    ):
+        assert words in page.text, words
