@@ -267,9 +267,17 @@ def _numeric(number: Number, label: str, slot: int) -> Maker:
                 realise(other, index, at - slot)
 
         value = float(model.numeric_data[at])
-        return Target(spec, number.unit, value, write, constants=elastic, minimum=number.minimum, shape=number.shape)
+        unit = _of_joint(number.unit, _hinge(model, index)) if spec.startswith("joint:") else number.unit
+        return Target(spec, unit, value, write, constants=elastic, minimum=number.minimum, shape=number.shape)
 
     return make
+
+
+def _of_joint(unit: str, hinge: bool) -> str:
+    """A unit in words, such as ``force/velocity``, at a hinge or a slide."""
+    words = {"force": ("N m", "N"), "velocity": ("rad/s", "m/s"), "position": ("rad", "m")}
+    top, slash, bottom = (words[w][not hinge] if w in words else w for w in unit.partition("/"))
+    return f"{top}/({bottom})" if slash and not bottom.isalnum() else f"{top}{slash}{bottom}"
 
 
 def _laws(kind: str) -> dict[str, Maker]:
