@@ -144,22 +144,11 @@ def give_way(spec: Any) -> None:
 
 
 TWIST = "hinge2.link"
+HINGE = {"force": "N m", "velocity": "rad/s", "position": "rad"}  # a unit in words as it is at a hinge
+HINGE |= {"force/velocity": "N m/(rad/s)", "position/force": "rad/(N m)"}
 LAW_AT = {"joint": "joint:hinge", "actuator": "actuator:motor"}
-AT_HINGE = {
-    "force": "N m",
-    "force/velocity": "N m/(rad/s)",
-    "velocity": "rad/s",
-    "position": "rad",
-    "position/force": "rad/(N m)",
-}
-
 
 # (target, value, unit, how the spec is edited)
-def at_hinge(kind: str, unit: str) -> str:
-    """A unit in words as it is at a hinge; an actuator's stay words."""
-    return AT_HINGE.get(unit, unit) if kind == "joint" else unit
-
-
 CASES: list[tuple[str, float, str, Edit]] = [
     ("body:rod.mass", 1.7, "kg", mass),
     ("body:tilted.mass", 0.3, "kg", mass),
@@ -235,13 +224,10 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("option.density", 2.0, "kg/m^3", scalar("density")),
     ("option.viscosity", 1e-3, "Pa s", scalar("viscosity")),
     *(
-        (f"{LAW_AT[kind]}.{attribute}", 0.3, at_hinge(kind, law.numbers[slot].unit), vector("data", slot))
+        (f"{LAW_AT[kind]}.{attribute}", 0.3, HINGE.get(u := law.numbers[slot].unit, u), vector("data", slot))
         for (kind, attribute), (law, slot) in LAW_OF.items()
     ),
-    *(
-        (f"joint:{TWIST}.{number.attribute}", 0.2, at_hinge("joint", number.unit), elastic(k))
-        for k, number in enumerate(NUMBERS)
-    ),
+    *((f"joint:{TWIST}.{n.attribute}", 0.2, HINGE.get(n.unit, n.unit), elastic(k)) for k, n in enumerate(NUMBERS)),
 ]
 
 
