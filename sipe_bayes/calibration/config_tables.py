@@ -283,11 +283,13 @@ class PriorSource(Table):
 class Search(Table):
     """How widely the optimum is looked for.
 
-    restarts: starting points that are followed; candidates: draws from the prior among which they are chosen.
+    restarts: starting points that are followed; candidates: draws from the prior among which they are chosen; start:
+    values by parameter, in their units, from which the search of ``laplace`` begins instead.
     """
 
     restarts: Annotated[int, Strict(), Field(gt=0)] = 2
     candidates: Annotated[int, Strict(), Field(ge=0)] = 8
+    start: dict[str, Number] | None = None
 
 
 class Structure(Table):

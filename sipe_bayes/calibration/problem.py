@@ -14,10 +14,12 @@ from sipe_bayes.calibration.config import Config, check_dimensions, load_config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.config_tables import LogEntry, overlap
 from sipe_bayes.calibration.logs import load_logs
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.units import find_unit, to_si
+from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
@@ -278,7 +280,20 @@ def method_of(
         likelihood=problem.likelihood,
         seed=config.seed if seed is None else seed,
         budget=config.budget if budget is None else budget,
-        **(config.search.model_dump() if takes else {}),
+        **(config.search.model_dump(exclude={"start"}) if takes else {}),
+        **({"initial": _start(problem)[None]} if config.search.start and name == "laplace" else {}),
         checkpoint=checkpoint,
         progress=progress,
     )
+
+
+def _start(problem: Problem) -> FloatArray:
+    """Theta (N,) where the search begins: the configuration's values, the model's own of the others."""
+    space, theta = problem.environment.space, np.clip(problem.environment.space.default_theta, 0, 1)
+    for name, value in (problem.config.search.start or {}).items():
+        if name not in space.names:
+            hint = nearest_name(name, space.names) or f"; known are {', '.join(space.names)}"
+            raise ConfigError(f"{problem.config.path}: key `search.start`: no parameter {name!r}{hint}")
+        index = space.index(name)
+        theta[index] = np.clip(float(space[index].normalise(value)), 0, 1)
+    return theta

@@ -86,6 +86,7 @@ def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Disco
     data = tomllib.loads((Path(found.out) / "discovered.toml").read_text(encoding="utf-8"))
     assert [p["name"] for p in data["parameters"]] == ["rod_mass", "damping", "hinge.dry_friction"]
     assert not Path(data["model"]).is_absolute()
+    assert data["search"]["start"] == pytest.approx(dict(found.best))
     again = run(Path(found.out) / "discovered.toml", out=config.parent / "again", num_threads=1)
     best = json.loads((Path(found.out) / "structures.json").read_text())["best"]
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-3)
@@ -133,6 +134,14 @@ def test_wrong_column_is_said_and_set_right_in_the_configuration(
     assert row[key] == pytest.approx(1 / factor)
     again = run(tmp_path / "out" / "discovered.toml", out=tmp_path / "again", num_threads=1)
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(dict(found.best), rel=1e-3)
+
+
+def test_start_of_an_unknown_parameter_is_one_line(tmp_path: Path) -> None:
+    config = write_lacking(tmp_path)
+    config.write_text("search.start = { dampin = 0.1 }\n" + config.read_text())
+    with pytest.raises(ValueError, match=r"`search\.start`: no parameter 'dampin'; did you mean 'damping'\?"):
+        run(config, out=tmp_path / "out", num_threads=1)
+    assert not (tmp_path / "out").exists()
 
 
 def test_killed_search_goes_on_to_the_same_bits(case: tuple[Path, Discovery], tmp_path: Path) -> None:

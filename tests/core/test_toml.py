@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sipe_bayes.core.toml import to_toml
@@ -16,6 +16,7 @@ TABLES = st.dictionaries(st.text(), VALUES, max_size=4)
 DOCUMENTS = st.dictionaries(st.text(), VALUES | TABLES | st.lists(TABLES, max_size=3), max_size=5)
 
 
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(DOCUMENTS)
 def test_any_document_comes_back(document: dict[str, object]) -> None:
     assert tomllib.loads(to_toml(document)) == document
