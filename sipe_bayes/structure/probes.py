@@ -10,14 +10,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
@@ -146,7 +146,10 @@ def _simulated(
         first += len(one.plain)
     mapped = mapped_starts(windows.simulator.model, simulator.model, starts)
     pieces = np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS))
-    runs = [bound.predict(piece, np.tile(mapped, (len(piece), 1, 1))) for piece in pieces]
+    runs = []
+    for piece in pieces:
+        begun = carried_starts(windows.simulator.model, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
+        runs.append(bound.predict(piece, begun))
     predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
     windows.rollouts += bound.rollouts
     out, at = [], 1
@@ -160,35 +163,3 @@ def _simulated(
             if valid[0] and use.any():
                 out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use]))
     return out
-
-
-def mapped_starts(before: mujoco.MjModel, after: mujoco.MjModel, starts: FloatArray) -> FloatArray:
-    """Starts (..., W, D) of one model as starts of an extended one: what it has more begins at its reference."""
-    if not starts.shape[-1]:
-        return starts
-    out = np.zeros((*starts.shape[:-1], 2 * after.nv + after.na))
-    dofs, acts = _dofs(before, after), _activations(before, after)
-    out[..., dofs] = starts[..., : before.nv]
-    out[..., after.nv + dofs] = starts[..., before.nv : 2 * before.nv]
-    out[..., 2 * after.nv + acts] = starts[..., 2 * before.nv :]
-    return out
-
-
-def _dofs(before: mujoco.MjModel, after: mujoco.MjModel) -> IntArray:
-    """Where each dof of a model is in an extended one, by the names of the joints, or their order without names."""
-    places: list[int] = []
-    for joint in range(before.njnt):
-        name = before.joint(joint).name
-        other = after.joint(name).id if name else joint
-        width = (int(before.jnt_dofadr[joint + 1]) if joint + 1 < before.njnt else before.nv) - before.jnt_dofadr[joint]
-        places.extend(range(int(after.jnt_dofadr[other]), int(after.jnt_dofadr[other]) + int(width)))
-    return np.array(places, np.int64)
-
-
-def _activations(before: mujoco.MjModel, after: mujoco.MjModel) -> IntArray:
-    places: list[int] = []
-    for actuator in range(before.nu):
-        name, count = before.actuator(actuator).name, int(before.actuator_actnum[actuator])
-        other = after.actuator(name).id if name else actuator
-        places.extend(range(int(after.actuator_actadr[other]), int(after.actuator_actadr[other]) + count))
-    return np.array(places, np.int64)
