@@ -15,7 +15,7 @@ from sipe_bayes.structure.machine import Machine
 _ROTOR = 0.2  # of the inertia that the joint moves, taken for the motor's where the model has none
 _SOFTEST = 2.0  # times the motion's own frequency: the lowest resonance
 _LEAST_RANGE = 20.0  # of the softest spring to the stiffest that the physics step resolves
-_START = 0.15  # of the softest spring's usual twist, where windows may start
+_START = 0.05  # of the softest spring's usual twist, where windows may start
 _LOSSES = 0.005, 0.3  # time constants, of the motion's own
 
 
