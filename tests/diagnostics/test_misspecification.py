@@ -190,7 +190,7 @@ def test_an_optimum_at_a_bound_is_no_excuse() -> None:
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_a_right_model_is_left_in_peace(rho: float) -> None:
     """Two logs, each below p = 0.05 with a probability of 5 %; the same seed gives the same p."""
-    recorded = log(pendulum(), [0.6, 0.08], 3, rho=rho)
+    recorded = log(pendulum(), [0.6, 0.08], 4, rho=rho)
     seen = found(recorded)
     print(seen)
     assert seen.p > 0.05
