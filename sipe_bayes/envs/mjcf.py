@@ -34,7 +34,7 @@ from sipe_bayes.envs.channels import (
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
 from sipe_bayes.envs.internal.states import filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
-from sipe_bayes.envs.laws.bound import BoundLaw, declare, laws_of, moving_on
+from sipe_bayes.envs.laws.bound import declare, laws_of, moving_on
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.poses import PoseReading, pose_columns, pose_readings
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
@@ -183,10 +183,6 @@ class MjcfEnvironment(Environment):
     def _model(self) -> mujoco.MjModel:
         return self.compile()
 
-    @cached_property
-    def _laws(self) -> tuple[BoundLaw, ...]:
-        return laws_of(self._model)
-
     def __getstate__(self) -> dict[str, object]:
         return {f: getattr(self, f) for f in ("source", "actuators", "measurements", "parameters", "edits")}
 
@@ -333,10 +329,10 @@ class MjcfEnvironment(Environment):
         self, model: mujoco.MjModel, states: FloatArray, actions: Sequence[FloatArray], timestep: FloatArray
     ) -> FloatArray:
         """Fill the history of every delayed actuator and begin at rest; see ``Environment.history``."""
-        filtered = filtered_commands(model)
-        if model.nhistory == 0 and not filtered and not self._laws:
+        filtered, laws = filtered_commands(model), laws_of(model)
+        if model.nhistory == 0 and not filtered and not laws:
             return states
-        states, timestep = moving_on(self._laws, states), np.asarray(timestep)
+        states, timestep = moving_on(laws, states), np.asarray(timestep)
         for index, column in filtered:
             for row, past in enumerate(actions):
                 states[row, column] = self.control(model, states[row], past[-1])[int(model.actuator_ctrladr[index])]
