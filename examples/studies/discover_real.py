@@ -82,10 +82,10 @@ def studied(name: str) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("examples", nargs="*", choices=EXAMPLES, default=list(EXAMPLES))
+    parser.add_argument("examples", nargs="*", choices=EXAMPLES, help="default both")
     path = HERE / "results" / "discover_real.json"
     table = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for name in parser.parse_args().examples:
+    for name in parser.parse_args().examples or EXAMPLES:
         table[name] = studied(name)
         write_text(path, json.dumps(table, indent=1) + "\n")
         print(json.dumps(table[name], indent=1))
