@@ -1,7 +1,7 @@
 """What is found in the two real pendulums, and what it is worth on logs that were held out.
 
     python examples/studies/discover_real.py                        # both; some quarter of an hour on two cores
-    python examples/studies/discover_real.py simple_pendulum
+    python examples/studies/discover_real.py --examples simple_pendulum
 
 `sipe discover` searches, then `sipe calibrate` fits the model as given and the discovered configuration, both with the
 example's own noise model. Errors are root-mean-square over open-loop windows from measured starts. Searches go on from
@@ -82,10 +82,10 @@ def studied(name: str) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("examples", nargs="*", choices=EXAMPLES, help="default both")
+    parser.add_argument("--examples", nargs="+", choices=EXAMPLES, default=EXAMPLES)
     path = HERE / "results" / "discover_real.json"
     table = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for name in parser.parse_args().examples or EXAMPLES:
+    for name in parser.parse_args().examples:
         table[name] = studied(name)
         write_text(path, json.dumps(table, indent=1) + "\n")
         print(json.dumps(table[name], indent=1))
