@@ -96,8 +96,8 @@ def write_configuration(problem: Problem, structures: Structures, folder: Path, 
         data["model"] = EXTENDED_XML
     data["parameters"] = [*data["parameters"], *_entries([p for one in placed for p in one.parameters])]
     space = _environment(structures).space
-    found = zip(space.names, space.values(structures.best.theta).tolist(), strict=True)
-    data["search"] = {**data.get("search", {}), "start": dict(found)}
+    values = zip(space.names, space.values(structures.best.theta).tolist(), strict=True)
+    data["search"] = {**data.get("search", {}), "start": dict(values)}
     lines = [f"# {problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]
     lines += [f"#   sipe calibrate {folder / DISCOVERED_TOML}", *(f"# {x.sentence}" for x in structures.columns)]
     lines += [f"# {one.sentence}" for one in placed]

@@ -114,15 +114,15 @@ def unmeasured_starts(
         return []
     model = simulator.model
     joints = [joint for joint in unmeasured_joints(simulator, logs) if has_pose(model, joint)]
-    said = []
+    findings = []
     for joint in joints:
         body = model.body(int(model.jnt_bodyid[joint])).name or f"body {int(model.jnt_bodyid[joint])}"
         name = model.joint(joint).name or f"of {body}"
         place = f"body:{body}.position and " if int(model.jnt_type[joint]) == _FREE else ""
         needed = f"{place}body:{body}.orientation"
         code = Code.HELD_OUT_AT_REST if isinstance(likelihood, StateSpace) else Code.STARTS_AT_REST
-        said.append(finding(code, joint=name, needed=needed))
-    return said
+        findings.append(finding(code, joint=name, needed=needed))
+    return findings
 
 
 def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:

@@ -93,16 +93,16 @@ def calibrate(
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
         calibration = run(config, estimator, seed, budget, out, threads, progress.update)
-        found = None
+        discovery = None
         if discover:
             folder = Path(calibration.out) / "discover"
-            found = run_discovery(config, folder, seed, num_threads=threads, progress=progress.update)
+            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=progress.update)
     if as_json:
-        print(to_json(calibration.to_dict() | ({} if found is None else {"discovery": found.to_dict()})))
+        print(to_json(calibration.to_dict() | ({} if discovery is None else {"discovery": discovery.to_dict()})))
         return
     print_calibration(calibration)
-    if found is not None:
-        discover_commands.print_discovery(found)
+    if discovery is not None:
+        discover_commands.print_discovery(discovery)
 
 
 @app.command()

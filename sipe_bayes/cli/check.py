@@ -58,17 +58,17 @@ def check(
         of = f" of at most {each} rollouts each" * bool(each)
         if not as_json:
             print(f"{trained}{truths} fits{of}, kept in {folder}", flush=True)
-        found = checks.run(study, truths, folder, _say if not as_json and sys.stderr.isatty() else _silent)
+        outcome = checks.run(study, truths, folder, _say if not as_json and sys.stderr.isatty() else _silent)
     if as_json:
-        print(to_json(found.to_dict()))
+        print(to_json(outcome.to_dict()))
     else:
-        print(found.sentence())
-        for line in found.check.sentences():
+        print(outcome.sentence())
+        for line in outcome.check.sentences():
             print(line)
-        for name, c in zip(found.check.names, found.contraction, strict=True):
-            print(f"{name}: {found.check.verdict(name)}, mean contraction {c:.2f}")
+        for name, c in zip(outcome.check.names, outcome.contraction, strict=True):
+            print(f"{name}: {outcome.check.verdict(name)}, mean contraction {c:.2f}")
         print(f"figures: {folder / 'ranks.png'}, {folder / 'coverage.png'}")
-    if not found.check.calibrated:
+    if not outcome.check.calibrated:
         raise typer.Exit(1)
 
 

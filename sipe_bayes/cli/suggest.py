@@ -67,13 +67,13 @@ def suggest(
             raise ValueError("--candidates: expected at least 1, or --given; got none")
         known, noise = _known(problem, posterior), _noise(problem, posterior)
         model = problem.simulator, problem.segments
-        found = suggestions.rank(*model, plans, noise, known, parameter or (), draws=draws, seed=seed)
-        _write(problem, found[0].plan, out)
+        ranked = suggestions.rank(*model, plans, noise, known, parameter or (), draws=draws, seed=seed)
+        _write(problem, ranked[0].plan, out)
     if as_json:
-        print(to_json({**suggestions.to_dict(found, problem.simulator, parameter or ()), "out": str(out)}))
+        print(to_json({**suggestions.to_dict(ranked, problem.simulator, parameter or ()), "out": str(out)}))
         return
     space, channels = problem.simulator.space, problem.simulator.environment.channels
-    for one in found[:_SHOWN]:
+    for one in ranked[:_SHOWN]:
         each = ", ".join(f"{name} {one.contraction[space.index(name)]:.2f}" for name in parameter or space.names)
         reach = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, (a, b) in zip(channels, one.reach, strict=True))
         lost = f"; diverges at {one.diverged} of {draws} draws" if one.diverged else ""
@@ -86,11 +86,11 @@ def _known(problem: Problem, path: Path | None) -> Posterior:
 
     if path is None:
         return problem.prior
-    found = load_posterior(path)
-    difference = found.space.difference(problem.simulator.space)
+    posterior = load_posterior(path)
+    difference = posterior.space.difference(problem.simulator.space)
     if difference:
         raise ValueError(f"--posterior {path}: {difference} in the configuration; give that of a run of it")
-    return found
+    return posterior
 
 
 def _noise(problem: Problem, path: Path | None) -> Noise:

@@ -101,13 +101,13 @@ def components(target: str, name: str, quaternion: bool = False) -> list[Channel
 def rotation_triples(channels: Sequence[Channel]) -> tuple[tuple[int, int, int], ...]:
     """Places of the rotation vectors; raises TargetError where one of the three numbers is missing."""
     places = {c.target: k for k, c in enumerate(channels) if is_rotation(c)}
-    found = []
+    groups = []
     for whole in dict.fromkeys(target.rpartition("[")[0] for target in places):
         parts = [places.get(f"{whole}[{i}]") for i in range(3)]
         if None in parts:
             raise TargetError(f"measurement {whole!r}: an orientation is measured whole; give {whole!r}, without [i]")
-        found.append(tuple(parts))
-    return tuple(found)  # type: ignore[arg-type]
+        groups.append(tuple(parts))
+    return tuple(groups)  # type: ignore[arg-type]
 
 
 def expanded(model: mujoco.MjModel, channel: Channel) -> list[Channel]:

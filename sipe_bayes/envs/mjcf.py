@@ -371,10 +371,7 @@ def _prepared(
     timestep = spec.option.timestep
     for parameter in parameters:
         for target in physical_targets(parameter.targets):
-            try:
-                kind, name, attribute = split(target)
-            except TargetError as error:
-                raise TargetError(f"parameter {parameter.name!r}: {error}") from None
+            kind, name, attribute = split(target, parameter.name)
             if kind == "body" and attribute != "mass" and spec.body(name) is not None:
                 spec.body(name).simple = False
             if kind == "actuator" and attribute == "delay" and spec.actuator(name) is not None:

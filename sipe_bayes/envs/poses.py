@@ -68,15 +68,15 @@ def pose_readings(model: mujoco.MjModel, readers: Sequence[Reader]) -> tuple[Pos
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     places = {(r.index, r.turn): channel for channel, r in enumerate(readers) if r.derived}
-    found = []
+    readings = []
     for sensor in range(model.nsensor):
         quantity, address = _QUANTITIES.get(int(model.sensor_type[sensor])), int(model.sensor_adr[sensor])
         keys = [(address, i) if quantity == "orientation" else (address + i, None) for i in range(3)]
         if quantity is not None and all(key in places for key in keys):
             x, y, z = (places[key] for key in keys)
             reading = _reading(model, data, sensor, quantity, (x, y, z))
-            found += [] if reading is None else [reading]
-    return tuple(found)
+            readings += [] if reading is None else [reading]
+    return tuple(readings)
 
 
 def _reading(

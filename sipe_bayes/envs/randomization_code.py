@@ -63,8 +63,8 @@ def randomize_fn(model, rng):
         if getattr(model, name) != size:
             raise ValueError(f"model: expected {{name}} = {{size}}, got {{getattr(model, name)}}; load identified.xml")
     for name, (places, values) in KINDS.items():
-        found = getattr(model, name, None)
-        if found is not None and [int(found.ravel()[place]) for place in places] != values:
+        own = getattr(model, name, None)
+        if own is not None and [int(own.ravel()[place]) for place in places] != values:
             raise ValueError(
                 f"model: {{name}} is not that of the calibrated model, and MJX fixes it on loading; load identified.xml"
             )
@@ -75,10 +75,10 @@ def randomize_fn(model, rng):
         )
 
     def field(name):
-        found = model
+        part_of = model
         for part in name.split("."):
-            found = getattr(found, part)
-        return jp.asarray(found)
+            part_of = getattr(part_of, part)
+        return jp.asarray(part_of)
 
     @jax.vmap
     def draw(key):

@@ -28,13 +28,14 @@ _PATTERN = re.compile(r"^(?:(body|joint|actuator|geom|pair):(.+)|(option))\.([a-
 _AXES = ("x", "y", "z")
 
 
-def split(spec: str) -> tuple[str, str, str]:
-    """(kind, name, attribute) of a target; raises TargetError."""
+def split(spec: str, parameter: str = "") -> tuple[str, str, str]:
+    """(kind, name, attribute) of a target; raises TargetError, which names the parameter where it is given."""
     match = _PATTERN.match(spec)
     if not match:
         kinds = sorted(set(ATTRIBUTES) - {"option"})
+        owner = f"parameter {parameter!r}: " if parameter else ""
         raise TargetError(
-            f"target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {kinds}, or option.ATTRIBUTE"
+            f"{owner}target {spec!r}: expected KIND:NAME.ATTRIBUTE with KIND one of {kinds}, or option.ATTRIBUTE"
         )
     kind, name, option, attribute = match.groups()
     return (option or kind, name or "", attribute)

@@ -169,11 +169,11 @@ class Task(Environment):
     @cached_property
     def _writes(self) -> list[tuple[int, float, Target]]:
         """(parameter, multiplier, target) in the order they must be done; several targets keep their proportions."""
-        found = []
+        lasting = []
         for j, parameter in enumerate(self.parameters):
             targets = [self.bind(t) for t in parameter.targets]
-            found += [(j, target.value / targets[0].value, target) for target in targets]
-        return sorted(found, key=lambda item: item[2].order)
+            lasting += [(j, target.value / targets[0].value, target) for target in targets]
+        return sorted(lasting, key=lambda item: item[2].order)
 
     @property
     def needs_constants(self) -> bool:

@@ -53,8 +53,8 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         states[:, list(measured)] = series if raw else smoothed(series, trajectory.dt)
     readings = simulator.environment.poses
     for joint in dict.fromkeys(reading.joint for reading in readings):
-        told = [r for r in readings if r.joint == joint and _seen(trajectory, r)]
-        _put_pose(model, {r.quantity: r for r in told}, trajectory, states, raw)
+        readings_of = [r for r in readings if r.joint == joint and _seen(trajectory, r)]
+        _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
     return states
 
 
@@ -79,12 +79,12 @@ def _seen(trajectory: Trajectory, reading: PoseReading) -> bool:
 
 
 def _put_pose(
-    model: mujoco.MjModel, told: dict[str, PoseReading], trajectory: Trajectory, states: FloatArray, raw: bool
+    model: mujoco.MjModel, poses: dict[str, PoseReading], trajectory: Trajectory, states: FloatArray, raw: bool
 ) -> None:
-    """Write what is told of one free or ball joint into states (T+1, S): nothing without its orientation."""
-    if "orientation" not in told:
+    """Write what is poses of one free or ball joint into states (T+1, S): nothing without its orientation."""
+    if "orientation" not in poses:
         return
-    orientation = told["orientation"]
+    orientation = poses["orientation"]
     joint, dt = orientation.joint, trajectory.dt
     free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
     place, motion = 1 + int(model.jnt_qposadr[joint]), 1 + model.nq + int(model.jnt_dofadr[joint])
@@ -99,16 +99,16 @@ def _put_pose(
     states[:, place + 3 * free : place + 3 * free + 4] = turn
     states[:, turning] = turned(inverse(turn), spin)
     of_body = turn if parent is None else product(parent, turn)
-    if "angular_velocity" in told and (free or told["angular_velocity"].of_joint):
-        velocity = _values(trajectory, told["angular_velocity"], raw)
-        states[:, turning] = _in_body(velocity, told["angular_velocity"], of_body)
-    if free and "position" in told and not told["position"].at_origin:
-        arm = turned(turn, told["position"].offset)
-        position = _values(trajectory, told["position"], raw=True) - arm
+    if "angular_velocity" in poses and (free or poses["angular_velocity"].of_joint):
+        velocity = _values(trajectory, poses["angular_velocity"], raw)
+        states[:, turning] = _in_body(velocity, poses["angular_velocity"], of_body)
+    if free and "position" in poses and not poses["position"].at_origin:
+        arm = turned(turn, poses["position"].offset)
+        position = _values(trajectory, poses["position"], raw=True) - arm
         states[:, place : place + 3] = position if raw else smoothed(position, dt)
         states[:, motion : motion + 3] = smoothed(position, dt, 1)
-    if free and "linear_velocity" in told:
-        reading = told["linear_velocity"]
+    if free and "linear_velocity" in poses:
+        reading = poses["linear_velocity"]
         velocity = turned(turn, _in_body(_values(trajectory, reading, raw), reading, turn))
         arm = np.cross(states[:, turning], reading.offset)  # in the body's axes
         states[:, motion : motion + 3] = velocity - turned(turn, arm)
@@ -153,13 +153,13 @@ def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[
         return []
     seen = np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
     columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
-    told = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
+    known_poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
     missing, resting = [], joints_at_rest(model)
     for joint in (joint for joint in range(model.njnt) if joint not in resting):
         if has_pose(model, joint):
-            known = (joint, "orientation") in told
+            known = (joint, "orientation") in known_poses
             if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
-                known &= (joint, "position") in told
+                known &= (joint, "position") in known_poses
         else:
             known = 1 + int(model.jnt_qposadr[joint]) in columns
         if not known:

@@ -72,14 +72,14 @@ def fitted_rotations(
     rotations: SequenceOf[tuple[int, int, int]], channels: list[int]
 ) -> tuple[tuple[int, int, int], ...]:
     """Places among the fitted ``channels`` of rotation vectors; raises ValueError where one is fitted in part."""
-    found = []
+    groups = []
     for triple in rotations:
         fitted = [channels.index(c) for c in triple if c in channels]
         if len(fitted) not in (0, 3):
             raise ValueError("fit: an orientation's three numbers are fitted together or not at all; name all three")
         if fitted:
-            found.append((fitted[0], fitted[1], fitted[2]))
-    return tuple(found)
+            groups.append((fitted[0], fitted[1], fitted[2]))
+    return tuple(groups)
 
 
 def check_seen(names: SequenceOf[str], seen: BoolArray) -> None:

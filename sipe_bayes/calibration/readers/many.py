@@ -28,8 +28,8 @@ def matching(path: Path, folder: Path) -> list[Path]:
     if not glob.has_magic(str(path)) or path.exists():
         return [path]
     within = path.relative_to(folder) if path.is_relative_to(folder) else path
-    found = map(Path, glob.glob(str(Path(glob.escape(str(folder)), within)), recursive=True))
-    return sorted(found, key=lambda one: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", str(one))])
+    files = map(Path, glob.glob(str(Path(glob.escape(str(folder)), within)), recursive=True))
+    return sorted(files, key=lambda one: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", str(one))])
 
 
 def names_of(paths: list[Path]) -> list[str]:
@@ -45,8 +45,8 @@ def names_of(paths: list[Path]) -> list[str]:
 def episodes_of(path: Path, column: str) -> list[int]:
     """The numbers of the episodes in a file, in the order in which they begin; raises LogError where it has none."""
     numbers = episode_numbers(path, read_table(path, [column]), column)
-    found = np.unique(numbers, return_index=True)
-    episodes = [int(number) for number in found[0][np.argsort(found[1])]]
+    distinct = np.unique(numbers, return_index=True)
+    episodes = [int(number) for number in distinct[0][np.argsort(distinct[1])]]
     if 2 * len(episodes) > len(numbers):
         raise LogError(
             f"{path}: column {column!r} has {len(episodes)} numbers in {len(numbers)} rows, which are no episodes; "
@@ -57,11 +57,11 @@ def episodes_of(path: Path, column: str) -> list[int]:
 
 def episode(table: Columns, numbers: IntArray, number: int) -> Columns:
     """The rows of one episode; columns of another length than its numbers (n,) are left as they are."""
-    found = np.flatnonzero(numbers == number)
-    if not found.size:
+    members = np.flatnonzero(numbers == number)
+    if not members.size:
         raise LogError(f"no episode {number}; they go from {numbers.min()} to {numbers.max()}")
-    first, last = int(found[0]), int(found[-1]) + 1
-    rows = slice(first, last) if last - first == found.size else found  # no copies where they stand together
+    first, last = int(members[0]), int(members[-1]) + 1
+    rows = slice(first, last) if last - first == members.size else members  # no copies where they stand together
     return {name: values[rows] if len(values) == len(numbers) else values for name, values in table.items()}
 
 

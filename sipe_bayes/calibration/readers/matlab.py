@@ -46,10 +46,10 @@ def _version_5(path: Path) -> tuple[Columns, list[str]]:
     kinds = dict(_variables(path))
     objects = [name for name, kind in kinds.items() if kind in _OBJECTS]
     names = [name for name in kinds if name and name not in objects]
-    found = loadmat(path, variable_names=names, simplify_cells=True) if names else {}
+    variables = loadmat(path, variable_names=names, simplify_cells=True) if names else {}
     columns: Columns = {}
     for name in names:
-        for word, values in _leaves(name, found.get(name), 0):
+        for word, values in _leaves(name, variables.get(name), 0):
             columns.update(spread(word, values))
     return columns, objects
 

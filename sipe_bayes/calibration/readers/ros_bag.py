@@ -51,8 +51,8 @@ def _connections(path: Path, all_of_them: Collection[Connection], wanted: Collec
     kinds = {one.topic: one.msgtype for one in all_of_them}
     for name in wanted:
         if not any(name.startswith(f"{topic}.") for topic in kinds):
-            there = listed([f"{topic} ({kind})" for topic, kind in sorted(kinds.items())]) or "no topics"
-            raise LogError(f"{path}: no topic for {name!r}; {nearest(name.split('.')[0], kinds)} (it has {there})")
+            topics = listed([f"{topic} ({kind})" for topic, kind in sorted(kinds.items())]) or "no topics"
+            raise LogError(f"{path}: no topic for {name!r}; {nearest(name.split('.')[0], kinds)} (it has {topics})")
     for one in all_of_them:
         if not wanted or any(name.startswith(f"{one.topic}.") for name in wanted):
             yield one
@@ -78,12 +78,12 @@ def _types(connection: Connection) -> Mapping[str, Fields]:
 
     definition = connection.msgdef
     if definition.format == MessageDefinitionFormat.MSG:
-        found = get_types_from_msg(definition.data, connection.msgtype)
+        definitions = get_types_from_msg(definition.data, connection.msgtype)
     elif definition.format == MessageDefinitionFormat.IDL:
-        found = get_types_from_idl(definition.data)
+        definitions = get_types_from_idl(definition.data)
     else:
-        found = get_typestore(Stores.LATEST).fielddefs
-    return {name: fields for name, (_, fields) in found.items()}
+        definitions = get_typestore(Stores.LATEST).fielddefs
+    return {name: fields for name, (_, fields) in definitions.items()}
 
 
 class _Topic:
@@ -112,10 +112,10 @@ class _Topic:
         """Each (n,), times from ``first`` in ns."""
         rows = len(self.received)
         stamps = self.stamps if any(self.stamps) else self.received
-        found: Columns = {"time": _seconds(self.received, first), "stamp": _seconds(stamps, first)}
+        columns: Columns = {"time": _seconds(self.received, first), "stamp": _seconds(stamps, first)}
         for name, column in self.numbers.items():
-            found[name] = np.append(np.array(column), np.full(rows - len(column), np.nan))
-        return found
+            columns[name] = np.append(np.array(column), np.full(rows - len(column), np.nan))
+        return columns
 
 
 def _seconds(times: array[int], first: int) -> np.ndarray:

@@ -70,10 +70,10 @@ def _kind(path: Path) -> str:
     """The key of ``READERS`` for a path."""
     if path.is_dir():
         folders = [kind for kind in READERS if not kind.startswith(".")]
-        found = next((kind for kind in folders if (path / kind).is_file()), None)
-        if found is None:
+        inner = next((kind for kind in folders if (path / kind).is_file()), None)
+        if inner is None:
             raise LogError(f"{path}: a folder without {_one_of(folders)}; name the log's file")
-        return found
+        return inner
     if not path.is_file():
         raise LogError(f"{path}: no such file; {nearest_file(path)}")
     if path.suffix.lower() not in READERS:

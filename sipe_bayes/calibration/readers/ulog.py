@@ -33,10 +33,10 @@ def read_ulog(path: Path, wanted: Collection[str]) -> Columns:
     messages = sorted({name.split(".")[0].split("[")[0] for name in wanted})
     with contextlib.redirect_stdout(io.StringIO()):
         log = ULog(str(path), messages or None)
-    there = {data.name for data in log.data_list}
+    topics = {data.name for data in log.data_list}
     for name in messages:
-        if name not in there:
-            known = nearest(name, there | set(log.message_formats)) if log.message_formats else "it has no messages"
+        if name not in topics:
+            known = nearest(name, topics | set(log.message_formats)) if log.message_formats else "it has no messages"
             raise LogError(f"{path}: no message {name!r} was logged; {known}")
     columns: Columns = {}
     for data in log.data_list:

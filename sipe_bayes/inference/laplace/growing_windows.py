@@ -178,5 +178,5 @@ def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuni
     covariance *= freedom / (freedom - 2)  # of Student's t
     half = 0.5 * (kept.mean(0) - optimum.theta)
     covariance = covariance + np.outer(half, half)
-    said = finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
-    return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=said)
+    scatter = finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
+    return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=scatter)

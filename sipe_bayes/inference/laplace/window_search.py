@@ -160,8 +160,8 @@ class WindowSearch:
             return replace(state, here=self._apart(0, state), optima=cut_short, aside=state.optima)
         if not touches(self.windows):
             return onward
-        said = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
-        return replace(onward, optima=tuple(replace(optimum, finding=said) for optimum in state.optima))
+        unknown = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
+        return replace(onward, optima=tuple(replace(optimum, finding=unknown) for optimum in state.optima))
 
     def _apart(self, number: int, state: WindowState) -> Position:
         """Where a group of windows is fitted from: the best optimum's theta, and the measured starts."""
