@@ -153,12 +153,12 @@ def parse_measurement_target(target: str) -> MeasurementTarget:
     """
     for kind, pattern in (("joint", _JOINT), ("body", _BODY), ("sensor", _SENSOR)):
         if match := pattern.fullmatch(target):
-            found: dict[str, Any] = match.groupdict()
-            index = found.get("index")
+            parts: dict[str, Any] = match.groupdict()
+            index = parts.get("index")
             return MeasurementTarget(
                 kind,  # type: ignore[arg-type]
-                found["name"],
-                found.get("quantity", "reading"),
+                parts["name"],
+                parts.get("quantity", "reading"),
                 None if index is None else int(index),
             )
     raise ValueError(

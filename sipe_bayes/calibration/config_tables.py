@@ -181,19 +181,19 @@ def _is_words(value: Any) -> bool:
 
 def _matched(logs: tuple[LogEntry, ...], info: ValidationInfo) -> tuple[LogEntry, ...]:
     """Each log whose file is a pattern as the files that match it."""
-    found: list[LogEntry] = []
+    entries: list[LogEntry] = []
     for i, log in enumerate(logs):
         files = matching(log.file, (info.context or {}).get("folder", Path()))
         if not files:
             raise problem(f"no file matches {log.file}; correct the pattern", i, "file")
         if files == [log.file]:
-            found.append(log)
+            entries.append(log)
             continue
         own = log.name != log.file.stem
         names = [f"{log.name}-{k}" for k in range(len(files))] if own else names_of(files)
         pairs = zip(files, names, strict=True)
-        found += [log.model_copy(update={"file": file, "name": name}) for file, name in pairs]
-    return tuple(found)
+        entries += [log.model_copy(update={"file": file, "name": name}) for file, name in pairs]
+    return tuple(entries)
 
 
 Logs = Annotated[tuple[LogEntry, ...], Field(min_length=1), BeforeValidator(_log_words), AfterValidator(_matched)]

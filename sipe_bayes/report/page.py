@@ -231,15 +231,21 @@ def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) ->
 
 
 def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
-    """Write ``figures/*.png`` and ``report.html``.
-
-    Everything is drawn and rendered before the first file is written, and the report comes last.
+    """Write ``figures/*.png`` and ``report.html``; everything is drawn and rendered before the first file is written.
 
     Returns:
         The report's path.
     """
     images = pictures(calibration)
-    page = render(calibration, images)
+    return write_page(render(calibration, images), images, folder)
+
+
+def write_page(page: str, images: Sequence[Picture], folder: str | os.PathLike[str]) -> Path:
+    """Write the pictures of a page, then the page as ``report.html``.
+
+    Returns:
+        The page's path.
+    """
     write_pictures(images, folder)
     path = Path(folder) / "report.html"
     write_bytes(path, page.encode())

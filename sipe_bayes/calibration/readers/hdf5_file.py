@@ -19,17 +19,17 @@ def read_hdf5(path: Path, wanted: Collection[str]) -> Columns:
     """The datasets that hold numbers; of a table with named fields each field is a column, ``log.angle``."""
     import h5py
 
-    found: dict[str, h5py.Dataset] = {}
+    datasets: dict[str, h5py.Dataset] = {}
 
     def note(name: str, item: object) -> None:
         if isinstance(item, h5py.Dataset) and is_column(item):
-            found[name] = item
+            datasets[name] = item
 
     columns: Columns = {}
     with h5py.File(path, "r") as file:
         file.visititems(note)  # each object once, and none through a link
-        check_size(path, sum(dataset.nbytes for dataset in found.values()))
-        for name, dataset in found.items():
+        check_size(path, sum(dataset.nbytes for dataset in datasets.values()))
+        for name, dataset in datasets.items():
             for field in dataset.dtype.names or ("",):
                 columns.update(spread(f"{name}.{field}" if field else name, dataset[field] if field else dataset[()]))
     return {name: values for name, values in columns.items() if values.dtype.kind in "biuf"}

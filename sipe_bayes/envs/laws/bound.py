@@ -129,16 +129,16 @@ class LawNumbers:
 
 def laws_of(model: mujoco.MjModel) -> tuple[BoundLaw, ...]:
     """The laws that a compiled model's numerics declare."""
-    found: list[BoundLaw] = []
+    bounds: list[BoundLaw] = []
     for index in range(model.nnumeric):
         label = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_NUMERIC, index) or ""
         head, _, name = label.rpartition(".")
         kind, _, owner = head.partition(":")
         if name in LAWS and LAWS[name].kind == kind:
             first = int(model.numeric_adr[index])
-            found.append(_bound(model, LAWS[name], owner, slice(first, first + int(model.numeric_size[index])), label))
-    peers = {law.name: tuple(bound.sensor for bound in found if bound.law is law) for law in LAWS.values()}
-    return tuple(replace(bound, peers=peers[bound.law.name]) for bound in found)
+            bounds.append(_bound(model, LAWS[name], owner, slice(first, first + int(model.numeric_size[index])), label))
+    peers = {law.name: tuple(bound.sensor for bound in bounds if bound.law is law) for law in LAWS.values()}
+    return tuple(replace(bound, peers=peers[bound.law.name]) for bound in bounds)
 
 
 def _bound(model: mujoco.MjModel, law: Law, owner: str, numbers: slice, label: str) -> BoundLaw:

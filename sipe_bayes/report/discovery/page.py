@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sipe_bayes.core.files import write_bytes
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors
 from sipe_bayes.report.discovery import plots
@@ -24,7 +23,7 @@ from sipe_bayes.report.discovery.words import (
     warnings,
 )
 from sipe_bayes.report.drawing import png
-from sipe_bayes.report.page import Picture, run_details, write_pictures
+from sipe_bayes.report.page import Picture, run_details, write_page
 from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.words import error_text, number, times, unit_text
 
@@ -123,8 +122,4 @@ def write_discovery_report(discovery: Discovery, folder: str | os.PathLike[str])
         The report's path.
     """
     images = discovery_pictures(discovery)
-    page = render_discovery(discovery, images)
-    write_pictures(images, folder)
-    path = Path(folder) / "report.html"
-    write_bytes(path, page.encode())
-    return path
+    return write_page(render_discovery(discovery, images), images, folder)
