@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt
 
-.PHONY: demo test bench studies wheel-check clean
+.PHONY: demo test bench studies docs wheel-check clean
 .DEFAULT_GOAL := test
 
 $(READY): pyproject.toml constraints.txt
@@ -36,9 +36,15 @@ studies: $(patsubst examples/studies/%.py,study-%,$(wildcard examples/studies/[a
 study-%: $(READY)
 	$(BIN)/python examples/studies/$*.py
 
+# the site, into docs/_build, with warnings as errors
+docs: $(READY)
+	$(BIN)/python docs/generate.py
+	$(PIP) -e '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build
+
 # sdist -> wheel, and what the wheel holds
 wheel-check: $(READY)
 	.ci/run wheel
 
 clean:
-	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv build dist docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -102,7 +102,7 @@ def discover(folder: Path) -> Discovery:
 
 
 def save_picture(found: Discovery) -> Path:
-    """The README's picture, from the report's figures: before and after, of the training log and of a held-out one."""
+    """The README's figure, from the report's figures: before and after, of the training log and of a held-out one."""
     figures = Path(found.out) / "figures"
     parts = [
         Image.open(figures / f"{name}.png") for name in ("residuals_before_after", "before_after_1_direct_collocation")

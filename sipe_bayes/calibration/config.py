@@ -50,11 +50,20 @@ class Config(Table):
     """
 
     model: Location
+    """the MJCF file"""
     estimator: EstimatorName = "laplace"
+    """the method, see [estimators](estimators.md)"""
     likelihood: Literal["segments", "state_space"] = "segments"
+    """`"segments"`: windows of the log; or `"state_space"`: the state is unknown at every sample and process
+    noise is inferred (`laplace` and `mcmc`; takes neither `window` nor a `noise.model` other than `"white"`)"""
     window: Window = None
+    """length in seconds of the windows that a log is cut into, each with a start of its own; `"log"` for whole
+    logs; to be given with `"segments"`"""
     seed: Annotated[int, Strict(), Field(ge=0)] = 0
+    """the same seed gives the same posterior"""
     budget: Annotated[int, Strict(), Field(gt=0)] | None = None
+    """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
+    afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
     search: Search = Search()
     resample: Resample = Resample()
     columns: Columns = Columns()

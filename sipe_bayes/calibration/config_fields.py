@@ -190,10 +190,13 @@ Window = Annotated[float | Literal["log"] | None, BeforeValidator(lambda v: None
 
 
 class Table(BaseModel):
-    """A TOML table: frozen, without unknown keys. ``also`` are keys that are turned into others."""
+    """A TOML table: frozen, without unknown keys. A key's description is the docstring below its field.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    also: ClassVar[tuple[str, ...]] = ()
+    ``also`` are keys that are turned into others, with their descriptions.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    also: ClassVar[dict[str, str]] = {}
 
     @model_validator(mode="before")
     @classmethod

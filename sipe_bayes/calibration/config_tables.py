@@ -34,31 +34,41 @@ class TimeColumn(Table):
     """The column that holds the clock."""
 
     column: Text = "time"
+    """column with the clock"""
     unit: TimeWord = "s"
+    """its unit; to be named where rows are a quarter of a second apart or more"""
 
 
 class Columns(Table):
-    """Columns that are neither command nor measurement. episode: numbers the logs that one file holds."""
+    """Columns that are neither command nor measurement."""
 
     time: TimeColumn = TimeColumn()
     episode: Text | None = None
+    """column that numbers the episodes of a file, each of which is then a log of its own"""
 
 
 class Resample(Table):
-    """The control grid. rate: Hz, default the log's own. max_gap: s, default five sample periods."""
+    """The control grid."""
 
     rate: Positive | None = None
+    """Hz of the control grid; default the log's own rate"""
     max_gap: Positive | None = None
+    """seconds; wider holes are masked; default five sample periods"""
 
 
 class Command(Table):
     """The column that drives one actuator; ``sign`` * ``factor`` * column in ``unit``."""
 
     actuator: Text
+    """name of the driven actuator in the MJCF; a `[[commands]]` for each"""
     column: Text
+    """the log's column that drives it; under position control the set-point"""
     unit: UnitWord
+    """unit of that column"""
     sign: Sign = 1
+    """1 or -1"""
     factor: Positive = 1.0
+    """what the column is multiplied by beside its unit"""
 
     @property
     def target(self) -> str:
@@ -69,21 +79,31 @@ class Command(Table):
 class Measurement(Table):
     """A column that measures a joint, body or sensor; ``sign`` * ``factor`` * column in ``unit``.
 
-    A vector has three ``columns``; an orientation four, those of a quaternion in the order that ``quaternion`` names,
-    and three channels, its rotation vector (rad). fit: False keeps it out of the likelihood, for starting windows and
-    plots only. noise_sd: in SI, if known.
+    A vector has three ``columns``; an orientation four, and three channels, its rotation vector (rad).
     """
 
     column: Text | None = None
+    """the log's column; a `[[measurements]]` for each measured quantity"""
     columns: tuple[Text, ...] = ()
+    """in place of `column`: three of a vector, four of a quaternion"""
     quaternion: Literal["wxyz", "xyzw"] | None = None
+    """`"wxyz"` or `"xyzw"`: their order; signs are aligned, residuals are rotation vectors (rad)"""
     target: TargetWord
+    """`"joint:NAME.position"`, `"joint:NAME.velocity"`, `"body:NAME.position"`, `.orientation`,
+    `.linear_velocity`, `.angular_velocity` (of a body's frame in the world's axes), `"sensor:NAME"` or
+    `"sensor:NAME[0]"`"""
     unit: UnitWord
+    """unit of that column; its kind is checked against the model"""
     sign: Sign = 1
+    """1 or -1"""
     factor: Positive = 1.0
+    """what the column is multiplied by beside its unit"""
     fit: Annotated[bool, Strict()] = True
+    """`false`: starts windows and is drawn, but is not fitted"""
     noise_sd: Positive | None = None
+    """standard deviation of the noise in SI, where known; default estimated"""
     name: Text = ""
+    """default the column's name"""
 
     @model_validator(mode="before")
     @classmethod
@@ -141,11 +161,18 @@ class LogEntry(Table):
     """
 
     file: Location
+    """a file or folder of one of the [formats](logs.md), or a pattern such as `"tosses/*.csv"` for all that
+    match; a `[[logs]]` for each log or part of one. `logs = "tosses/*.csv"` is short for one such table"""
     name: Text = ""
+    """default the file's name without suffix; logs of one table are numbered"""
     use: Use = "train"
+    """`"train"` or `"holdout"`"""
     episodes: Annotated[tuple[Annotated[int, Strict()], ...], Field(min_length=1)] | None = None
+    """numbers of those episodes that are meant; default all"""
     span: Pair | None = None
+    """`[start, stop]` in seconds from the first sample; default all"""
     window: Window = None
+    """overrides `window` for this log; with `"state_space"`, over what a held-out log is scored (default 0.5 s)"""
 
     @model_validator(mode="before")
     @classmethod
@@ -203,22 +230,32 @@ class NormalPrior(Table):
     """A normal prior truncated to the bounds, in their terms: SI, or factors of the model's value."""
 
     mean: Number
+    """normal prior truncated to the bounds: its mean, in SI, or beside `factor` in factors; default uniform on
+    the scale"""
     sd: Positive
+    """its standard deviation"""
 
 
 class ParameterEntry(Table):
     """One unknown. Give ``bounds`` (SI) or ``factor`` (times the model's own value)."""
 
-    also: ClassVar[tuple[str, ...]] = ("target",)
+    also: ClassVar[dict[str, str]] = {"target": "what it changes, see [targets](targets.md)"}
 
     name: Text
+    """of the unknown; a `[[parameters]]` for each"""
     targets: Annotated[tuple[Text, ...], Field(min_length=1)]
+    """several of them in place of `target`: all get its value, or with `factor` keep their proportions"""
     bounds: Pair | None = None
+    """`[low, high]` in SI"""
     factor: Pair | None = None
+    """`[low, high]` times the model's own value, in place of `bounds`"""
     scale: Literal["linear", "log"] = "linear"
+    """`"linear"` or `"log"`"""
     prior: NormalPrior | None = None
     per_log: Annotated[bool, Strict()] = False
+    """a value of its own in every training log, as for zero errors, and their mean in a held-out one"""
     description: str = ""
+    """free text"""
 
     @model_validator(mode="before")
     @classmethod
@@ -272,38 +309,43 @@ class Noise(Table):
     """The model of the residuals."""
 
     model: Literal["ar1", "white", "sandwich"] = "ar1"
+    """residuals: `"ar1"` (first-order autoregressive), `"white"`, or `"sandwich"`: plain least squares with the
+    width that autoregressive residuals imply (`laplace` only; for models that are wrong at low frequencies)"""
 
 
 class PriorSource(Table):
     """An earlier run's posterior (path without suffix) as the prior; in TOML the key is ``from``."""
 
     source: Location = Field(alias="from")
+    """path without suffix of an earlier run's posterior, the prior of the parameters that it knows by name"""
 
 
 class Search(Table):
-    """How widely the optimum is looked for.
-
-    restarts: starting points that are followed; candidates: draws from the prior among which they are chosen; start:
-    values by parameter, in their units, from which the search of ``laplace`` begins instead.
-    """
+    """How widely the optimum is looked for."""
 
     restarts: Annotated[int, Strict(), Field(gt=0)] = 2
+    """of `laplace` and `mcmc`: starting points that the search follows"""
     candidates: Annotated[int, Strict(), Field(ge=0)] = 8
+    """how many points are simulated to choose them from, besides the model as given. They are drawn from the
+    prior; from 40 on, the later ones around the best so far"""
     start: dict[str, Number] | None = None
+    """of `laplace`: values by parameter, in SI, from which the search begins instead, as `sipe discover` writes
+    them"""
 
 
 class Structure(Table):
-    """What ``sipe discover`` may put into the model.
-
-    only: names of extensions, default all; without: names that are left out; extra: extensions of the user's own beside
-    them; sites: joints, actuators and channels where they may be placed, default all; budget: rollouts of all fits.
-    """
+    """What ``sipe discover`` may put into the model."""
 
     only: tuple[ExtensionName, ...] | None = None
+    """of `sipe discover`: names of the [extensions](extensions.md) that it may try; default all"""
     without: tuple[ExtensionName, ...] = ()
+    """names that it leaves out"""
     extra: tuple[OwnExtension, ...] = ()
+    """extensions of your own beside them: `"path/to/file.py:Class"` or `"package.module:Class"`"""
     sites: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
+    """joints, actuators and channels where extensions may be placed; default all"""
     budget: Annotated[int, Strict(), Field(gt=0)] | None = None
+    """rollouts of all its fits; default 20,000"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

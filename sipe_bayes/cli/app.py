@@ -12,9 +12,11 @@ from sipe_bayes.cli import benchmark as benchmark_commands
 from sipe_bayes.cli import check as check_commands
 from sipe_bayes.cli import data as data_commands
 from sipe_bayes.cli import discover as discover_commands
+from sipe_bayes.cli import explain as explain_commands
 from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
+from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.errors import check_least, exit_on_error
 from sipe_bayes.cli.progress import Progress
 from sipe_bayes.inference.registry import ESTIMATORS
@@ -39,6 +41,8 @@ app.command()(benchmark_commands.simulate)
 app.command()(check_commands.check)
 app.command()(suggest_commands.suggest)
 app.command()(discover_commands.discover)
+app.command()(video_commands.video)
+app.command()(explain_commands.explain)
 app.command()(rl_commands.train)
 app.command()(rl_commands.agents)
 

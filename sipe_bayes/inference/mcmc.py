@@ -144,7 +144,7 @@ class MCMCState:
 
 
 class MCMC(Estimator[MCMCState]):
-    """Particles of an emcee ensemble; see the module's docstring.
+    """emcee over the likelihood of `laplace`, all walkers in one batch; in minutes. Particles.
 
     Args:
         walkers: chains of the ensemble; default twice the dimensions plus two, at least 24.

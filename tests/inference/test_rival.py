@@ -2,8 +2,8 @@
 
 Ours returns a usable posterior and says what happened. Where mujoco.sysid can be imported, what it does in the same
 place is checked too: it returns the start, or dies. (That its answer depends on the start is a printed figure:
-`bench.py rival`.) Should a test of its behaviour fail, the rival has improved, and what the README says of it must
-change.
+`bench.py rival`.) Should a test of its behaviour fail, the rival has improved, and what README and
+docs/results/measured.md say of it must change.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli.app import app
-from sipe_bayes.datasets.demonstrations import AGENT_FILES
 from sipe_bayes.models.policy import load_policy
 from sipe_bayes.rl.evaluation import check_agents, evaluate, install, references, write_card
 from sipe_bayes.rl.train import CurvePoint, choose
@@ -99,21 +98,3 @@ def test_commands_train_write_cards_and_check_them(tmp_path: Path) -> None:
     checked = runner.invoke(app, ["agents", str(out), "--episodes", "3"])
     assert checked.exit_code == 1
     assert "BEYOND" in checked.output
-
-
-def test_the_readmes_table_is_that_of_the_cards() -> None:
-    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    cards = sorted(AGENT_FILES.glob("*-expert.json"))
-    assert len(cards) == 7
-    for path in cards:
-        task = path.stem.removesuffix("-expert")
-        row = [line for line in text.splitlines() if line.startswith(f"| `{task}` |")][-1]
-        for file, kind in (
-            (path, "evaluation"),
-            (path.with_name(path.name.replace("expert", "suboptimal")), "evaluation"),
-            (path, "idle"),
-            (path, "random"),
-        ):
-            found = json.loads(file.read_text(encoding="utf-8"))[kind]
-            rate = "" if found["success_rate"] is None else f" ({found['success_rate']:.2f})"
-            assert f"| {found['mean']:,.0f} ± {found['standard_error']:.0f}{rate} |" in row

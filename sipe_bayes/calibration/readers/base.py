@@ -58,11 +58,13 @@ class Format:
 
     Args:
         read: its reader.
+        columns: what its columns are called, for the reference.
         extra: the extra of this package that brings the library it needs; none where the package itself does.
         remedy: what to do about a file that is broken.
     """
 
     read: LogReader
+    columns: str
     extra: str = ""
     remedy: str = "write it anew"
 

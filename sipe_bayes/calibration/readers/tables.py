@@ -17,20 +17,31 @@ from sipe_bayes.calibration.readers.parquet_table import read_parquet
 from sipe_bayes.calibration.readers.ros_bag import read_bag
 from sipe_bayes.calibration.readers.ulog import read_ulog
 
-_BAG = Format(read_bag, "ros", "mend it with `mcap recover` or `ros2 bag reindex`, or record it again")
+_HDF5 = Format(read_hdf5, "the path of the dataset: `robot/arm/state[0]`")
+_BAG = Format(
+    read_bag,
+    "ROS 2 bag: `/joint_states.position[elbow]`, `/effort.data[0]`, `/imu.angular_velocity.z`",
+    "ros",
+    "mend it with `mcap recover` or `ros2 bag reindex`, or record it again",
+)
 
 READERS: dict[str, Format] = {
-    ".csv": Format(read_csv),
-    ".parquet": Format(read_parquet),
-    ".npz": Format(read_npz),
-    ".h5": Format(read_hdf5),
-    ".hdf5": Format(read_hdf5),
-    ".mat": Format(read_matlab),
-    INFO: Format(read_lerobot),
+    ".csv": Format(read_csv, "as the first line says"),
+    ".parquet": Format(read_parquet, "as there; entries of lists `state[0]`"),
+    ".npz": Format(read_npz, "as its array; of two dimensions, where rows are samples, `states[0]` and so on"),
+    ".h5": _HDF5,
+    ".hdf5": _HDF5,
+    ".mat": Format(
+        read_matlab,
+        "`q[0]`, in a struct `log.q`, in a cell or an array of structs `runs[0].q`; versions 5 to 7.3, no objects",
+    ),
+    INFO: Format(
+        read_lerobot, "LeRobot, v2 and v3: `observation.state[shoulder]`; time `timestamp`, episodes `episode_index`"
+    ),
     ".mcap": _BAG,
     ".db3": _BAG,
     "metadata.yaml": _BAG,
-    ".ulg": Format(read_ulog, "px4"),
+    ".ulg": Format(read_ulog, "PX4: `vehicle_angular_velocity.xyz[0]`; of a second instance `sensor_gyro[1].x`", "px4"),
 }
 """The one list of formats: by the suffix of a file, or by the file that tells what a folder is."""
 

@@ -61,7 +61,7 @@ class Bank:
 
 
 class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
-    """Particles of equal weight; see the module's docstring."""
+    """Rejection on the statistics (sbi); amortised. Particles of equal weight."""
 
     name: ClassVar[str] = "abc"
     options_type: ClassVar[type[Options]] = ABCOptions

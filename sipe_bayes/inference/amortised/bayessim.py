@@ -69,7 +69,7 @@ class BayesSimOptions(RoundsOptions):
 
 
 class BayesSim(Rounds[TrainedNetwork]):
-    """A GaussianMixture; see the module's docstring."""
+    """Mixture density network on statistics of the log; amortised, or in rounds. A GaussianMixture."""
 
     name: ClassVar[str] = "bayessim"
     options_type: ClassVar[type[Options]] = BayesSimOptions

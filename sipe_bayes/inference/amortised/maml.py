@@ -110,7 +110,7 @@ class MAMLState(PriorSamplingState[TrainedNetwork]):
 
 
 class MAML(PriorSampling[MAMLState, TrainedNetwork]):
-    """A Dirac; see the module's docstring."""
+    """Second-order meta-learning, gradient steps on simulations near the estimate. A Dirac."""
 
     name: ClassVar[str] = "maml"
     amortised: ClassVar[bool] = False  # it simulates for every log

@@ -107,7 +107,7 @@ class TrainedFlow:
 
 
 class NPE(Rounds[TrainedFlow]):
-    """A Flow; see the module's docstring."""
+    """Normalising flow (sbi) behind an embedding of logs of any length; amortised, or in rounds. A Flow."""
 
     name: ClassVar[str] = "npe"
     options_type: ClassVar[type[Options]] = NPEOptions

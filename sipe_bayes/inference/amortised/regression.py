@@ -52,7 +52,7 @@ class RegressionOptions(PriorSamplingOptions):
 
 
 class Regression(PriorSampling[PriorSamplingState[TrainedNetwork], TrainedNetwork]):
-    """A Dirac; see the module's docstring."""
+    """Linear in single control steps, by stochastic gradient; amortised. A Dirac."""
 
     name: ClassVar[str] = "regression"
     options_type: ClassVar[type[Options]] = RegressionOptions

@@ -48,7 +48,7 @@ class LaplaceState:
 
 
 class Laplace(Estimator[LaplaceState]):
-    """Mixture of truncated normals at the optima of the likelihood; see the package's docstring.
+    """Box-constrained least squares, noise by restricted likelihood; in seconds. A GaussianMixture of the optima.
 
     Args:
         restarts: starting points followed, at most.

@@ -77,7 +77,7 @@ class ADRState(PoolState):
 
 
 class ADR(RewardSearch[ADRState]):
-    """Particles of equal weights where they stand; ``state.paths`` is where they went."""
+    """Stein variational policy gradient of a few particles. Particles of equal weight; `state.paths`: their way."""
 
     name: ClassVar[str] = "adr"
     options_type = ADROptions

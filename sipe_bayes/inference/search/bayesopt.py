@@ -131,7 +131,7 @@ class BayesOptState:
 
 
 class BayesOpt(Estimator[BayesOptState]):
-    """``SurrogatePosterior`` of a Gaussian process over the log discrepancy; see the module's docstring."""
+    """Gaussian process (BoTorch) over the log discrepancy. A SurrogatePosterior."""
 
     name: ClassVar[str] = "bayesopt"
     options_type = BayesOptOptions

@@ -66,7 +66,7 @@ class CEMState(PoolState):
 
 
 class CEM(Search[CEMState]):
-    """The last elites as Particles of equal weights, the best of them as mode."""
+    """Cross-entropy search, the baseline. The last elites as Particles of equal weight, the best one as mode."""
 
     name: ClassVar[str] = "cem"
     options_type = CEMOptions

@@ -95,7 +95,7 @@ class SimOptState(PoolState):
 
 
 class SimOpt(RewardSearch[SimOptState]):
-    """The last iteration's weighted draws as Particles; ``proposal`` is the Gaussian that they fit."""
+    """Relative entropy policy search. Its last draws, weighted, as Particles; `proposal` is their Gaussian."""
 
     name: ClassVar[str] = "simopt"
     begins_with_prior: ClassVar[bool] = False

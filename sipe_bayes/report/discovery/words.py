@@ -159,7 +159,9 @@ def next_steps(discovery: Discovery) -> str:
         return f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
     if discovery.passes:
         return "nothing to put in; go on with the configuration as it is"
-    return "record other motions and search again, or write an extension of your own: structure.extra in the README"
+    return (
+        "record other motions and search again, or write an extension of your own: structure.extra in the configuration"
+    )
 
 
 def residual_lines(discovery: Discovery) -> list[str]:

@@ -1,0 +1,107 @@
+"""What every target is, in words: the one place where they stand.
+
+``TARGET_TEXTS`` has the kinds and attributes of ``targets.ATTRIBUTES`` and of ``sensing.NEUTRAL``.
+"""
+
+from __future__ import annotations
+
+_CONTACT = {
+    "solref_timeconst": "s; of the contact's spring and damper: the shorter the harder, from two physics steps on",
+    "solref_dampratio": "of the same; below 1 a fall comes back as a bounce, the less the higher",
+    "solimp_dmin": "share of the force at first touch",
+    "solimp_dmax": "share of it at depth",
+    "solimp_width": "m; the depth",
+    "solimp_midpoint": "of the way between both",
+    "solimp_power": "how sharp it is",
+    "margin": "m; from how far contacts push",
+}
+_FRICTION = {"friction_torsional": "m", "friction_rolling": "m"}
+
+TARGET_TEXTS: dict[str, dict[str, str]] = {
+    "body": {
+        "mass": "kg; the inertia scales with it",
+        "com_x": "m, x of the centre of mass in the body's frame",
+        "com_y": "m, y of the centre of mass in the body's frame",
+        "com_z": "m, z of the centre of mass in the body's frame",
+        "inertia_xx": "kg m^2, about the centre of mass in the body's axes",
+        "inertia_xy": "kg m^2, about the centre of mass in the body's axes",
+        "inertia_xz": "kg m^2, about the centre of mass in the body's axes",
+        "inertia_yy": "kg m^2, about the centre of mass in the body's axes",
+        "inertia_yz": "kg m^2, about the centre of mass in the body's axes",
+        "inertia_zz": "kg m^2, about the centre of mass in the body's axes",
+    },
+    "joint": {
+        "damping": "viscous friction, N m s/rad or N s/m",
+        "frictionloss": "dry friction, N m or N",
+        "armature": "inertia of rotor and gears, kg m^2 or kg",
+        "stiffness": "spring, N m/rad or N/m",
+        "springref": "where the spring rests, rad or m",
+        "damping_quadratic": "drag per squared velocity, N m/(rad/s)^2 or N/(m/s)^2",
+        "damping_cubic": "drag per cubed velocity, N m/(rad/s)^3 or N/(m/s)^3",
+        "stiffness_quadratic": "of the spring, per squared position, N m/rad^2 or N/m^2",
+        "stiffness_cubic": "of the spring, per cubed position, N m/rad^3 or N/m^3",
+        "compliance": "twist per force of a joint that an extension brings, rad/(N m) or m/N; 0 is rigid",
+        "compliance_loss": "s; its damping over its stiffness",
+        "compliance_inertia": "its own inertia, kg m^2 or kg",
+        "play": "width of the gap in which it moves freely, rad or m",
+        "load_friction": "dry friction for each unit of the torque that the joint passes on; a law (below)",
+        "direction_friction": "half the difference of dry friction forwards and backwards, N m or N; a law",
+        "direction_damping": "half the difference of viscous friction forwards and backwards; a law",
+        "stribeck_friction": "dry friction at rest above that at speed, N m or N; a law",
+        "stribeck_velocity": "speed at which it has mostly gone, rad/s or m/s",
+        "presliding_friction": "dry friction that is built up over a distance, N m or N; a law",
+        "presliding_range": "that distance, rad or m",
+        "hysteresis_force": "largest force of elasto-plastic springs in parallel, N m or N; a law",
+        "hysteresis_range": "distance at which the second of three gives way, rad or m",
+        "cogging_sin": "torque with the sine of poles times the position, N m or N; a law",
+        "cogging_cos": "with the cosine of it, N m or N",
+        "cogging_poles": "periods in 2 pi of the position",
+        "residual_position": "length over which the residual force changes, rad or m; a law",
+        "residual_velocity": "the same, rad/s or m/s",
+        "residual_command": "the same, in the command's unit",
+        **dict.fromkeys((f"residual_{k}" for k in range(12)), "weights of the residual force, N m or N"),
+    },
+    "actuator": {
+        "gear": "transmission ratio",
+        "gain": "force for each unit of command",
+        "kp": "position gain of a position actuator: gain and bias_position together",
+        "kv": "velocity gain, minus bias_velocity",
+        "bias_force": "constant force",
+        "bias_position": "force for each unit of position",
+        "bias_velocity": "force for each unit of velocity, as back-EMF",
+        "offset": "added to the command, in its unit; not a physical property",
+        "delay": "s; the command arrives later, interpolated between physics steps",
+        "force_limit": "largest force either way",
+        "command_limit": "largest command either way",
+        "lag": 's; time constant of an actuator with `dyntype="filterexact"`',
+        "force_drop": "share of the force that is lost for each unit of it; a law",
+        "supply_sag": "share of the force that is lost for each unit of the forces of all actuators; a law",
+    },
+    "geom": {
+        "friction": "sliding friction; MuJoCo takes the larger one of two touching geoms",
+        **_FRICTION,
+        **_CONTACT,
+    },
+    "pair": {
+        "friction": "sliding friction of a pair of geoms that the MJCF lists, by its name or as GEOM/GEOM",
+        **_FRICTION,
+        **_CONTACT,
+    },
+    "option": {
+        "gravity_x": "m/s^2",
+        "gravity_y": "m/s^2",
+        "gravity_z": "m/s^2",
+        "wind_x": "m/s",
+        "wind_y": "m/s",
+        "wind_z": "m/s",
+        "density": "of the medium, kg/m^3",
+        "viscosity": "of the medium, Pa s",
+        "impratio": "friction's impedance over the normal force's: the more the less it creeps",
+    },
+    "sensor": {
+        "bias": "constant error of a measurement, of a sensor or of the measurement called NAME, in its unit",
+        "scale": "factor of a measurement",
+        "delay": "s; the measurement is as old",
+        "filter": "s; time constant of a first-order low-pass filter before the measurement",
+    },
+}

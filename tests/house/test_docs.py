@@ -1,0 +1,213 @@
+"""README and docs are true: generated pages are up to date, code runs, commands, keys, links and anchors are there."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from urllib.parse import unquote
+
+import pytest
+import typer.main
+
+from sipe_bayes.calibration.config import Config
+from sipe_bayes.cli.app import app
+from sipe_bayes.core.finding_texts import Code
+from sipe_bayes.envs.sensing import NEUTRAL
+from sipe_bayes.envs.target_texts import TARGET_TEXTS
+from sipe_bayes.envs.targets import ATTRIBUTES
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", flags=re.DOTALL)
+KINDS = {"python", "toml", "bash"}
+
+
+def blocks(page: Path, kind: str) -> list[tuple[str, str]]:
+    """(comment above, code) of the page's blocks of a kind; a comment ``not run: REASON`` takes a block out."""
+    found = [
+        (m["mark"] or "", m["text"]) for m in BLOCK.finditer(page.read_text(encoding="utf-8")) if m["kind"] == kind
+    ]
+    return [(mark, text) for mark, text in found if not re.match(r"not run: \w", mark)]
+
+
+def generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+# What is written from its source
+
+
+def test_generated_pages_are_up_to_date(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["generate.py", "--check"])
+    assert not generator().main(), f"{capsys.readouterr().out}; run python docs/generate.py"
+
+
+def test_every_target_has_its_words() -> None:
+    wanted = {kind: set(attributes) for kind, attributes in {**ATTRIBUTES, "sensor": NEUTRAL}.items()}
+    assert {kind: set(texts) for kind, texts in TARGET_TEXTS.items()} == wanted, "sipe_bayes/envs/target_texts.py"
+
+
+def test_every_key_is_described() -> None:
+    rows = generator().keys(Config, "")
+    assert len(rows) > 40
+    assert not [key for key, text, _ in rows if not text], "write a docstring below the field"
+
+
+def test_every_finding_has_its_anchor() -> None:
+    assert {str(code) for code in Code} <= anchors(ROOT / "docs" / "reference" / "findings.md")
+
+
+# The README
+
+
+def test_readme_is_short() -> None:
+    lines = README.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    assert not [line for line in lines if len(line) > 120]
+
+
+def test_pictures_are_small() -> None:
+    folder = ROOT / "examples" / "simple_pendulum"
+    assert (folder / "figure.png").stat().st_size < 150_000
+    assert (folder / "clip.webp").stat().st_size < 2_000_000
+
+
+# Code
+
+
+def test_blocks_are_of_kinds_that_are_tested() -> None:
+    for page in PAGES:
+        kinds = {m["kind"] for m in BLOCK.finditer(page.read_text(encoding="utf-8"))}
+        assert kinds <= KINDS, page
+
+
+RUN = """\
+import json, os, sys, mujoco, scipy.stats, torch  # once: they are most of what each would import
+
+for folder, name, text in json.load(sys.stdin):
+    child = os.fork()
+    if not child:
+        print("##", name, flush=True)
+        os.chdir(folder)
+        exec(text, {"__name__": "__main__"})
+        sys.stdout.flush()
+        raise SystemExit
+    assert not os.waitpid(child, 0)[1], name
+"""
+
+
+def test_python_runs(tmp_path: Path) -> None:
+    """Each block in a process of its own, those of a page one after the other in a folder, which has its files."""
+    work = []
+    for k, page in enumerate(PAGES):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        (folder / "examples").symlink_to(ROOT / "examples")
+        for mark, text in blocks(page, "toml"):
+            if mark.startswith("file: "):
+                (folder / mark.removeprefix("file: ")).write_text(text, encoding="utf-8")
+        work += [(str(folder), str(page.relative_to(ROOT)), text) for _, text in blocks(page, "python")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2", "MPLBACKEND": "Agg"}
+    command = [sys.executable, "-c", RUN]
+    done = subprocess.run(
+        command, input=json.dumps(work), capture_output=True, text=True, check=False, env=environment, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    output = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", done.stdout, flags=re.DOTALL | re.MULTILINE))
+    values = re.findall(r"^([\w\[\]]+): ([-.\d]+) ±", output["README.md"], flags=re.MULTILINE)
+    assert [name for name, _ in values] == ["weight_mass", "armature", "damping", "coulomb", "torque_offset[ddp]"]
+    assert float(values[0][1]) == pytest.approx(0.70, abs=0.03)
+    robot = output["docs/tutorials/your-robot.md"]
+    low, high = re.findall(r"mass: ([.\d]+) to ([.\d]+) kg", robot)[0]
+    assert float(low) == pytest.approx(0.62, abs=0.01)  # the truth of the page's own log
+    assert float(high) == pytest.approx(0.62, abs=0.01)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_configurations_are_legal(page: Path) -> None:
+    """Whole ones, and parts by their keys."""
+    known = {key for key, *_ in generator().keys(Config, "")}
+    for mark, text in blocks(page, "toml"):
+        table = tomllib.loads(text)
+        if mark != "part of a configuration":
+            Config.model_validate(table)
+        assert not set(keys_of(table)) - known, mark
+
+
+def keys_of(table: dict[str, Any], prefix: str = "") -> list[str]:
+    found = []
+    for key, value in table.items():
+        inner = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
+        for one in inner:
+            found += keys_of(one, f"{prefix}{key}.") if isinstance(one, dict) else [f"{prefix}{key}"]
+    return found
+
+
+def test_the_least_configuration_is_one() -> None:
+    ((_, text),) = blocks(README, "toml")
+    table = tomllib.loads(text)
+    assert [log.use for log in Config.model_validate(table).logs] == ["train", "holdout"]
+    for left_out in ("model", "window", "measurements", "logs", "parameters"):
+        with pytest.raises(ValueError, match=r"(?i)missing|required|at least"):
+            Config.model_validate({k: v for k, v in table.items() if k != left_out})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_are_there(page: Path) -> None:
+    """Every ``sipe ...`` in a block of code or between backticks, with its options."""
+    text = page.read_text(encoding="utf-8")
+    lines = [line for _, block in blocks(page, "bash") for line in block.splitlines()]
+    lines += re.findall(r"^    (?:\.venv/bin/)?(sipe [^\n]*)", text, flags=re.MULTILINE)
+    lines += re.findall(r"`(sipe [^`]+)`", text)
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        if words[:1] == ["sipe"]:
+            check_command([word for word in words[1:] if word not in ("...", "[OPTIONS]")], line)
+
+
+def check_command(words: list[str], line: str) -> None:
+    command: Any = typer.main.get_command(app)
+    while words and hasattr(command, "commands") and not words[0].startswith("-"):
+        assert words[0] in command.commands, line
+        command, words = command.commands[words[0]], words[1:]
+    options = {"--help"} | {o for p in command.params for o in (*p.opts, *p.secondary_opts)}
+    assert not [w for w in words if w.startswith("--") and w.partition("=")[0] not in options], line
+
+
+# Links
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as GitHub and the site make them."""
+    headings = re.findall(r"^#+ (.+)$", BLOCK.sub("", page.read_text(encoding="utf-8")), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page: Path) -> None:
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    definitions = dict(re.findall(r"^\[([^\]]+)\]: (\S+)$", text, flags=re.MULTILINE))
+    assert not [word for word in re.findall(r"\]\[([^\]]+)\]", text) if word not in definitions]
+    for target in (*re.findall(r"\]\(([^)]+)\)", text), *definitions.values()):
+        if re.match(r"https?://", target):
+            continue
+        file, _, anchor = unquote(target).partition("#")
+        path = (page.parent / file).resolve() if file else page
+        assert path.exists(), target
+        assert path.is_relative_to(ROOT), target
+        assert not anchor or anchor in anchors(path), target
