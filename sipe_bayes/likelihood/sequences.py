@@ -8,6 +8,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
+_SAME_RATE = 1e-3  # relative: logs of one machine whose clocks differ by less have gaps of one length
+
 
 @dataclass(frozen=True)
 class Sequence:
@@ -40,7 +42,7 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
         dt: (W,), seconds per sample.
     """
     _, length, channels = observed.shape
-    by_channel = []
+    by_channel, dt = [], _rates(dt)
     for c in range(channels):
         index = np.flatnonzero(observed[:, :, c].ravel())
         window, number = index // length, sample.ravel()[index]
@@ -54,3 +56,12 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
         crosses = linked & (window != np.concatenate([[-1], window[:-1]])[: len(index)])
         by_channel.append(Sequence(index, previous, window, crosses, gap, gaps))
     return by_channel
+
+
+def _rates(dt: FloatArray) -> FloatArray:
+    """Seconds per sample (W,), those alike as the shortest of them: each length of a gap costs products of its own."""
+    alike = dt.copy()
+    while (left := alike > 0).any():
+        shortest = alike[left].min()
+        alike[left & (alike <= shortest * (1 + _SAME_RATE))] = -shortest
+    return -alike
