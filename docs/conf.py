@@ -8,7 +8,9 @@ import sipe_bayes
 
 project = "sipe_bayes"
 release = version = sipe_bayes.__version__
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
 exclude_patterns = ["_build"]
 html_theme = "sphinx_book_theme"
 html_title = f"sipe_bayes {release}"

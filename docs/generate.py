@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, fields
@@ -23,6 +24,7 @@ from sipe_bayes.calibration.config_fields import Table
 from sipe_bayes.calibration.config_tables import NormalPrior
 from sipe_bayes.calibration.readers.tables import READERS
 from sipe_bayes.cli.app import app
+from sipe_bayes.core.finding_advice import ADVICE, plain
 from sipe_bayes.core.finding_texts import Code
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.thresholds import Thresholds
@@ -231,11 +233,11 @@ What is done with them: [logs](../logs.md).
 
 
 def findings() -> str:
-    """Every code of a finding, from ``core.finding_texts``."""
+    """Every code of a finding, from ``core.finding_texts`` and ``core.finding_advice``."""
     parts = []
     for one in Code:
         text = one.value
-        parts.append(f"## {one}\n\n*{text.severity}*. {text.template}\n")
+        parts.append(f"## {one}\n\n*{text.severity}*. {plain(one)}\n\n{ADVICE[one]}\n")
     return f"""# Findings
 
 What a fit, a check or a log reader may notice, by its code: `findings` of `result.json`. A note is worth knowing; of a
@@ -288,7 +290,17 @@ def python() -> str:
 
 `import sipe_bayes as sipe`; `help(sipe.NAME)` says shapes and units.
 
-{table(("name", "what it is"), rows)}"""
+{table(("name", "what it is"), rows)}
+{chr(10).join(entry(name) for name in names)}"""
+
+
+def entry(name: str) -> str:
+    """A public name in full, as the site shows it from its docstring."""
+    thing = getattr(sipe_bayes, name)
+    kind = "module" if inspect.ismodule(thing) else "class" if inspect.isclass(thing) else "function"
+    members = "   :members:\n" if kind == "class" else ""
+    where = f"{thing.__name__}" if kind == "module" else f"sipe_bayes.{name}"
+    return f"## {name}\n\n```{{eval-rst}}\n.. auto{kind}:: {where}\n{members}```\n"
 
 
 PAGES = {
@@ -300,16 +312,45 @@ PAGES = {
 }
 
 
+def llms() -> str:
+    """llms.txt: what the library is, and its pages in a line each."""
+    pages = sorted(
+        path for path in FOLDER.parent.rglob("*.md") if path.name != "index.md" and "_build" not in path.parts
+    )
+    lines = []
+    for path in pages:
+        text = path.read_text(encoding="utf-8").replace(NOTE, "")
+        title, _, rest = text.strip().partition("\n")
+        first = " ".join(rest.strip().split("\n\n")[0].split())
+        about = first.split(". ")[0].rstrip(".:") if first[:1].isalpha() else ""
+        about = re.sub(r"\[([^\]]+)\]\([^)]+\)", r"\1", about)
+        lines.append(f"- [{title.lstrip('# ')}]({path.relative_to(FOLDER.parents[1])}){f': {about}' if about else ''}")
+    return f"""# sipe_bayes
+
+> Give it a robot simulator (MuJoCo) and a log of the real machine; it gives back a probability distribution over the
+> simulator's parameters, says how far you may trust it, and finds the physics that the simulator lacks.
+
+`pip install -e .`, then `sipe calibrate CONFIG.toml`; in Python `import sipe_bayes as sipe`. Begin with README.md and
+docs/tutorials/your-robot.md. Values are in SI; theta is normalised to [0, 1]. A value is to be trusted only where no
+finding blocks.
+
+## Pages
+
+{chr(10).join(lines)}
+"""
+
+
 def main() -> int:
     """Writes the pages, or compares them."""
     stale = []
-    for name, page in PAGES.items():
-        path, text = FOLDER / f"{name}.md", f"{NOTE}\n{page()}"
+    wanted = [(FOLDER / f"{name}.md", lambda page=page: f"{NOTE}\n{page()}") for name, page in PAGES.items()]
+    for path, make in (*wanted, (FOLDER.parents[1] / "llms.txt", llms)):
+        text = make()
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             stale.append(path.name)
             if "--check" not in sys.argv:
                 path.write_text(text, encoding="utf-8")
-    print(f"docs/reference: {', '.join(stale) or 'nothing'} {'is out of date' if '--check' in sys.argv else 'written'}")
+    print(f"docs: {', '.join(stale) or 'nothing'} {'is out of date' if '--check' in sys.argv else 'written'}")
     return int("--check" in sys.argv and bool(stale))
 
 

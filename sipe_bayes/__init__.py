@@ -9,6 +9,8 @@ import sys
 from functools import cache
 from typing import TYPE_CHECKING
 
+from sipe_bayes.core import __version__ as __version__
+
 if TYPE_CHECKING:
     from sipe_bayes.calibration.config import load_config as load_config
     from sipe_bayes.calibration.discover import discover as discover
@@ -42,8 +44,6 @@ if TYPE_CHECKING:
     from sipe_bayes.simulation.gym import make as make
     from sipe_bayes.simulation.gym import make_vec as make_vec
     from sipe_bayes.simulation.simulator import Simulator as Simulator
-
-__version__ = "0.1.0"
 
 if not TYPE_CHECKING:
 

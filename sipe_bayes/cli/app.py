@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +19,9 @@ from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.errors import check_least, exit_on_error
+from sipe_bayes.cli.examples import give_examples
 from sipe_bayes.cli.progress import Progress
+from sipe_bayes.core import __version__
 from sipe_bayes.inference.registry import ESTIMATORS
 
 if TYPE_CHECKING:
@@ -31,21 +34,8 @@ app = typer.Typer(
     name="sipe",
     help="Calibrate robot simulators with honest uncertainty.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(data_commands.app)
-app.add_typer(benchmark_commands.app)
-app.add_typer(transfer_commands.app)
-app.command()(benchmark_commands.simulate)
-app.command()(check_commands.check)
-app.command()(suggest_commands.suggest)
-app.command()(discover_commands.discover)
-app.command()(video_commands.video)
-app.command()(explain_commands.explain)
-app.command()(rl_commands.train)
-app.command()(rl_commands.agents)
-
 # what the parser says of options and arguments, whose name typer keeps private
 _REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
@@ -68,12 +58,21 @@ def main() -> None:
     sys.exit(code or 0)
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        print(f"sipe_bayes {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
-def _root() -> None:
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     """Calibrate robot simulators with honest uncertainty."""
 
 
-@app.command()
 def calibrate(
     config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
     estimator: Annotated[
@@ -109,7 +108,6 @@ def calibrate(
         discover_commands.print_discovery(discovery)
 
 
-@app.command()
 def envs(
     name: Annotated[str | None, typer.Argument(help="A task; without it all are listed.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
@@ -191,7 +189,7 @@ def print_calibration(calibration: Calibration) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from sipe_bayes.core.findings import Findings
+    from sipe_bayes.core.findings import Findings, Severity
     from sipe_bayes.report.verdicts import parameter_verdict, verdicts
     from sipe_bayes.report.words import significant
 
@@ -225,10 +223,28 @@ def print_calibration(calibration: Calibration) -> None:
             )
     lines += [f"left out: {sentence}" for sentence in calibration.left_out]
     lines += [f"warning: {warning}" for warning in calibration.warnings]
+    codes = dict.fromkeys(str(item.code) for item in calibration.findings if item.severity is not Severity.NOTE)
+    lines += [f"what these mean and what to do: sipe explain {' '.join(codes)}"] * bool(codes)
     lines.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s")
     lines += [f"report: {Path(calibration.out) / 'report.html'}"] * bool(calibration.out)
     for line in lines:
         console.print(line, highlight=False, markup=False)
+
+
+_PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which a newcomer needs them
+    "Your machine": (
+        *(calibrate, discover_commands.discover, check_commands.check, suggest_commands.suggest),
+        *(video_commands.video, explain_commands.explain),
+    ),
+    "Environments and policies": (envs, rl_commands.train, rl_commands.agents),
+    "Studies": (benchmark_commands.simulate,),
+}
+for _panel, _commands in _PANELS.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_panel)(_command)
+for _group in (data_commands.app, transfer_commands.app, benchmark_commands.app):
+    app.add_typer(_group, rich_help_panel="Studies")
+give_examples(app)
 
 
 if __name__ == "__main__":

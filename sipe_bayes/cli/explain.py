@@ -9,18 +9,22 @@ import typer
 from sipe_bayes.cli.errors import exit_on_error
 
 
-def explain(code: Annotated[str, typer.Argument(help="Of a finding, such as not_mixed; `all` lists them.")]) -> None:
-    """What a finding of a report or of result.json means."""
+def explain(
+    codes: Annotated[list[str] | None, typer.Argument(help="Of findings, such as not_mixed; none lists all.")] = None,
+) -> None:
+    """What a finding of a report or of result.json means, and what to do."""
+    from sipe_bayes.core.finding_advice import ADVICE, plain
     from sipe_bayes.core.finding_texts import Code
     from sipe_bayes.core.validation import nearest_name
 
-    words = {str(one): one.value for one in Code}
-    name = code.lower()
-    if code == "all":
-        for known, text in words.items():
-            print(f"{known} ({text.severity})")
-        return
+    known = {str(one): one for one in Code}
     with exit_on_error():
-        if name not in words:
-            raise ValueError(f"no finding {code!r}{nearest_name(name, words) or '; `sipe explain all` lists them'}")
-    print(f"{name} ({words[name].severity})\n{words[name].template}")
+        for name in codes or ():
+            if name.lower() not in known:
+                hint = nearest_name(name, known) or "; `sipe explain` lists them"
+                raise ValueError(f"CODES: expected the code of a finding, got {name!r}{hint}")
+    if not codes:
+        print("\n".join(f"{name} ({one.value.severity})" for name, one in known.items()))
+    for name in codes or ():
+        found = known[name.lower()]
+        print(f"{found} ({found.value.severity})\n  {plain(found)}\n  {ADVICE[found]}")

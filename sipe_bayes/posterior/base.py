@@ -221,7 +221,7 @@ class Posterior(TorchDistribution):
             generator: of random numbers, default torch's global one.
 
         Returns:
-            theta (*sample_shape, *batch_shape, N).
+            theta ``(*sample_shape, *batch_shape, N)``.
         """
         try:
             shape = torch.Size(whole("sample_shape", size, 0) for size in sample_shape) + self.batch_shape

@@ -20,6 +20,8 @@ import typer.main
 
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.cli.app import app
+from sipe_bayes.cli.examples import EXAMPLES
+from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.finding_texts import Code
 from sipe_bayes.envs.sensing import NEUTRAL
 from sipe_bayes.envs.target_texts import TARGET_TEXTS
@@ -27,7 +29,8 @@ from sipe_bayes.envs.targets import ATTRIBUTES
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+OWN = [README, *(ROOT / name for name in ("CHANGELOG.md", "SECURITY.md", "llms.txt"))]
+PAGES = OWN + sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts)
 BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", flags=re.DOTALL)
 KINDS = {"python", "toml", "bash"}
 
@@ -68,6 +71,10 @@ def test_every_key_is_described() -> None:
     assert not [key for key, text, _ in rows if not text], "write a docstring below the field"
 
 
+def test_every_finding_says_what_to_do() -> None:
+    assert set(ADVICE) == set(Code), "sipe_bayes/core/finding_advice.py"
+
+
 def test_every_finding_has_its_anchor() -> None:
     assert {str(code) for code in Code} <= anchors(ROOT / "docs" / "reference" / "findings.md")
 
@@ -97,15 +104,21 @@ def test_blocks_are_of_kinds_that_are_tested() -> None:
 
 
 RUN = """\
-import json, os, sys, mujoco, scipy.stats, torch  # once: they are most of what each would import
+import json, os, sys, time, gymnasium, scipy.stats, sipe_bayes  # once: they are most of what each would take
+for name in sipe_bayes.__all__:
+    getattr(sipe_bayes, name)
+from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
+for name in ("laplace", "bayessim"):
+    estimator_class(name)
 
 for folder, name, text in json.load(sys.stdin):
     child = os.fork()
     if not child:
         print("##", name, flush=True)
+        began = time.process_time()
         os.chdir(folder)
         exec(text, {"__name__": "__main__"})
-        sys.stdout.flush()
+        print(f"CPU {time.process_time() - began:.1f} s", flush=True)
         raise SystemExit
     assert not os.waitpid(child, 0)[1], name
 """
@@ -122,7 +135,7 @@ def test_python_runs(tmp_path: Path) -> None:
             if mark.startswith("file: "):
                 (folder / mark.removeprefix("file: ")).write_text(text, encoding="utf-8")
         work += [(str(folder), str(page.relative_to(ROOT)), text) for _, text in blocks(page, "python")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "2", "MPLBACKEND": "Agg"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     command = [sys.executable, "-c", RUN]
     done = subprocess.run(
         command, input=json.dumps(work), capture_output=True, text=True, check=False, env=environment, cwd=tmp_path
@@ -187,6 +200,24 @@ def check_command(words: list[str], line: str) -> None:
         command, words = command.commands[words[0]], words[1:]
     options = {"--help"} | {o for p in command.params for o in (*p.opts, *p.secondary_opts)}
     assert not [w for w in words if w.startswith("--") and w.partition("=")[0] not in options], line
+
+
+def test_every_command_has_an_example() -> None:
+    """In its --help, in the order of EXAMPLES, and it is legal."""
+    listed = []
+    for path, command in every_command(typer.main.get_command(app), ""):
+        assert command.epilog == f"Example: {EXAMPLES[path]}", path
+        assert EXAMPLES[path].startswith(f"sipe {path}")
+        check_command(shlex.split(EXAMPLES[path])[1:], EXAMPLES[path])
+        listed.append(path)
+    assert sorted(listed) == sorted(EXAMPLES)
+
+
+def every_command(command: Any, path: str) -> list[tuple[str, Any]]:
+    below = getattr(command, "commands", None)
+    if below is None:
+        return [(path, command)]
+    return [pair for name, one in below.items() for pair in every_command(one, f"{path} {name}".strip())]
 
 
 # Links

@@ -108,10 +108,13 @@ def test_registry_names_are_the_classes_own() -> None:
         assert estimator_class(name).name == name
 
 
-def test_version_is_the_project_s() -> None:
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["version"] == sipe_bayes.__version__
+def test_the_version_stands_in_one_place() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    project = tomllib.loads(text)
+    assert "version" not in project["project"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "sipe_bayes.core.__version__"}
+    for file in ("CITATION.cff", "CHANGELOG.md"):
+        assert sipe_bayes.__version__ in (ROOT / file).read_text(encoding="utf-8"), file
 
 
 ORDERS = (

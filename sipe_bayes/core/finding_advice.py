@@ -1,0 +1,168 @@
+"""What to do about each finding, beyond what its text says: `sipe explain CODE` and the reference print it."""
+
+from __future__ import annotations
+
+import re
+
+from sipe_bayes.core.finding_texts import Code
+
+_COMPARE = "Fit again with `--estimator mcmc` and compare the intervals."
+_REMEDY_LACKING = "Run `sipe discover` on the same configuration; it puts in what explains the residuals, and says so."
+_BOUNDS = (
+    "Widen the bounds if the value could lie beyond. Where the bound is physical, zero friction for instance, the "
+    "estimate may be right and its interval one-sided. A value that runs away often stands for physics that the model "
+    "lacks, or for a wrong sign or unit."
+)
+_SMOOTHER = "Use shorter windows, or drop the parameters that make the simulation rough, as stiffness of a contact."
+
+ADVICE: dict[Code, str] = {
+    Code.BUDGET_SPENT: (
+        "Give a larger `budget`; the same command with the same folder does not take up a changed one, so give "
+        "another `--out`."
+    ),
+    Code.AT_BOUND: _BOUNDS,
+    Code.NOT_MIXED: (
+        "The chains have not forgotten where they began. Raise the budget; fewer free parameters or a parameter "
+        "pair on a ridge that is fixed help more than many more steps."
+    ),
+    Code.SEARCH_SPREAD: (
+        "Particles of a search gather where the search went; they may do as a point. For an interval take a method "
+        "with a likelihood, or recalibrate."
+    ),
+    Code.PRIOR_HARDLY_USED: (
+        "An informative prior does not change this method's answer: take `laplace`, `mcmc`, `npe` or `bayesopt` if "
+        "it should."
+    ),
+    Code.DIVERGED_COUNT_AS_WORST: (
+        "Some values in the bounds make the simulation explode. A few are harmless; many hide the optimum: narrow "
+        "the bounds or take a smaller timestep."
+    ),
+    Code.SEARCH_STILL_WIDE: "The search ended before it had gathered. More rollouts, or fewer parameters.",
+    Code.BEST_AT_BOUND: _BOUNDS,
+    Code.OTHER_TRAJECTORIES: "A checkpoint of another fit was taken up. Delete it or name another one.",
+    Code.STARTS_NOT_RECORDED: "The method compares simulations from estimated starts, whose errors it does not count.",
+    Code.EPSILON_IMPROBABLE: (
+        "The search found a good point, but the surrogate spreads over the whole room. Read the mode, not the interval."
+    ),
+    Code.DENSITY_ROUGH: "Draws and intervals are not affected; only comparisons of `log_prob` between runs are.",
+    Code.REFITS_LOST: "Narrow the prior to where the method works, or mend why its fits diverge.",
+    Code.REFITS_NOT_NORMAL: (
+        "The recalibration's model of the estimates is rough. `sipe check --refits` says whether it still covers."
+    ),
+    Code.DIVERGES_AS_GIVEN: (
+        "The values in the MJCF explode under these commands: look at units and signs of the commands, and at the "
+        "timestep."
+    ),
+    Code.SEPARATE_OPTIMA: (
+        "Several places explain the logs about equally well. Look at them in the report; another motion in the log "
+        "tells them apart."
+    ),
+    Code.PROCESS_NOISE_UNSETTLED: (
+        "How much is process noise and how much measurement noise was still moving. Give `search.restarts`, or "
+        "`measurements.noise_sd` where it is known."
+    ),
+    Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
+    Code.SEARCH_UNSETTLED: (
+        "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "
+        f"{_COMPARE}"
+    ),
+    Code.NOT_SMOOTH: f"{_COMPARE} {_SMOOTHER}",
+    Code.STARTS_AT_REST: (
+        "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
+        "likelihood that infers states."
+    ),
+    Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
+    Code.SCATTER: (
+        "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
+    ),
+    Code.SCATTER_UNKNOWN: "Record more windows with impacts, and take out parameters that differ between logs.",
+    Code.ROUGH_EVERYWHERE: (
+        "Take `npe` or `bayessim` as well. Let windows begin shortly before the contacts that matter."
+    ),
+    Code.NOT_LOOKED_AROUND: "Raise `budget`: the look around the optimum comes last.",
+    Code.TOO_FEW_DRAWS: f"The posterior bends more than a normal follows. {_COMPARE}",
+    Code.NONLINEAR_STARTS: "Starts are marginalised by a linearisation, which fails over long windows. Halve `window`.",
+    Code.NONLINEAR_STATES: "As of starts: states between contacts are linearised. Hold it against `laplace`.",
+    Code.NO_EFFECT: (
+        "The target is not touched by this motion: a contact that never closes, a limit that is never reached, a "
+        "body that does not move. Leave it out, or record what excites it."
+    ),
+    Code.DEAD_RANGE: (
+        "Values there simulate alike, as beyond a limit that is not reached. The interval reaches over all of it; "
+        "narrow the bounds to where it acts if you know better."
+    ),
+    Code.NOT_DETERMINED: (
+        "The interval is about the prior's. `sipe suggest --for NAME` says what to send; or fix it at a measured value."
+    ),
+    Code.MODE_AT_BOUND: _BOUNDS,
+    Code.RIDGE: "Only the combination acts on the motion. Use it, not its members.",
+    Code.RIDGE_TO_RESOLVE: "Weigh, measure or look up one member, and take it out of the unknowns.",
+    Code.RIDGE_EXPECTED: "The planned motion would tell the combination alone. Plan another, or fix a member.",
+    Code.NEVER_EXCITED: "The planned motion does not touch it.",
+    Code.NOT_DETERMINED_EXPECTED: "Send more, longer or faster motion of what it acts on.",
+    Code.UNEVEN_TARGETS: (
+        "One value for targets that differ in the model. Use `factor` in place of `bounds` where they should keep "
+        "their proportions."
+    ),
+    Code.NO_MISFIT: "Nothing to do. The cause that is named is the one that would have been looked at first.",
+    Code.SMALL_MISFIT: "The values may be used. For a better prediction put the cause into the model.",
+    Code.MISFIT: _REMEDY_LACKING,
+    Code.MISFIT_SHIFTS: f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong.",
+    Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
+    Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
+    Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",
+    Code.PROCESS_NOISE: "What the model lacks acts there. A few per cent are usual of a good model.",
+    Code.PROCESS_OUTLIERS: "Look at the log at these times: a kick, a contact, a sample that was lost.",
+    Code.PROCESS_NOISE_SMALL: "Nothing to do.",
+    Code.PROCESS_NOISE_LARGE: "Fit the same log with windows and run `sipe discover`, which names what is lacking.",
+    Code.WITHIN_PRIOR: "Nothing to do.",
+    Code.OUTSIDE_PRIOR: (
+        "No values within the bounds simulate such a log. First suspects: unit or sign of that channel, a delay, a "
+        "model that was given wrong masses. Then the bounds."
+    ),
+    Code.OUTSIDE_PRIOR_UNKNOWN: "Judge by the signals in the report.",
+    Code.LOGS_DISAGREE: (
+        "Did something change between the logs: load, temperature, a zero, a battery, a screw? Then `per_log = "
+        "true`. If not, the model lacks what the logs show differently: `sipe discover`."
+    ),
+    Code.LOGS_DISAGREE_UNEXPLAINED: _REMEDY_LACKING,
+    Code.AGREEMENT_UNKNOWN: "The log alone is too short or too poor. It still counts in the joint fit.",
+    Code.HELD_OUT_DIVERGES: (
+        "The calibrated model explodes on a motion that it was not fitted on: look at parameters at a bound, train "
+        "on such motion too."
+    ),
+    Code.HELD_OUT_WORSE: (
+        "The calibration did not help there. It fits what is peculiar to the training logs, or the model lacks "
+        "what matters on this one."
+    ),
+    Code.LOG_CLOCK: "Nothing to do.",
+    Code.LOG_RESAMPLED: "Nothing to do, unless the jitter is as large as the delays that you look for.",
+    Code.LOG_GAP: "Nothing to do where it is short. Cut the log there by `span` if the command did change in the gap.",
+    Code.LOG_MISSING: "Nothing to do: masked samples are not fitted.",
+    Code.LOG_BLANK_COMMANDS: "See that a blank means 'as before' in your log and not 'off'.",
+    Code.LOG_CLOCKS: "See that all clocks count from the same instant: an offset between them looks like a delay.",
+    Code.LOG_COMMAND_ENDS: "A held command drives the simulation when the machine's controller may have stopped.",
+    Code.LOG_SLOW: "Record anew at 100 Hz or more; no method finds in a log what is not there.",
+    Code.LOG_CLIPPED: "A saturated sensor lies. Cut those parts out by `span`, or send less.",
+    Code.PRIOR_OF_MIXTURE: "Give the logs of both runs to one fit instead, if the modes lie far apart.",
+    Code.PRIOR_COUNTED_TWICE: "Take those logs out of this run, or drop `prior.from`.",
+    Code.NOT_EXPORTED: "The posterior is not touched; only the written model leaves it out.",
+    Code.BIAS_NOT_EXPORTED: "A simulated sensor has no such error: correct the measurement where you use it.",
+    Code.INVALID_SIMULATIONS: "Narrow the bounds where the simulations explode, if they are more than a few.",
+    Code.STILL_IMPROVING: "More training would learn more from the same simulations.",
+    Code.OTHER_EXPERIMENT: "The network learned for other commands, lengths or noise. `fit(log, retrain=True)`.",
+    Code.UNLIKE_SIMULATIONS: (
+        "The network answers for logs that it has seen the like of; of this one it has not. Simulate with noise, "
+        "wider bounds, or a better model."
+    ),
+    Code.TRAINED_ANEW: "Nothing to do but wait.",
+    Code.ROUNDED_OUTPUTS: "Outputs that vary by rounding alone tell nothing, and rounding may be taken for a signal.",
+    Code.FEW_DIFFERENT_PROPOSALS: "Later rounds learn from few different simulations.",
+    Code.FEW_ACCEPTED: "Raise `budget` or `accepted`: the spread of so few draws is itself uncertain.",
+    Code.INVALID_NEAR_ESTIMATE: "The estimate lies where simulations explode: look at the bounds and the timestep.",
+}
+
+
+def plain(code: Code) -> str:
+    """A finding's text with its places as {words}, without how numbers are written."""
+    return re.sub(r"\{(\w+)[^}]*\}", r"{\1}", code.value.template)
