@@ -57,6 +57,7 @@ def discover(
     return search(
         problem.simulator,
         problem.train,
+        holdout=problem.holdout,
         prior=problem.prior,
         likelihood=problem.segments,
         restriction=restriction_of(problem, only, without),

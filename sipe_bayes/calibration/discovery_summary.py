@@ -8,7 +8,9 @@ import numpy as np
 
 from sipe_bayes.calibration.gathered import Marginals
 from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.agreement import in_pieces, log_estimates, marginal
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
 from sipe_bayes.diagnostics.evaluate import (
     compare_errors,
@@ -21,8 +23,10 @@ from sipe_bayes.diagnostics.evaluate import (
 from sipe_bayes.diagnostics.misspecification import misfit
 from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
+from sipe_bayes.inference.random_effects import random_effects
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.fitted import FittedStructure
@@ -47,6 +51,8 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
             drawn += _signals(use, before, after, logs, seed)
     added = [p for label in structures.best.labels for p in _added(structures, label, seed)]
     averaged = Marginals.of(structures.posterior, problem.prior, problem.prior.space, seed)
+    plain, left = before.stage(seed), after.stage(seed)
+    further = after.further(seed) if left.misfit is None or left.misfit.matters else None
     return Discovery(
         name=name,
         columns=tuple(column.sentence for column in structures.columns),
@@ -55,21 +61,31 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
         promises=_promises(structures),
         posterior=structures.posterior,
         prior=problem.prior,
-        parameters=tuple(averaged.summaries()),
+        parameters=tuple(averaged.summaries(further)),
         plain_parameters=tuple(before.summaries(seed)),
         added=tuple(added),
         cost=structures.search.cost,
         best=after.values,
         errors=tuple(compared),
         comparison=_comparison(problem, before, after),
-        before=before.stage(seed),
-        after=after.stage(seed),
+        before=plain,
+        after=left,
         signals=tuple(drawn),
         named_share=structures.named_share,
         settled=structures.settled,
         rollouts=structures.rollouts,
         seconds=seconds,
+        findings=_thinned(problem, structures),
     )
+
+
+def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:
+    """That the search has left out parts of long logs, where it has."""
+    fitting = structures.search.fitting
+    windows = fitting.windows(fitting.simulator([]))
+    used, logs = float((windows.steps * windows.dt).sum()), problem.train
+    all_of = float((logs.length * logs.dt).sum())
+    return (finding(Code.SEARCHED_ON_PARTS, used=used, all=all_of),) if used < 0.99 * all_of else ()
 
 
 @dataclass(frozen=True)
@@ -96,6 +112,19 @@ class _Model:
         simulator = self.structures.simulator(self.one)
         prior = self.structures.search.fitting.prior_of(simulator)
         return Marginals.of(self.structures.posterior_of(self.one), prior, simulator.space, seed).summaries()
+
+    def further(self, seed: int) -> Posterior | None:
+        """Of the user's parameters that a further log would ask for; None where single logs cannot be fitted."""
+        fitting, theta = self.structures.search.fitting, self.one.theta
+        simulator, count = self.structures.simulator(self.one), len(self.problem.prior.space)
+        logs = in_pieces(fitting.trajectories, fitting.windows(simulator).start)
+        alone, _ = log_estimates(simulator, fitting.likelihood, logs, theta, seed)
+        if len(alone) < 2:
+            return None
+        own = [
+            replace(log, mean=log.mean[:count], information=marginal(log.information, range(count))) for log in alone
+        ]
+        return random_effects(own, self.problem.prior, seed).new_log
 
     def stage(self, seed: int) -> Stage:
         """What it leaves of the training logs."""
@@ -161,6 +190,8 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
         evidence, held_out = _gain(structures, label)
         kept = label in structures.best.labels
         paid = evidence is not None and evidence > structures.search.cost
+        log_score = _log_score(structures, label)
+        against = (held_out is not None and held_out <= 0) or (log_score is not None and log_score < 0)
         pieces.append(
             Piece(
                 label,
@@ -169,8 +200,9 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
                 probability,
                 evidence,
                 held_out,
+                log_score,
                 kept,
-                not kept and paid and held_out is not None and held_out <= 0,
+                not kept and paid and against,
                 extension.kind,
                 extension.native,
                 extension.nearest,
@@ -194,6 +226,16 @@ def _gain(structures: Structures, label: str) -> tuple[float | None, float | Non
     known = one.held_out is not None and rest.held_out is not None
     held_out = one.held_out - rest.held_out if known else None  # type: ignore[operator]
     return one.evidence - rest.evidence, held_out
+
+
+def _log_score(structures: Structures, label: str) -> float | None:
+    """What held-out logs gain by an extension beside the most of what was there when they were asked."""
+    state, gained = structures.state, None
+    for one in state.judged:
+        rest = state.judgement([other for other in one.labels if other != label])
+        if label in one.labels and rest is not None:
+            gained = one.log_score - rest.log_score
+    return gained
 
 
 def _added(structures: Structures, label: str, seed: int) -> list[ParameterSummary]:

@@ -16,7 +16,7 @@ from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import disagreement, log_estimates
+from sipe_bayes.diagnostics.agreement import disagreement, in_pieces, log_estimates
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
     channel_scores,
@@ -68,7 +68,6 @@ def calibrate(
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     posterior = method.fit(problem.train)
     tell = functools.partial(_tell, method, progress)
-    # what the parameters do and whether the logs agree about them
     tell("checking what each parameter changes")
     theta, space = posterior.mode.numpy(), problem.environment.space
     logs, problem = problem.train, _from_fitted_states(problem, method)
@@ -86,6 +85,8 @@ def calibrate(
     marginals = Marginals.of(posterior, problem.prior, space, method.seed)
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
+    if doubted and len(logs) == 1:
+        alone = _by_pieces(replace(problem, train=logs), fitted, theta, method.seed, tell)
     further = random_effects(alone, problem.prior, method.seed).new_log if doubted and alone[1:] else None
     predictions = _Predictions.of(problem, theta)
     noticed = (
@@ -182,6 +183,14 @@ def _one_by_one(
         return [], []
     alone, skipped = log_estimates(problem.simulator, problem.likelihood, problem.train, theta, seed, tell)
     return alone, [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
+
+
+def _by_pieces(
+    problem: Problem, fitted: Windows, theta: FloatArray, seed: int, tell: Callable[[str], None]
+) -> list[LogEstimate]:
+    """What pieces of a single log say, each by itself."""
+    pieces = replace(problem, train=in_pieces(problem.train, fitted.start))
+    return _one_by_one(pieces, fitted, theta, seed, tell)[0]
 
 
 def _mixing(method: Estimator) -> Mixing | None:

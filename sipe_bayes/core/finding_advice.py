@@ -61,6 +61,10 @@ ADVICE: dict[Code, str] = {
         "How much is process noise and how much measurement noise was still moving. Give `search.restarts`, or "
         "`measurements.noise_sd` where it is known."
     ),
+    Code.SEARCHED_ON_PARTS: (
+        "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "
+        "shows in a few moments only, cut the logs to these."
+    ),
     Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
     Code.SEARCH_UNSETTLED: (
         "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "

@@ -102,6 +102,12 @@ class Code(Enum):
         "recalibrated intervals are approximate; verify them with `sipe check`"
     )
 
+    # discover
+    SEARCHED_ON_PARTS = note(
+        "the search used {used:.3g} of the logs' {all:.3g} s, in blocks spread over them; `sipe calibrate` of its "
+        "result uses all"
+    )
+
     # laplace
     DIVERGES_AS_GIVEN = caution("the model as given diverges on these logs; the search started elsewhere")
     SEPARATE_OPTIMA = caution("the search found {count} separate optima; the posterior is a mixture of them")

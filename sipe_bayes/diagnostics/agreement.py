@@ -13,7 +13,8 @@ explains it. And each log is left out in turn: where the others agree without on
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -33,6 +34,7 @@ from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 _BUDGET = 5000  # rollouts for each log
+_PIECES = 5  # of a single log, where there is no other to compare it with
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,21 @@ class Disagreement:
         return self.finding.text
 
 
+def in_pieces(trajectories: Trajectories, windows: IntArray) -> Trajectories:
+    """The logs; of a single one, pieces of whole windows that stand for several, each under the log's name.
+
+    Args:
+        trajectories: the logs.
+        windows: (W,), the control steps at which the windows of the logs begin.
+    """
+    if len(trajectories) > 1 or len(windows) < 2:
+        return trajectories
+    (log,) = trajectories
+    parts = np.array_split(np.sort(windows), min(_PIECES, len(windows)))
+    edges = [0, *(int(part[0]) for part in parts[1:]), len(log)]
+    return Trajectories.stack([log.slice(start, stop) for start, stop in itertools.pairwise(edges)])
+
+
 def log_estimates(
     simulator: Simulator,
     likelihood: Segments | StateSpace,
@@ -115,7 +132,7 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
     shared = [j for j, p in enumerate(space) if p.log is None]
     if len(logs) < 2 or not shared:
         return None
-    roots = [_root(_marginal(log.information, shared)) for log in logs]
+    roots = [_root(marginal(log.information, shared)) for log in logs]
     sought = [root @ log.mean[shared] for root, log in zip(roots, logs, strict=True)]
     together = _scatter(roots, sought)
     if together.freedom < 1 or together.p > THRESHOLDS.logs_disagree:
@@ -134,7 +151,7 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
     return Disagreement(together.p, parameter.name, apart[worst].p, tuple(per_log), parameter.unit, *odd)
 
 
-def _marginal(information: FloatArray, kept: list[int]) -> FloatArray:
+def marginal(information: FloatArray, kept: Sequence[int]) -> FloatArray:
     """Information about ``kept`` with the other parameters marginalised."""
     other = [j for j in range(len(information)) if j not in kept]
     block = information[np.ix_(kept, kept)]

@@ -25,7 +25,8 @@ class Piece:
             fitted.
         held_out: nats of held-out pieces, likewise; None also where there are no pieces.
         kept: whether the most probable structure has it.
-        undecided: whether it is out although its evidence pays for it, since held-out pieces speak against it.
+        log_score: nats that held-out logs gain by it in the round that it would have won; None where it was not asked.
+        undecided: whether it is out although its evidence pays for it, since held-out pieces or logs speak against it.
         kind: what it is placed at: ``joint``, ``actuator``, ``channel`` (a measurement) or ``world``.
         native: whether MJCF has an element for it.
         nearest: the element that comes nearest where it has none.
@@ -38,6 +39,7 @@ class Piece:
     probability: float
     evidence: float | None
     held_out: float | None
+    log_score: float | None
     kept: bool
     undecided: bool
     kind: str

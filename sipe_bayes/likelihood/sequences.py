@@ -1,14 +1,15 @@
-"""The observed samples of logs in order of time, across windows and gaps."""
+"""The observed samples of logs in order of time, across windows and gaps; and which windows are kept of long logs."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
-_SAME_RATE = 1e-3  # relative: logs of one machine whose clocks differ by less have gaps of one length
+_BLOCK, _LEAST_WINDOWS = 4, 2  # windows that stay together where not all are kept; of a log
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
         dt: (W,), seconds per sample.
     """
     _, length, channels = observed.shape
-    by_channel, dt = [], _rates(dt)
+    by_channel = []
     for c in range(channels):
         index = np.flatnonzero(observed[:, :, c].ravel())
         window, number = index // length, sample.ravel()[index]
@@ -58,10 +59,20 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
     return by_channel
 
 
-def _rates(dt: FloatArray) -> FloatArray:
-    """Seconds per sample (W,), those alike as the shortest of them: each length of a gap costs products of its own."""
-    alike = dt.copy()
-    while (left := alike > 0).any():
-        shortest = alike[left].min()
-        alike[left & (alike <= shortest * (1 + _SAME_RATE))] = -shortest
-    return -alike
+def spread_blocks(log: IntArray, share: float) -> IntArray:
+    """Numbers of the windows that are kept of each log: blocks of a few, spread evenly over it.
+
+    Args:
+        log: (W,), of which each window is.
+        share: of the windows, all from 1 on; at least two windows of each log are kept.
+    """
+    kept = []
+    for number in np.unique(log):
+        own = np.flatnonzero(log == number)
+        count = min(len(own), max(_LEAST_WINDOWS, round(share * len(own))))
+        blocks = np.array_split(own, math.ceil(count / _BLOCK))
+        sizes = [len(x) for x in np.array_split(np.arange(count), len(blocks))]
+        for block, size in zip(blocks, sizes, strict=True):
+            first = (len(block) - size) // 2
+            kept.append(block[first : first + size])
+    return np.concatenate(kept)

@@ -52,6 +52,7 @@ class Segments:
         windows: (name, seconds) of logs for which ``window`` is another.
         starts: "estimated" with theta, or "recorded": the trajectories' states are exact (they come from a simulator)
             and each window predicts the samples after its start; ``window`` = dt then compares single control steps.
+        seconds: of all logs together that count at most: blocks of windows spread over them, None for all.
 
     Raises:
         ValueError: for any other setting.
@@ -63,12 +64,15 @@ class Segments:
     noise_sd: tuple[float | None, ...] | None = None
     windows: tuple[tuple[str, float | None], ...] = ()
     starts: str = "estimated"
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
         if self.noise not in ("ar1", "white", "sandwich"):
             raise ValueError(f"noise: expected 'ar1', 'white' or 'sandwich', got {self.noise!r}")
         if any(w is not None and not w > 0 for w in (self.window, *dict(self.windows).values())):
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"seconds: expected a time above zero, or None for all of the logs, got {self.seconds}")
         check_settings(self.starts, self.fit, self.noise_sd)
 
 

@@ -27,7 +27,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.internal.states import activations_at_rest
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
-from sipe_bayes.likelihood.sequences import Sequence, sequences
+from sipe_bayes.likelihood.sequences import Sequence, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
@@ -141,6 +141,10 @@ class Windows:
             for start in range(0, len(trajectory), steps):
                 pieces.append((k, start, min(steps, len(trajectory) - start)))
         self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
+        if self.settings.seconds is not None:
+            lasting = float((self.steps * trajectories.dt[self.log]).sum())
+            keep = spread_blocks(self.log, self.settings.seconds / lasting)
+            self.log, self.start, self.steps = self.log[keep], self.start[keep], self.steps[keep]
         self.dt = trajectories.dt[self.log]
         names = trajectories.names or (None,) * len(trajectories)
         self.names = [names[k] for k in self.log]

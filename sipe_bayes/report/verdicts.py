@@ -185,5 +185,7 @@ def between_logs(calibration: Calibration) -> Verdict | None:
     """What the column beside the intervals holds, where there is one."""
     if all(p.further is None for p in calibration.parameters):
         return None
-    text = "Beside each interval: the one for what a further log would ask for. It holds what differs between the logs"
-    return Verdict("fair", f"{text}, not what the model lacks in all of them.")
+    single = len({score.log for score in calibration.train}) == 1
+    logs = "pieces of the log" if single else "logs"
+    text = "Beside each interval: the one for what a further log would ask for. It holds what differs between the"
+    return Verdict("fair", f"{text} {logs}, not what the model lacks in all of them.")

@@ -24,7 +24,8 @@ from sipe_bayes.structure.extension import placements
 from sipe_bayes.structure.fitted import Fitting
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
-from sipe_bayes.structure.search import DiscoverOptions, DiscoverState, StructureSearch
+from sipe_bayes.structure.search import DiscoverOptions, StructureSearch
+from sipe_bayes.structure.state import DiscoverState
 from sipe_bayes.structure.structures import Structures
 
 _SAVE_SECONDS = 1.0
@@ -72,6 +73,7 @@ def discover(
     simulator: Simulator,
     trajectories: Trajectories,
     *,
+    holdout: Trajectories | None = None,
     prior: Posterior | None = None,
     likelihood: Segments | None = None,
     restriction: Restriction | None = None,
@@ -86,6 +88,7 @@ def discover(
     Args:
         simulator: of an ``MjcfEnvironment``, the user's model with its unknowns.
         trajectories: the logs.
+        holdout: logs that no structure is fitted to; one that they speak against is not kept.
         prior: of the unknowns; default their own.
         likelihood: how logs are cut into windows; the noise is coloured whatever it says.
         restriction: which extensions may be tried, and where.
@@ -99,7 +102,7 @@ def discover(
         ValueError: for a simulator of anything but an MJCF, unknown extensions, or sites that the model does not have.
         CheckpointError: for a checkpoint that is damaged or of another run.
     """
-    search = _search(simulator, trajectories, prior, likelihood, restriction, options, budget, seed)
+    search = _search(simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed)
     fingerprint = _fingerprint(search, simulator, restriction or Restriction())
     state = DiscoverState()
     if checkpoint is not None and checkpoint.exists():
@@ -154,6 +157,7 @@ def _environment(simulator: Simulator) -> MjcfEnvironment:
 def _search(
     simulator: Simulator,
     trajectories: Trajectories,
+    holdout: Trajectories | None,
     prior: Posterior | None,
     likelihood: Segments | None,
     restriction: Restriction | None,
@@ -162,12 +166,14 @@ def _search(
     seed: int,
 ) -> StructureSearch:
     environment = _environment(simulator)
-    restriction = restriction or Restriction()
+    restriction, options = restriction or Restriction(), options or DiscoverOptions()
     _check_sites(environment, restriction.sites)
+    seconds = options.physics_steps * float(simulator.model.opt.timestep)
     fitting = Fitting(
         environment,
         trajectories,
-        replace(likelihood or Segments(), noise="ar1"),
+        holdout,
+        replace(likelihood or Segments(), noise="ar1", seconds=seconds),
         default_prior(environment.space) if prior is None else prior,
         whole("seed", seed, 0),
         simulator.num_threads or cores(),
@@ -201,4 +207,5 @@ def _fingerprint(search: StructureSearch, simulator: Simulator, restriction: Res
         "extensions": list(EXTENSIONS),
         "own": restriction.digests,
     }
-    return hashlib.sha256(f"{settings!r}{digest(fitting.trajectories)}".encode()).hexdigest()
+    held_out = "" if fitting.holdout is None else digest(fitting.holdout)
+    return hashlib.sha256(f"{settings!r}{digest(fitting.trajectories)}{held_out}".encode()).hexdigest()

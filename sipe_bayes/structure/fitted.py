@@ -12,6 +12,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
 from sipe_bayes.inference.laplace.strategy import distinct
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.likelihood.noise import Noise
@@ -25,6 +26,9 @@ from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.scores import scores
 
+# structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
+_COARSE = WindowTuning(tolerance=0.1, rough_tolerance=1e-3, most_steps=30)
+_LOOK = 300  # rollouts of a fit to a held-out log, at most
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
 
 
@@ -71,6 +75,7 @@ class Fitting:
     Args:
         environment: the user's model.
         trajectories: the logs.
+        holdout: logs that no structure is fitted to, if there are such.
         likelihood: windows with coloured noise.
         prior: of the user's parameters.
         seed: of the searches.
@@ -79,6 +84,7 @@ class Fitting:
 
     environment: MjcfEnvironment
     trajectories: Trajectories
+    holdout: Trajectories | None
     likelihood: Segments
     prior: Posterior
     seed: int
@@ -92,8 +98,9 @@ class Fitting:
         """The same with columns of the logs multiplied."""
         if not columns:
             return self
-        logs = corrected(self.trajectories, columns, self.environment.actuators)
-        return replace(self, trajectories=logs)
+        logs, actuators = corrected(self.trajectories, columns, self.environment.actuators), self.environment.actuators
+        held = None if self.holdout is None else corrected(self.holdout, columns, actuators)
+        return replace(self, trajectories=logs, holdout=held)
 
     def windows(self, simulator: Simulator) -> Windows:
         """The logs bound to a model."""
@@ -125,18 +132,11 @@ class Fitting:
         """
         simulator = self.simulator(placed)
         prior = self.prior_of(simulator)
-        given = None if initial is None else initial[None]
-        laplace = Laplace(
-            simulator, prior=prior, budget=budget, seed=self.seed, likelihood=self.likelihood, initial=given
-        )
-        laplace.fit(self.trajectories)
-        assert laplace.state is not None
-        best = distinct(laplace.state.search.optima)[0]
-        assert isinstance(best, WindowOptimum)
-        windows, noise = self.windows(simulator), Noise(best.sd, best.tau)
-        both = scores(windows, best.theta, best.starts, noise, QuadraticPrior.of(prior))
+        optimum = self._optimum(simulator, prior, self.trajectories, initial, budget)
+        best, windows = optimum.best, self.windows(simulator)
+        both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         labels = tuple(one.label for one in placed)
-        rollouts, settled = laplace.rollouts + windows.rollouts, best.finding is None
+        rollouts, settled = optimum.rollouts + windows.rollouts, best.finding is None
         return FittedStructure(
             labels,
             best.theta,
@@ -150,3 +150,52 @@ class Fitting:
             rollouts,
             settled,
         )
+
+    def log_score(self, placed: Sequence[Placed], one: FittedStructure) -> tuple[float, int]:
+        """Log p of the held-out logs given the others, their noise estimated from themselves; and the rollouts.
+
+        Minus infinity where the structure does not follow them at all.
+
+        Args:
+            placed: the structure's extensions.
+            one: fitted to the other logs.
+        """
+        assert self.holdout is not None
+        simulator = self.simulator(placed)
+        prior = GaussianMixture(torch.zeros(1), one.mean[None], one.covariance[None], simulator.space)
+        try:
+            optimum = self._optimum(simulator, prior, self.holdout, one.theta, _LOOK * len(self.holdout))
+            windows, best = Windows(self.likelihood, simulator, self.holdout), optimum.best
+            both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
+        except ValueError:  # LinAlgError and BudgetTooSmall are ones
+            return -np.inf, 0
+        return both.evidence, optimum.rollouts + windows.rollouts
+
+    def _optimum(
+        self, simulator: Simulator, prior: Posterior, logs: Trajectories, initial: FloatArray | None, budget: int
+    ) -> _Optimum:
+        """The best optimum of some logs."""
+        given = None if initial is None else initial[None]
+        tuning = LaplaceTuning(windows=_COARSE)
+        laplace = Laplace(
+            simulator,
+            prior=prior,
+            budget=budget,
+            seed=self.seed,
+            likelihood=self.likelihood,
+            initial=given,
+            tuning=tuning,
+        )
+        laplace.fit(logs)
+        assert laplace.state is not None
+        best = distinct(laplace.state.search.optima)[0]
+        assert isinstance(best, WindowOptimum)
+        return _Optimum(best, laplace.rollouts)
+
+
+@dataclass(frozen=True)
+class _Optimum:
+    """Where a fit ended, and the rollouts that it took."""
+
+    best: WindowOptimum
+    rollouts: int

@@ -11,22 +11,23 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
       v                                                      v
     FIT     the best few, one a step ------------------>  PRUNE   each kept piece left out once
       |  the best of them is better                           v
-      v                                                    RESIDUAL  a force without a name, as the yardstick
+      v                                                    SWAP   what did about as well, in a kept one's place
     AGAIN   the present structure, from where the             v
-      |     best one ended: still better, it is kept       DONE
-      +--> RANK
+      |     best one ended: still better, it is kept       RESIDUAL  a force without a name, as the yardstick
+      +--> RANK                                               v
+                                                           DONE
 
 **Judgement.** A structure S of K extensions out of n has
 
 .. math:: \log p(S \mid y) = \log p(y \mid S) - K (\log n + c) + const,
 
-and it counts only where the log score of held-out pieces has become better with it as well. Structures that are about
-equally good are not decided between: ``Structures.posterior`` averages over them.
+and it counts only where the log score of held-out pieces has become better with it as well, and where the logs that no
+fit has seen do not speak against it. Structures that are about equally good are not decided between:
+``Structures.posterior`` averages over them.
 """
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -43,19 +44,8 @@ from sipe_bayes.structure.columns import Column, choices, log_jacobian, unexplai
 from sipe_bayes.structure.extension import Extension, Placed, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
-
-
-class Phase(enum.Enum):
-    """What the next step does."""
-
-    PLAIN = "plain"
-    COLUMNS = "columns"
-    RANK = "rank"
-    FIT = "fit"
-    AGAIN = "again"
-    PRUNE = "prune"
-    RESIDUAL = "residual"
-    DONE = "done"
+from sipe_bayes.structure.rivals import rivals
+from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
 
 
 @dataclass(frozen=True)
@@ -65,75 +55,16 @@ class DiscoverOptions(Options):
     width: int = option(3, "candidates that are fitted in a round; twice as many where they promise the same", least=1)
     tied: float = option(0.05, "of the best gain, within which candidates promise the same", least=0)
     most: int = option(5, "extensions that a structure may have", least=1)
+    against: float = option(2.0, "nats of held-out logs that speak against an extension", "nats", least=0)
+    rivals: int = option(2, "of a kept piece that are tried in its place", least=0)
+    rival: float = option(0.1, "of a piece's gain in its round, by which a rival may fall behind", least=0)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
     sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
     gross: float = option(0.25, "of a channel's spread left from which signs and units are tried", least=0)
     column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
     fit_budget: int = option(2000, "rollouts of one fit", least=1)
-
-
-@dataclass(frozen=True)
-class Offer:
-    """What an extension promised at a structure.
-
-    Args:
-        at: labels of the structure.
-        label: of the extension.
-        gain: promised log-likelihood in nats.
-        theta: (P,), where its parameters are to start.
-    """
-
-    at: tuple[str, ...]
-    label: str
-    gain: float
-    theta: FloatArray
-
-
-@dataclass(frozen=True)
-class DiscoverState:
-    """Where a search over structures stands.
-
-    Args:
-        phase: what comes next.
-        fitted: structures, the plain model first.
-        present: labels of the structure that is gone on from.
-        larger: labels of the structure that is better than it, while it is fitted again.
-        offers: all that was promised until now.
-        queue: labels of the extensions that this round still has to fit.
-        failed: labels of structures that could not be fitted.
-        columns: of the logs that are multiplied, since then the plain model fits far better.
-    """
-
-    phase: Phase = Phase.PLAIN
-    fitted: tuple[FittedStructure, ...] = ()
-    present: tuple[str, ...] = ()
-    larger: tuple[str, ...] = ()
-    offers: tuple[Offer, ...] = ()
-    queue: tuple[str, ...] = ()
-    failed: tuple[tuple[str, ...], ...] = ()
-    columns: tuple[Column, ...] = ()
-
-    @property
-    def done(self) -> bool:
-        """Whether the search has ended."""
-        return self.phase is Phase.DONE
-
-    @property
-    def rollouts(self) -> int:
-        """Of all fits."""
-        return sum(one.rollouts for one in self.fitted)
-
-    def of(self, labels: Sequence[str]) -> FittedStructure | None:
-        """The fit of a structure, whatever the order of its extensions."""
-        return next((one for one in self.fitted if set(one.labels) == set(labels)), None)
-
-    @property
-    def here(self) -> FittedStructure:
-        """The fit of the present structure."""
-        here = self.of(self.present)
-        assert here is not None
-        return here
+    physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
 
 
 class StructureSearch:
@@ -173,6 +104,7 @@ class StructureSearch:
             Phase.FIT: self._fit,
             Phase.AGAIN: self._again,
             Phase.PRUNE: self._prune,
+            Phase.SWAP: self._swap,
             Phase.RESIDUAL: self._residual,
             Phase.DONE: lambda state: state,
         }[state.phase](state)
@@ -187,6 +119,7 @@ class StructureSearch:
             Phase.FIT: f"fitting {state.queue[0] if state.queue else ''}{having}",
             Phase.AGAIN: f"fitting without {state.larger[-1] if state.larger else ''} once more",
             Phase.PRUNE: "leaving out each piece once",
+            Phase.SWAP: "trying what did about as well in the place of what is kept",
             Phase.RESIDUAL: "fitting a force without a name",
             Phase.DONE: "done",
         }[state.phase]
@@ -315,7 +248,21 @@ class StructureSearch:
         """The best of those with one extension more, where it is better than the present structure."""
         here = state.here
         grown = [o for o in state.fitted if len(o.labels) == len(here.labels) + 1 and set(here.labels) < set(o.labels)]
-        return max((one for one in grown if self.better(one, here)), key=self.total, default=None)
+        allowed = [one for one in grown if not state.is_refused(one.labels) and self.better(one, here)]
+        return max(allowed, key=self.total, default=None)
+
+    def _judged(self, state: DiscoverState, one: FittedStructure) -> DiscoverState:
+        """With what the held-out logs say of a structure and of the present one, where there are such logs."""
+        for each in (state.here, one) if self.fitting.holdout is not None else ():
+            if state.judgement(each.labels) is None:
+                log_score, rollouts = self.fitting.log_score(self.structure(each.labels), each)
+                state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
+        return state
+
+    def _speaks_against(self, state: DiscoverState, one: FittedStructure) -> bool:
+        """Whether held-out logs are foretold worse by a structure than by the present one."""
+        here, other = state.judgement(state.present), state.judgement(one.labels)
+        return here is not None and other is not None and other.log_score < here.log_score - self.options.against
 
     def _again(self, state: DiscoverState) -> DiscoverState:
         """The present structure from where the larger one ended, whose gain may be nothing but a better optimum."""
@@ -329,16 +276,16 @@ class StructureSearch:
             better = replace(better, rollouts=here.rollouts + once_more.rollouts)
             state = replace(state, fitted=tuple(better if one is here else one for one in state.fitted))
         best = self._best_grown(state)
-        state = replace(state, larger=())
-        if best is None:
-            return replace(state, phase=Phase.RANK if state.here is not here else Phase.PRUNE)
-        return replace(state, present=best.labels, phase=Phase.RANK)
+        if best is not None and self._speaks_against(state := self._judged(state, best), best):
+            return self._settled(replace(state, refused=(*state.refused, best.labels), larger=()))
+        onward = Phase.PRUNE if best is None and state.here is here else Phase.RANK
+        return replace(state, larger=(), phase=onward, present=state.present if best is None else best.labels)
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
         """One smaller structure fitted, or all of them compared."""
         here = state.here
         if len(here.labels) < 2:
-            return replace(state, phase=Phase.RESIDUAL)
+            return replace(state, phase=Phase.SWAP)
         smaller = [tuple(x for x in here.labels if x != label) for label in here.labels]
         for labels in smaller:
             if state.of(labels) is None and labels not in state.failed:
@@ -348,6 +295,22 @@ class StructureSearch:
         without = [one for one in known if not self.better(here, one)]
         if without:
             return replace(state, present=max(without, key=self.total).labels)
+        return replace(state, phase=Phase.SWAP)
+
+    def _swap(self, state: DiscoverState) -> DiscoverState:
+        """One structure with a close rival in a kept piece's place fitted, or all of them compared."""
+        here, options = state.here, self.options
+        close = list(rivals(state.fitted, here.labels, self.total, options.rival, options.rivals))
+        for rival in close:
+            if state.of(rival.labels) is None and rival.labels not in state.failed:
+                owners = np.array(self._owners(here), object)
+                own = [here.theta[owners == label] for label in (None, *here.labels)]
+                own[1 + here.labels.index(rival.kept)] = rival.theta
+                return self._fitted(state, rival.labels, np.concatenate(own))
+        known = [one for rival in close if (one := state.of(rival.labels)) is not None]
+        best = max(known, key=self.total, default=here)
+        if self.better(best, here) and not self._speaks_against(state := self._judged(state, best), best):
+            return replace(state, present=best.labels)
         return replace(state, phase=Phase.RESIDUAL)
 
     def _residual(self, state: DiscoverState) -> DiscoverState:

@@ -15,7 +15,8 @@ from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.fitted import FittedStructure
-from sipe_bayes.structure.search import DiscoverState, Offer, StructureSearch
+from sipe_bayes.structure.search import StructureSearch
+from sipe_bayes.structure.state import DiscoverState, Offer
 
 _NEGLIGIBLE = 1e-3  # probability below which a structure is left out of the average
 
@@ -83,8 +84,11 @@ class Structures:
         return weight / weight.sum()
 
     def _counts(self, one: FittedStructure) -> bool:
-        """Whether a structure of named pieces foretells held-out pieces better than every smaller one tried."""
-        if self._is_yardstick(one):
+        """Whether a structure of named pieces foretells held-out pieces better than every smaller one tried.
+
+        And whether no held-out log speaks against it.
+        """
+        if self._is_yardstick(one) or self.state.is_refused(one.labels):
             return False
         smaller = [o for o in self.fitted if set(o.labels) < set(one.labels)]
         return all(one.held_out is None or o.held_out is None or one.held_out > o.held_out for o in smaller)

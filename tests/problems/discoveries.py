@@ -35,6 +35,7 @@ def piece(name: str, site: str = "hinge", kept: bool = False, **changes: object)
         "probability": 0.97 if kept else 0.02,
         "evidence": 40.0,
         "held_out": 30.0,
+        "log_score": None,
         "kept": kept,
         "undecided": False,
         "kind": "joint",

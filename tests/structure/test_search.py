@@ -12,7 +12,8 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.structure import Extension, Restriction, Structures, discover
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
 from sipe_bayes.structure.machine import Machine
 from tests.problems.pendulums import log, pendulum
 
@@ -127,3 +128,38 @@ class Bias(Extension):
         """As wide as the offset's."""
         size = machine.commands[site]
         return (Parameter(f"{site}.bias", -size, size, targets=(f"actuator:{site}.bias_force",)),)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_held_out_logs_speak_against_what_only_one_log_has(same: bool) -> None:
+    """A machine that rubbed on one day and not on the other: friction is no part of it."""
+    other = log(pendulum(FRICTION), [0.6, 0.08, 0.1 if same else 0.0], 12)
+    structures = discover(
+        pendulum(),
+        Trajectories.stack([log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)]),
+        holdout=Trajectories.stack([other]),
+        restriction=Restriction(only=("dry_friction", "delay")),
+    )
+    label = ("dry_friction:hinge",)
+    plain, rubbing = (structures.state.judgement(labels) for labels in ((), label))
+    print(plain, rubbing)
+    assert structures.best.labels == (label if same else ())
+    assert structures.state.is_refused(label) != same
+    assert plain is not None
+    assert rubbing is not None
+    assert (rubbing.log_score > plain.log_score) == same
+
+
+def test_a_long_log_is_searched_on_blocks_of_it() -> None:
+    recorded = log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)
+    half = len(recorded) * recorded.dt / 2
+    structures = discover(
+        pendulum(),
+        Trajectories.stack([recorded]),
+        likelihood=Segments(0.5),
+        restriction=Restriction(only=("dry_friction",)),
+        options=DiscoverOptions(physics_steps=round(half / pendulum().model.opt.timestep)),
+    )
+    windows = structures.search.fitting.windows(structures.simulator(structures.plain))
+    assert (windows.steps * windows.dt).sum() == pytest.approx(half, rel=0.15)
+    assert structures.best.labels == ("dry_friction:hinge",)

@@ -84,7 +84,8 @@ def headline(discovery: Discovery) -> Verdict:
         return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
-    return Verdict("bad", "The residuals are not noise, and nothing that was tried is what the model lacks.")
+    tried = "no piece that was tried is shown to be" if alternatives(discovery) else "nothing that was tried is"
+    return Verdict("bad", f"The residuals are not noise, and {tried} what the model lacks.")
 
 
 def held_out_verdict(discovery: Discovery) -> Verdict | None:
@@ -116,7 +117,9 @@ def undecided(discovery: Discovery) -> Verdict | None:
 
 def _why_open(piece: Piece) -> str:
     if piece.undecided:
-        return f"evidence {nats(piece.evidence)} nats, but held-out pieces {nats(piece.held_out)}"
+        pieces = piece.held_out is not None and piece.held_out <= 0
+        against = f"pieces {nats(piece.held_out)}" if pieces else f"logs {nats(piece.log_score)}"
+        return f"evidence {nats(piece.evidence)} nats, but held-out {against}"
     return f"probability {probability_text(piece.probability)}"
 
 
@@ -142,8 +145,12 @@ def trust(discovery: Discovery) -> Verdict:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
         return Verdict("good", "Values may be trusted within the intervals averaged over the structures, no narrower.")
-    text = "No value may be trusted within its interval yet: the intervals are those of models that are still wrong."
-    return Verdict("bad", text)
+    text = "No value may be trusted within its interval yet: the intervals are those of models that are still wrong"
+    if any(p.further is not None for p in discovery.parameters):
+        text += (
+            "; beside them is what a further log would ask for, which holds what differs between logs or their pieces"
+        )
+    return Verdict("bad", f"{text}.")
 
 
 def discovery_verdicts(discovery: Discovery) -> list[Verdict]:
@@ -195,6 +202,7 @@ def value_rows(discovery: Discovery) -> list[dict[str, str]]:
         old = plain.get(p.name)
         texts = [] if old is None else [significant(x, old.sd, scale) for x in (old.q50, old.q05, old.q95)]
         row |= {"before": texts[0] if texts else "", "before_interval": " to ".join(texts[1:])}
+        row["further"] = " to ".join(significant(x, p.sd, scale) for x in p.further or ())
         rows.append(row | {"added": "" if old else "yes", "nuisance": "yes" if p.nuisance else ""})
     return rows
 

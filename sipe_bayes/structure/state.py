@@ -1,0 +1,115 @@
+"""Where a search over structures stands: what was fitted, what was promised, what comes next."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.structure.columns import Column
+from sipe_bayes.structure.fitted import FittedStructure
+
+
+class Phase(enum.Enum):
+    """What the next step does."""
+
+    PLAIN = "plain"
+    COLUMNS = "columns"
+    RANK = "rank"
+    FIT = "fit"
+    AGAIN = "again"
+    PRUNE = "prune"
+    SWAP = "swap"
+    RESIDUAL = "residual"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What an extension promised at a structure.
+
+    Args:
+        at: labels of the structure.
+        label: of the extension.
+        gain: promised log-likelihood in nats.
+        theta: (P,), where its parameters are to start.
+    """
+
+    at: tuple[str, ...]
+    label: str
+    gain: float
+    theta: FloatArray
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What logs that no fit has seen say of a structure.
+
+    Args:
+        labels: of the structure.
+        log_score: log p of the held-out logs given the others, in nats, their noise estimated from themselves.
+        rollouts: that it took.
+    """
+
+    labels: tuple[str, ...]
+    log_score: float
+    rollouts: int
+
+
+@dataclass(frozen=True)
+class DiscoverState:
+    """Where a search over structures stands.
+
+    Args:
+        phase: what comes next.
+        fitted: structures, the plain model first.
+        present: labels of the structure that is gone on from.
+        larger: labels of the structure that is better than it, while it is fitted again.
+        offers: all that was promised until now.
+        queue: labels of the extensions that this round still has to fit.
+        failed: labels of structures that could not be fitted.
+        columns: of the logs that are multiplied, since then the plain model fits far better.
+        judged: what held-out logs say of structures.
+        refused: labels of structures that they speak against.
+    """
+
+    phase: Phase = Phase.PLAIN
+    fitted: tuple[FittedStructure, ...] = ()
+    present: tuple[str, ...] = ()
+    larger: tuple[str, ...] = ()
+    offers: tuple[Offer, ...] = ()
+    queue: tuple[str, ...] = ()
+    failed: tuple[tuple[str, ...], ...] = ()
+    columns: tuple[Column, ...] = ()
+    judged: tuple[Judgement, ...] = ()
+    refused: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def done(self) -> bool:
+        """Whether the search has ended."""
+        return self.phase is Phase.DONE
+
+    @property
+    def rollouts(self) -> int:
+        """Of all fits, and of the looks at held-out logs."""
+        return sum(one.rollouts for one in self.fitted) + sum(one.rollouts for one in self.judged)
+
+    def of(self, labels: Sequence[str]) -> FittedStructure | None:
+        """The fit of a structure, whatever the order of its extensions."""
+        return next((one for one in self.fitted if set(one.labels) == set(labels)), None)
+
+    def judgement(self, labels: Sequence[str]) -> Judgement | None:
+        """What held-out logs say of a structure, whatever the order of its extensions."""
+        return next((one for one in self.judged if set(one.labels) == set(labels)), None)
+
+    def is_refused(self, labels: Sequence[str]) -> bool:
+        """Whether held-out logs speak against a structure, whatever the order of its extensions."""
+        return any(set(one) == set(labels) for one in self.refused)
+
+    @property
+    def here(self) -> FittedStructure:
+        """The fit of the present structure."""
+        here = self.of(self.present)
+        assert here is not None
+        return here
