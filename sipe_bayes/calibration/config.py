@@ -121,7 +121,9 @@ class Config(Table):
         """Windows and coloured noise are of segments alone; held-out logs are scored by windows either way."""
         if self.likelihood == "segments":
             if self.window is None:
-                raise problem("missing; add it", "window")
+                raise problem(
+                    'missing; add it in seconds, such as window = 0.5, or window = "log" for whole logs', "window"
+                )
             return
         needless = "given with likelihood = 'state_space', which has no windows; drop it or use likelihood = 'segments'"
         if self.window is not None:

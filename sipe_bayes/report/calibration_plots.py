@@ -6,7 +6,7 @@ a figure into a file's bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,37 +155,58 @@ def signals(calibration: Calibration, log: str) -> list[Figure]:
     if not rows:
         known = sorted({s.log for s in calibration.signals})
         raise ValueError(f"log: expected one of {known}, got {log!r}")
-    rmse = {(s.log, s.channel): (s.rmse, s.rmse_default) for s in (*calibration.train, *calibration.holdout)}
-    return [_signal_figure(part, rmse) for part in equal_parts(rows, SIZES.channels)]
+    scores = [score for score in (*calibration.train, *calibration.holdout) if score.log == log]
+    titles = {
+        s.channel: f"RMSE {s.rmse:.3g} {unit_text(s.unit)}, with the model as given {s.rmse_default:.3g}"
+        for s in scores
+    }
+    parts = equal_parts(rows, SIZES.channels)
+    return [log_figure(part, error_panel, titles, _signal_handles()) for part in parts]
 
 
-def _signal_figure(rows: Sequence[Signal], rmse: Mapping[tuple[str, str], tuple[float, float]]) -> Figure:
+def log_figure(
+    rows: Sequence[Signal],
+    errors: Callable[[Axes, Signal, tuple[float, float]], None],
+    titles: Mapping[str, str],
+    handles: Sequence[Artist],
+    heights: tuple[float, float] = (3.0, 1.25),
+) -> Figure:
+    """Channels of one log: signals above, errors below; a long log also gets a close-up of the largest error.
+
+    Args:
+        rows: the channels.
+        errors: draws the panel below.
+        titles: of channels, above their panels.
+        handles: of the legend.
+        heights: of both panels, to each other.
+    """
     first = rows[0]
     long = len(first.window_starts) > SIZES.long_windows or len(first.time) > SIZES.long_samples
-    figure = new_figure(2.35 * len(rows) + 0.75)
-    grid = figure.add_gridspec(
-        2 * len(rows), 1 + long, height_ratios=[3, 1.25] * len(rows), width_ratios=[2.2, 1] if long else None
-    )
+    figure = new_figure(2.45 * len(rows) + 0.75)
+    ratios = [2.2, 1] if long else None
+    grid = figure.add_gridspec(2 * len(rows), 1 + long, height_ratios=[*heights] * len(rows), width_ratios=ratios)
     spans = [(float(first.time[0]), float(first.time[-1])), *([worst_stretch(rows)] if long else [])]
     for column, span in enumerate(spans):
         for i, signal in enumerate(rows):
             above = figure.add_subplot(grid[2 * i, column])
             below = figure.add_subplot(grid[2 * i + 1, column], sharex=above)
             signal_panel(above, signal, span)
-            error_panel(below, signal, span)
+            errors(below, signal, span)
             above.set_xlim(*span)
             above.tick_params(labelbottom=False)
             below.tick_params(labelbottom=i == len(rows) - 1)
-            if column == 0:
-                _channel_labels(above, below, signal, rmse.get((signal.log, signal.channel)))
-            else:
+            if column:
                 above.set_title("where the error is largest", loc="left")
+                continue
+            above.set_ylabel(with_unit(shortened(signal.channel, 22), signal.unit))
+            below.set_ylabel("error")
+            above.set_title(titles.get(signal.channel, ""), loc="right", color="#444444", fontsize=8.5)
         below.set_xlabel("time [s]")
     held_out = first.use == "holdout"
     kind = "held-out log, not used in the fit" if held_out else "training log"
     colour = HOLDOUT if held_out else "#222222"
     figure.suptitle(f"{shortened(first.log, 60)}: {kind}", color=colour, fontweight="bold")
-    figure.legend(handles=_signal_handles(), loc="outside lower center", ncols=5)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     figure.align_ylabels()
     return figure
 
@@ -198,14 +219,6 @@ def _signal_handles() -> list[Artist]:
         line_handle(DEFAULT, "model as given", "--", lw=1),
         line_handle(PRIOR, "a window starts", "none", marker="|", ms=8, mew=1.2),
     ]
-
-
-def _channel_labels(above: Axes, below: Axes, signal: Signal, rmse: tuple[float, float] | None) -> None:
-    above.set_ylabel(with_unit(shortened(signal.channel, 22), signal.unit))
-    below.set_ylabel("error")
-    if rmse is not None:
-        text = f"RMSE {rmse[0]:.3g} {unit_text(signal.unit)}, with the model as given {rmse[1]:.3g}"
-        above.set_title(text, loc="right", color="#444444", fontsize=8.5)
 
 
 # Residuals

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors
-from sipe_bayes.diagnostics.records import Residual, Signal
+from sipe_bayes.diagnostics.records import Residual
 from sipe_bayes.diagnostics.result import ParameterSummary
-from sipe_bayes.report.calibration_plots import SIZES, autocorrelation
-from sipe_bayes.report.colours import DEFAULT, HOLDOUT, MEASURED, POSTERIOR, PRIOR
+from sipe_bayes.report.calibration_plots import SIZES, autocorrelation, log_figure
+from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR
 from sipe_bayes.report.drawing import equal_parts, new_figure, panel_grid, styled, ticks
 from sipe_bayes.report.legends import legend_above, line_handle
-from sipe_bayes.report.signal_panels import signal_panel, two_errors_panel, worst_stretch
+from sipe_bayes.report.signal_panels import two_errors_panel
 from sipe_bayes.report.words import error_text, shortened, unit_text, with_unit
 
 _BEFORE, _AFTER = "calibrated as it was", "with what was found"
@@ -30,49 +30,17 @@ def before_and_after(discovery: Discovery, log: str) -> list[Figure]:
     Simulations start anew at every tick on the time axis; a long log also gets a close-up of the largest error.
     """
     rows = [s for s in discovery.signals if s.log == log]
-    rmse = {(row.log, row.channel): row for row in discovery.errors}
-    return [_signal_figure(part, rmse) for part in equal_parts(rows, SIZES.channels)]
-
-
-def _signal_figure(rows: Sequence[Signal], rmse: Mapping[tuple[str, str], ModelErrors]) -> Figure:
-    first = rows[0]
-    long = len(first.window_starts) > SIZES.long_windows or len(first.time) > SIZES.long_samples
-    figure = new_figure(2.6 * len(rows) + 0.75)
-    ratios = [2.2, 1] if long else None
-    grid = figure.add_gridspec(2 * len(rows), 1 + long, height_ratios=[1.6, 1] * len(rows), width_ratios=ratios)
-    spans = [(float(first.time[0]), float(first.time[-1])), *([worst_stretch(rows)] if long else [])]
-    for column, span in enumerate(spans):
-        for i, signal in enumerate(rows):
-            above = figure.add_subplot(grid[2 * i, column])
-            below = figure.add_subplot(grid[2 * i + 1, column], sharex=above)
-            signal_panel(above, signal, span)
-            two_errors_panel(below, signal, span)
-            above.set_xlim(*span)
-            above.tick_params(labelbottom=False)
-            below.tick_params(labelbottom=i == len(rows) - 1)
-            if column == 0:
-                _labels(above, below, signal, rmse.get((signal.log, signal.channel)))
-            else:
-                above.set_title("where the error is largest", loc="left")
-        below.set_xlabel("time [s]")
-    held_out = first.use == "holdout"
-    kind = "held-out log, not used in the fits" if held_out else "training log"
-    title = f"{shortened(first.log, 60)}: {kind}"
-    figure.suptitle(title, color=HOLDOUT if held_out else "#222222", fontweight="bold")
-    shown = [line_handle(MEASURED, "measured", lw=1), line_handle(DEFAULT, _BEFORE, "--", lw=1)]
+    titles = {row.channel: _errors_text(row) for row in discovery.errors if row.log == log}
     mark = line_handle(PRIOR, "a window starts", "none", marker="|", ms=8, mew=1.2)
-    shown += [line_handle(POSTERIOR, _AFTER, lw=1.5), mark]
-    figure.legend(handles=shown, loc="outside lower center", ncols=4)
-    figure.align_ylabels()
-    return figure
+    lines = [line_handle(MEASURED, "measured", lw=1), line_handle(DEFAULT, _BEFORE, "--", lw=1)]
+    handles = [*lines, line_handle(POSTERIOR, _AFTER, lw=1.5), mark]
+    parts = equal_parts(rows, SIZES.channels)
+    return [log_figure(part, two_errors_panel, titles, handles, heights=(1.6, 1.0)) for part in parts]
 
 
-def _labels(above: Axes, below: Axes, signal: Signal, row: ModelErrors | None) -> None:
-    above.set_ylabel(with_unit(shortened(signal.channel, 22), signal.unit))
-    below.set_ylabel("error")
-    if row is not None:
-        sizes = f"RMSE {error_text(row.before)} {unit_text(row.unit)} before, {error_text(row.after)} after"
-        above.set_title(f"{sizes}; model as given {error_text(row.given)}", loc="right", color="#444444", fontsize=8.5)
+def _errors_text(row: ModelErrors) -> str:
+    sizes = f"RMSE {error_text(row.before)} {unit_text(row.unit)} before, {error_text(row.after)} after"
+    return f"{sizes}; model as given {error_text(row.given)}"
 
 
 # Residuals
