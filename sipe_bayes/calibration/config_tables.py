@@ -26,6 +26,7 @@ from sipe_bayes.calibration.config_fields import (
     problem,
 )
 from sipe_bayes.calibration.readers.many import matching, names_of
+from sipe_bayes.core.units import find_unit
 
 Use = Literal["train", "holdout"]
 
@@ -98,6 +99,8 @@ class Measurement(Table):
     """1 or -1"""
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
+    wraps: Annotated[bool, Strict()] = False
+    """`true`: the angle comes round, and jumps by a turn are taken out"""
     fit: Annotated[bool, Strict()] = True
     """`false`: starts windows and is drawn, but is not fitted"""
     noise_sd: Positive | None = None
@@ -148,6 +151,8 @@ class Measurement(Table):
         if self.columns and not (whole and len(self.columns) in (3, 4 * turns)):
             message = f"{self.target} is one column, or a sensor's three, got {list(self.columns)}; use `column`"
             raise problem(message, "columns")
+        if self.wraps and (find_unit(self.unit).dimension != "angle" or self.columns):
+            raise problem(f"only one angle comes round, got {self.unit!r} and {list(self.sources)}; drop it", "wraps")
         if turns and (self.sign, self.factor) != (1, 1.0):
             raise problem("a quaternion has none; turn the frame in the MJCF instead", "sign")
         return self

@@ -143,6 +143,9 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         time = time_of(name)
         values = _fitted(name, column, len(time))
         values = convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
+        if isinstance(entry, Measurement) and entry.wraps:
+            known = np.isfinite(values)
+            values[known] = np.unwrap(entry.factor * values[known]) / entry.factor
         return Series(time, entry.sign * entry.factor * values)
 
     measurements = [y for m in config.measurements for y in _aligned(m, [signal(m, column) for column in m.sources])]

@@ -14,6 +14,7 @@ from sipe_bayes.cli import check as check_commands
 from sipe_bayes.cli import data as data_commands
 from sipe_bayes.cli import discover as discover_commands
 from sipe_bayes.cli import explain as explain_commands
+from sipe_bayes.cli import init as init_commands
 from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
@@ -233,7 +234,7 @@ def print_calibration(calibration: Calibration) -> None:
 
 _PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which a newcomer needs them
     "Your machine": (
-        *(calibrate, discover_commands.discover, check_commands.check, suggest_commands.suggest),
+        *(init_commands.init, calibrate, discover_commands.discover, check_commands.check, suggest_commands.suggest),
         *(video_commands.video, explain_commands.explain),
     ),
     "Environments and policies": (envs, rl_commands.train, rl_commands.agents),

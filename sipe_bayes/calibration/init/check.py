@@ -1,0 +1,173 @@
+"""What is odd in a configuration that exists: units, signs, swapped columns, delays, velocities, angles that wrap."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sipe_bayes.calibration.config import Config, load_config
+from sipe_bayes.calibration.config_tables import Command, Measurement
+from sipe_bayes.calibration.init.decisions import decide
+from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
+from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Match
+from sipe_bayes.calibration.init.names import read_name
+from sipe_bayes.calibration.init.readings import with_velocities
+from sipe_bayes.calibration.init.signals import turn_of
+from sipe_bayes.calibration.init.tables import Opened, open_table
+from sipe_bayes.calibration.init.trials import Assumption, Trial
+from sipe_bayes.calibration.init.unknowns import delay_of
+from sipe_bayes.calibration.init.windows import (
+    FEW,
+    MANY,
+    Source,
+    delays_of,
+    loaded,
+    rough_unknowns,
+    trial_of,
+    tried_part,
+)
+from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.envs.mjcf import compile_spec, load_spec
+
+_LOGS = 3  # that are simulated
+_BETTER = np.log(1.5)  # of the logarithm of misses together, from which another reading is named
+
+
+def oddities(path: Path) -> list[str]:
+    """One line for each thing that simulations and slopes speak against.
+
+    Raises:
+        ConfigError: for a configuration that can not be used.
+        LogError: for a log that can not be used.
+        ModelError: for a model that does not compile.
+    """
+    config = load_config(path)
+    folder = path.parent
+    model = compile_spec(load_spec(str(config.model)), str(config.model))
+    machine = Machine.of(model)
+    train = config.logs_for("train")[:_LOGS]
+    opened = open_table(train[0].file, read_table(train[0].file))
+    draft = _draft_of(config, opened, folder)
+    part = tried_part(draft)
+    part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
+    sources = [Source(log.file, log.episodes[0] if log.episodes else None, log.span) for log in train]
+    logs = loaded(part, sources, folder)
+    trial, layout = trial_of(part, model, machine, logs, folder, FEW)
+    better = decide(part, machine, trial, layout)
+    now, then = np.log(trial.misses([trial.given, layout.assumption(trial, part, better.readings)], trial.theta)).sum(
+        axis=1
+    )
+    gain, out = _swapped(part, trial)
+    if float(now - then) > max(gain, _BETTER):
+        out = _other_readings(part, better, float(now - then))
+    if not out:
+        trial, _ = trial_of(part, model, machine, logs, folder, MANY)
+        left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=6)
+        late, note = delay_of([c.actuator for c in config.commands], left, logs[0].dt)
+        delays = [p for p in config.parameters if any(t.endswith(".delay") for t in p.targets)]
+        if late and not delays and not model.actuator_delay.any():
+            out.append(f"parameters: {note}; ask for actuator:{config.commands[0].actuator}.delay")
+        if late and delays and left.best * logs[0].dt > max(p.range[1] for p in delays):
+            out.append(f"parameters: {note}, beyond the bounds of {delays[0].name!r}; widen them")
+    return out + _slopes(draft, opened) + _turns(draft, opened)
+
+
+def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
+    """The configuration as a draft whose columns' names say no units."""
+
+    def reading(entry: Command | Measurement, columns: tuple[str, ...]) -> Reading:
+        label = replace(read_name(columns[0]), unit="")
+        quaternion = (entry.quaternion or "") if isinstance(entry, Measurement) else ""
+        match = Match(columns, entry.target, label, 1.0, quaternion)
+        wraps = isinstance(entry, Measurement) and entry.wraps
+        return Reading(match, entry.unit, entry.sign, entry.factor, wraps)
+
+    clock = replace(opened.clock, column=config.columns.time.column, unit=config.columns.time.unit)
+    return Draft(
+        Path(os.path.relpath(config.model, folder)).as_posix(),
+        clock,
+        config.columns.episode,
+        tuple(reading(c, (c.column,)) for c in config.commands),
+        tuple(reading(m, m.sources) for m in config.measurements),
+        (LogLine(str(config.logs[0].file.resolve())),),
+        "log",
+    )
+
+
+def _other_readings(draft: Draft, better: Draft, gain: float) -> list[str]:
+    """Units and signs with which the logs are followed better; gain: the logarithm of by how much."""
+    out = []
+    for now, then in zip(draft.readings, better.readings, strict=True):
+        table = "commands" if now.commanded else "measurements"
+        where = f"{table}, column {now.match.column!r}"
+        channels = len(draft.measurements)
+        times = f"simulated windows miss {np.exp(gain / channels):.2g} times as much with what stands there"
+        if now.unit != then.unit:
+            out.append(f"{where}: unit {now.unit!r} is odd, {then.unit!r} fits the log: {times}")
+        if now.sign != then.sign:
+            out.append(f"{where}: sign {now.sign} is odd, {then.sign} fits the log: {times}")
+    return out
+
+
+def _swapped(draft: Draft, trial: Trial) -> tuple[float, list[str]]:
+    """Two columns of one kind that fit better the other way round, with any signs, and the logarithm of by how much."""
+    given, count = trial.given, len(draft.measurements)
+    tried: list[tuple[str, Assumption]] = []
+    for a, b in itertools.combinations(range(len(draft.readings)), 2):
+        one, other = draft.readings[a], draft.readings[b]
+        if one.commanded != other.commanded or one.unit != other.unit:
+            continue
+        if any(len(r.match.columns) > 1 for r in draft.measurements):
+            continue
+        i, j = (a - count, b - count) if one.commanded else (a, b)
+        order = list(given.actuators if one.commanded else given.channels)
+        order[i], order[j] = order[j], order[i]
+        for signs in itertools.product((1.0, -1.0), repeat=2):
+            factors = list(given.driven if one.commanded else given.observed)
+            factors[i], factors[j] = signs
+            names = f"columns {one.match.column!r} and {other.match.column!r}"
+            now = (
+                replace(given, actuators=tuple(order), driven=tuple(factors))
+                if one.commanded
+                else replace(given, channels=tuple(order), observed=tuple(factors))
+            )
+            tried.append((names, now))
+    if not tried:
+        return 0.0, []
+    misses = np.log(trial.misses([given, *(now for _, now in tried)], trial.theta)).sum(axis=1)
+    best = int(np.argmin(misses[1:]))
+    gain, names = float(misses[0] - misses[1 + best]), tried[best][0]
+    if gain < _BETTER:
+        return 0.0, []
+    times = f"simulated windows miss {np.exp(gain / count):.2g} times as much as the other way round"
+    return gain, [f"{names} look swapped: {times}"]
+
+
+def _slopes(draft: Draft, opened: Opened) -> list[str]:
+    """Velocities whose unit or sign the slopes of their positions speak against."""
+    known = [r for r in draft.measurements if all(c in opened.columns for c in r.match.columns)]
+    out = []
+    for now, then in zip(known, with_velocities(known, opened.columns, draft.clock), strict=True):
+        where = f"measurements, column {now.match.column!r}"
+        if then.doubts:
+            out.append(f"{where}: {then.doubts[0]}")
+        elif (now.unit, now.sign) != (then.unit, then.sign):
+            sign = "-" if then.sign < 0 else ""
+            out.append(f"{where}: as the slope of its position it is {sign}{then.unit}, not {now.sign} x {now.unit}")
+    return out
+
+
+def _turns(draft: Draft, opened: Opened) -> list[str]:
+    """Angles that come round and are not written on."""
+    return [
+        f"measurements, column {r.match.column!r}: jumps by {turn:.5g} where the angle comes round; add `wraps = true`"
+        for r in draft.measurements
+        if len(r.match.columns) == 1 and not r.wraps and r.match.column in opened.columns
+        if r.match.target.endswith(".position") and (turn := turn_of(opened.columns[r.match.column]))
+    ]

@@ -1,0 +1,374 @@
+"""Units and signs by trying them: every combination of what the names leave open, by short simulations."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sipe_bayes.calibration.init.draft import Draft, Reading
+from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.machine import Drive, Machine
+from sipe_bayes.calibration.init.names import Kind
+from sipe_bayes.calibration.init.trials import Assumption, Trial
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.units import find_unit
+
+_MOST = 300  # combinations that are all simulated; beyond, one question after the other
+_CLEAR = np.log(1.5)  # of the logarithm of misses, from which a nominal simulation decides
+_DECIDED = np.log(1.12)  # and one whose unknowns are fitted
+_USELESS = 0.9  # of a straight line's miss, from which no simulation tells anything
+_POOR = 0.7  # of a straight line's miss, beyond which the nominal model is not believed
+_SAME = np.log(1.02)
+_AGAINST = np.log(2.0)  # from which a simulation is believed against a name
+_UNLIKELY = 0.01  # by which what is not likely has to be better
+_FITTED = 4  # combinations that are fitted where the nominal model does not decide
+_FIRST_DELAYS = (0, 1, 2, 4)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is open: the unit of some readings, or the sign of one.
+
+    Args:
+        readings: places in ``Draft.readings``.
+        units: unit words; empty for a sign.
+    """
+
+    readings: tuple[int, ...]
+    units: tuple[str, ...] = ()
+
+    @property
+    def answers(self) -> tuple[str | int, ...]:
+        """What may be answered, the likeliest first."""
+        return self.units or (1, -1)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a draft's readings are in a trial: channels of each measurement, number of each command."""
+
+    channels: tuple[tuple[int, ...], ...]  # of each reading; empty where the trial has none
+    commands: tuple[int | None, ...]
+
+    def assumption(self, trial: Trial, draft: Draft, readings: Sequence[Reading]) -> Assumption:
+        """What other units and signs mean for what was read as the draft says."""
+        observed, driven = list(trial.given.observed), list(trial.given.driven)
+        for k, (now, then) in enumerate(zip(readings, draft.readings, strict=True)):
+            factor = scale_of(now) / scale_of(then)
+            for channel in self.channels[k]:
+                observed[channel] *= factor
+            command = self.commands[k]
+            if command is not None:
+                driven[command] *= factor
+        return replace(trial.given, observed=tuple(observed), driven=tuple(driven))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A draft with its windows; theta (N,): the unknowns with which they are simulated."""
+
+    draft: Draft
+    machine: Machine
+    trial: Trial
+    layout: Layout
+    theta: FloatArray
+
+    def assumption(self, readings: Sequence[Reading]) -> Assumption:
+        """What other readings mean for the windows."""
+        return self.layout.assumption(self.trial, self.draft, readings)
+
+    def misses(self, sets: Sequence[Sequence[Reading]]) -> FloatArray:
+        """What simulations miss in each channel with each set of readings (H, C)."""
+        return self.trial.misses([self.assumption(readings) for readings in sets], self.theta)
+
+
+def scale_of(reading: Reading) -> float:
+    """What a column is multiplied by to be SI in the model's direction."""
+    return reading.sign * reading.factor * find_unit(reading.unit).factor
+
+
+def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
+    """The units that a column without one in its name may have, the likeliest first."""
+    target, kind = reading.match.target, reading.match.label.kind
+    if target.startswith("body:"):
+        return ("m", "mm", "cm") if target.endswith(".position") else (reading.unit,)
+    if target.startswith("sensor:"):
+        return (reading.unit,)
+    if target.startswith("joint:"):
+        joint = next(j for j in machine.joints if target.startswith(f"joint:{j.name}."))
+        if target.endswith(".position"):
+            return ("rad", "deg") if joint.hinge else ("m", "mm", "cm")
+        return ("rad/s", "deg/s", "rpm") if joint.hinge else ("m/s", "mm/s")
+    actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
+    hinge = actuator.joint is None or actuator.joint.hinge
+    if actuator.drive == Drive.POSITION:
+        return ("rad", "deg") if hinge else ("m", "mm", "cm")
+    if actuator.drive == Drive.VELOCITY:
+        return ("rad/s", "deg/s", "rpm") if hinge else ("m/s", "mm/s")
+    if kind == Kind.CURRENT:
+        return ("A", "mA")
+    if kind == Kind.VOLTAGE or (actuator.drive == Drive.VOLTAGE and kind != Kind.TORQUE):
+        return ("V", "mV")
+    if kind == Kind.TORQUE or reading.unit != "1":
+        return ("N m", "mN m") if hinge else ("N", "mN")
+    return ("1", "%")
+
+
+def questions(draft: Draft, machine: Machine) -> list[Question]:
+    """What the names leave open: one unit for alike columns without one, one sign for each scalar."""
+    groups: dict[tuple[str, ...], list[int]] = {}
+    signs = []
+    for k, reading in enumerate(draft.readings):
+        scalar = len(reading.match.columns) == 1
+        if not _is_tried(draft, reading):
+            continue
+        words = unit_words(reading, machine)
+        if not reading.match.label.unit and len(words) > 1 and reading.factor == 1:
+            own = "command" if reading.commanded else "measured"
+            groups.setdefault((own, *words), []).append(k)
+        if scalar:
+            signs.append(Question((k,)))
+    return [Question(tuple(members), words[1:]) for words, members in groups.items()] + signs
+
+
+def _is_tried(draft: Draft, reading: Reading) -> bool:
+    """Whether simulations say something of it: commands, positions, and velocities of joints without these."""
+    target = reading.match.target
+    if reading.match.quaternion or target.startswith("sensor:"):
+        return False
+    if target.endswith(".velocity"):
+        place = target.removesuffix("velocity") + "position"
+        return all(other.match.target != place for other in draft.measurements)
+    return not target.endswith(("angular_velocity", "linear_velocity"))
+
+
+@dataclass(frozen=True)
+class _Ranking:
+    """Answers that were tried (H tuples), the logarithm of what each misses in all channels together (H,)."""
+
+    answers: list[tuple[str | int, ...]]
+    scores: FloatArray
+
+    @property
+    def best(self) -> int:
+        return int(np.argmin(self.scores))
+
+    def gap(self, question: int, answer: str | int) -> float:
+        """By how much the best combination with another answer to a question is worse."""
+        other = [s for a, s in zip(self.answers, self.scores, strict=True) if a[question] == answer]
+        return float(min(other) - self.scores[self.best]) if other else np.inf
+
+
+def _unlikely(asked: Sequence[Question], answers: Sequence[str | int]) -> float:
+    """A little against turned signs and against units that are not the likeliest: they have to be better by it."""
+    return sum(_UNLIKELY for q, a in zip(asked, answers, strict=True) if a != q.answers[0])
+
+
+def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draft:
+    """The draft with the units and signs with which simulations miss least, their evidence and what stays open."""
+    asked = questions(draft, machine)
+    if not asked:
+        return draft
+    case = Case(draft, machine, trial, layout, trial.theta)
+    ranking = _ranked(case, asked)
+    flies = bool(trial.simulator.environment.rotations)  # what its contacts do is not seen in short windows
+    rivals = [] if flies else _rivals(ranking, len(trial.given.observed))
+    if rivals:
+        ranking, theta = _fitted(case, asked, ranking, rivals)
+        case = replace(case, theta=theta)
+    answers = ranking.answers[ranking.best]
+    readings = list(_answered(draft.readings, asked, answers))
+    base = case.misses([readings])[0]
+    for q in range(len(asked)):
+        readings = _with_evidence(case, asked, ranking, q, readings, base)
+    readings = _against_names(case, readings, base)
+    doubts = [*draft.doubts, *_mirrored(asked, ranking, readings)]
+    if float(np.log(base).mean()) > np.log(_USELESS):
+        doubts.append(
+            "no simulation follows these logs better than a straight line does, so units and signs stand on names "
+            "alone; look at the model and at what drives it"
+        )
+    measured = len(draft.measurements)
+    return replace(
+        draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]), doubts=tuple(doubts)
+    )
+
+
+def _mirrored(asked: Sequence[Question], ranking: _Ranking, readings: Sequence[Reading]) -> list[str]:
+    """Signs that may be turned round together."""
+    groups: list[frozenset[int]] = []
+    for q, question in enumerate(asked):
+        if question.units or ranking.gap(q, -int(ranking.answers[ranking.best][q])) >= _DECIDED:
+            continue
+        other = -int(ranking.answers[ranking.best][q])
+        rows = [i for i, a in enumerate(ranking.answers) if a[q] == other]
+        nearest = ranking.answers[min(rows, key=lambda i: float(ranking.scores[i]))]
+        pairs = zip(nearest, ranking.answers[ranking.best], strict=True)
+        groups.append(frozenset(k for k, (a, b) in enumerate(pairs) if a != b and not asked[k].units))
+    out = []
+    for group in sorted(set(groups), key=sorted):
+        names = " and ".join(repr(readings[asked[k].readings[0]].match.column) for k in sorted(group))
+        if len(group) > 1:
+            out.append(f"all moves alike with {names} turned round together: only how they go together is known")
+    return out
+
+
+def _answered(
+    readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[str | int]
+) -> tuple[Reading, ...]:
+    out = list(readings)
+    for question, answer in zip(asked, answers, strict=True):
+        for k in question.readings:
+            out[k] = replace(out[k], sign=answer) if isinstance(answer, int) else replace(out[k], unit=answer)
+    return tuple(out)
+
+
+def _ranked(case: Case, asked: Sequence[Question]) -> _Ranking:
+    """All combinations, or where they are too many the best that changing one or two answers at a time leads to."""
+    count = int(np.prod([len(q.answers) for q in asked]))
+    if count <= _MOST:
+        combinations = list(itertools.product(*(q.answers for q in asked)))
+        return _tried(case, asked, combinations)
+    seen: dict[tuple[str | int, ...], float] = {}
+    now: tuple[str | int, ...] = tuple(q.answers[0] for q in asked)
+    for _ in range(4):
+        around = [now, *_neighbours(now, asked)]
+        fresh = [a for a in around if a not in seen]
+        if not fresh:
+            break
+        tried = _tried(case, asked, fresh)
+        seen |= dict(zip(tried.answers, tried.scores.tolist(), strict=True))
+        now = min(seen, key=lambda a: seen[a])
+    return _Ranking(list(seen), np.array(list(seen.values())))
+
+
+def _neighbours(now: tuple[str | int, ...], asked: Sequence[Question]) -> list[tuple[str | int, ...]]:
+    """Combinations in which one answer is another, or two signs are turned."""
+    out = []
+    for q, question in enumerate(asked):
+        out += [(*now[:q], answer, *now[q + 1 :]) for answer in question.answers if answer != now[q]]
+    signs = [q for q, question in enumerate(asked) if not question.units]
+    for a, b in itertools.combinations(signs, 2):
+        both = list(now)
+        both[a], both[b] = -int(now[a]), -int(now[b])
+        out.append(tuple(both))
+    return out
+
+
+def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[str | int, ...]]) -> _Ranking:
+    sets = [_answered(case.draft.readings, asked, a) for a in answers]
+    misses = np.concatenate([case.misses(sets[i : i + 64]) for i in range(0, len(sets), 64)])
+    scores = np.log(misses).sum(axis=-1) + np.array([_odd_sizes(case, readings) for readings in sets])
+    scores += [_unlikely(asked, a) for a in answers]
+    return _Ranking(answers, scores)
+
+
+def _odd_sizes(case: Case, readings: Sequence[Reading]) -> float:
+    """A little against sizes that are rare: turns by the dozen, and motions of less than a degree or a millimetre."""
+    odd = 0.0
+    for k, (now, then) in enumerate(zip(readings, case.draft.readings, strict=True)):
+        for channel in case.layout.channels[k]:
+            size = max(float(np.nanmax(np.abs(log.observations[:, channel]))) for log in case.trial.logs)
+            size *= abs(scale_of(now) / scale_of(then))
+            angular = find_unit(now.unit).dimension == "angle"
+            odd += 0.1 * (size > (40.0 if angular else 20.0)) + 0.1 * (size < (0.02 if angular else 0.002))
+    return odd
+
+
+def _rivals(ranking: _Ranking, channels: int) -> list[int]:
+    """Combinations that miss hardly more than the best, and are no mirror images; the best ones where all miss much."""
+    order = [int(i) for i in np.argsort(ranking.scores, kind="stable")]
+    behind = ranking.scores - ranking.scores[order[0]]
+    if float(ranking.scores[order[0]]) > channels * np.log(_POOR):
+        return order[:_FITTED]
+    near = [i for i in order if behind[i] < _CLEAR]
+    return near[:_FITTED] if any(behind[i] > _SAME for i in near) else []
+
+
+def _fitted(case: Case, asked: Sequence[Question], ranking: _Ranking, rivals: list[int]) -> tuple[_Ranking, FloatArray]:
+    """The ranking with the model's unknowns fitted to the rivals, and these of the best.
+
+    The others stay as far behind the worst of the rivals as they were.
+    """
+    scores, thetas = [], []
+    for i in rivals:
+        readings = _answered(case.draft.readings, asked, ranking.answers[i])
+        left = fit(case.trial, case.assumption(readings), _FIRST_DELAYS, rounds=3)
+        odd = _odd_sizes(case, readings) + _unlikely(asked, ranking.answers[i])
+        scores.append(float(np.log(left.misses).sum()) + odd)
+        thetas.append(left.theta)
+    rest = [i for i in range(len(ranking.answers)) if i not in rivals]
+    shift = max(scores) - float(ranking.scores[rivals].max())
+    answers = [ranking.answers[i] for i in (*rivals, *rest)]
+    ranked = _Ranking(answers, np.array(scores + (ranking.scores[rest] + shift).tolist()))
+    return ranked, thetas[int(np.argmin(scores))]
+
+
+def _with_evidence(
+    case: Case,
+    asked: Sequence[Question],
+    ranking: _Ranking,
+    q: int,
+    readings: list[Reading],
+    base: FloatArray,
+) -> list[Reading]:
+    """What speaks for the answer to a question, or that nothing does."""
+    question, answer = asked[q], ranking.answers[ranking.best][q]
+    others = [a for a in question.answers if a != answer]
+    sets = [_answered(readings, [question], [other]) for other in others]
+    ratios = np.log(case.misses(sets) / base)
+    out = list(readings)
+    for other, ratio in zip(others, ratios, strict=True):
+        alone, together = float(ratio.sum()), ranking.gap(q, other)
+        times = f"{np.exp(ratio.max()):.2g}"
+        for k in question.readings:
+            note, doubt, instead = "", "", ""
+            if question.units:
+                note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
+                if together < _DECIDED:
+                    note, doubt = "", f"{answer} or {other}? simulations follow the log as well with either"
+                    instead = f'unit = "{other}"'
+            elif alone < _DECIDED and together < _DECIDED:
+                doubt, instead = "its sign does not show in these logs", f"sign = {other}"
+            elif together < _DECIDED:
+                note = (
+                    f"sign {answer}: alone it can not be turned ({times} times the miss), but all moves alike where "
+                    "the others that belong to it are turned too"
+                )
+            else:
+                note = f"sign {answer}: turned round, simulated windows miss {times} times as much"
+            out[k] = replace(
+                out[k],
+                notes=(*out[k].notes, *([note] if note else [])),
+                doubts=(*out[k].doubts, *([doubt] if doubt else [])),
+                instead=(*out[k].instead, *([instead] if instead else [])),
+            )
+    return out
+
+
+def _against_names(case: Case, readings: list[Reading], base: FloatArray) -> list[Reading]:
+    """Units that stand in names, held against simulations with others."""
+    out = list(readings)
+    for k, reading in enumerate(readings):
+        label = reading.match.label
+        if not label.unit or reading.match.quaternion or not _is_tried(case.draft, reading):
+            continue
+        others = [u for u in unit_words(reading, case.machine) if u != reading.unit]
+        sets = [[replace(r, unit=u) if i == k else r for i, r in enumerate(readings)] for u in others]
+        if not sets:
+            continue
+        gaps = np.log(case.misses(sets) / base).sum(axis=1)
+        best = int(np.argmin(gaps))
+        note = f"{reading.unit}, as its name says"
+        if gaps[best] < -_AGAINST:
+            text = f"its name says {reading.unit}, but simulations follow it far better in {others[best]}"
+            out[k] = replace(
+                reading, doubts=(*reading.doubts, text), instead=(*reading.instead, f'unit = "{others[best]}"')
+            )
+        else:
+            agrees = "; simulations agree" if gaps[best] > _DECIDED else ""
+            out[k] = replace(reading, notes=(note + agrees, *reading.notes))
+    return out

@@ -1,0 +1,164 @@
+"""What is proposed, as data: how columns are read, with evidence and doubts, logs, unknowns; and its configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sipe_bayes.calibration.config import Config
+from sipe_bayes.calibration.config_tables import Use
+from sipe_bayes.calibration.init.matching import Match
+from sipe_bayes.calibration.init.tables import Clock
+
+Row = dict[str, object]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How columns are read.
+
+    Args:
+        match: the columns and what they are.
+        unit: unit word.
+        sign: 1 or -1.
+        factor: beside the unit.
+        wraps: whether jumps by a turn are taken out.
+        fit: False for what only starts windows.
+        notes: the evidence, each a comment.
+        doubts: what could not be decided, each a comment and told.
+        instead: lines of TOML that are the alternative where something could not be decided.
+    """
+
+    match: Match
+    unit: str
+    sign: int = 1
+    factor: float = 1.0
+    wraps: bool = False
+    fit: bool = True
+    notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    instead: tuple[str, ...] = ()
+
+    @property
+    def commanded(self) -> bool:
+        """Whether it drives an actuator."""
+        return self.match.target.startswith("actuator:")
+
+    def row(self) -> Row:
+        """Its table in the configuration."""
+        match = self.match
+        row: Row = {}
+        if self.commanded:
+            row["actuator"] = match.target.removeprefix("actuator:")
+        else:
+            row["target"] = match.target
+        row |= {"column": match.column} if len(match.columns) == 1 else {"columns": list(match.columns)}
+        if match.quaternion:
+            return row | {"quaternion": match.quaternion}
+        row["unit"] = self.unit
+        row |= {"sign": self.sign} if self.sign != 1 else {}
+        row |= {"factor": self.factor} if self.factor != 1 else {}
+        row |= {"wraps": True} if self.wraps else {}
+        return row | ({} if self.fit else {"fit": False})
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter that is proposed; left_out says why it stands in a comment only."""
+
+    name: str
+    targets: tuple[str, ...]
+    low: float
+    high: float
+    relative: bool
+    note: str
+    left_out: str = ""
+
+    def row(self) -> Row:
+        """Its table in the configuration."""
+        target: Row = {"target": self.targets[0]} if len(self.targets) == 1 else {"targets": list(self.targets)}
+        row: Row = {"name": self.name}
+        return row | target | {"factor" if self.relative else "bounds": [self.low, self.high]}
+
+
+@dataclass(frozen=True)
+class LogLine:
+    """A log or a part of it; file relative to the configuration."""
+
+    file: str
+    use: Use = "train"
+    name: str = ""
+    span: tuple[float, float] | None = None
+    episodes: tuple[int, ...] = ()
+
+    def row(self) -> Row:
+        """Its table in the configuration."""
+        row: Row = {"file": self.file}
+        row |= {"name": self.name} if self.name else {}
+        row |= {"use": self.use} if self.use != "train" else {}
+        row |= {"span": list(self.span)} if self.span else {}
+        return row | ({"episodes": list(self.episodes)} if self.episodes else {})
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A configuration with its evidence.
+
+    Args:
+        model: the MJCF, relative to the configuration.
+        clock: the log's clock.
+        episode: the column that numbers episodes.
+        commands: columns that drive actuators.
+        measurements: columns that measure.
+        logs: that train, and that are held out.
+        window: s, or "log".
+        window_note: why.
+        unknowns: parameters, those that are left out among them.
+        doubts: what could not be decided, beside what readings say.
+        notes: of the whole.
+        delay: of the commands, in samples.
+    """
+
+    model: str
+    clock: Clock
+    episode: str | None
+    commands: tuple[Reading, ...]
+    measurements: tuple[Reading, ...]
+    logs: tuple[LogLine, ...]
+    window: float | str
+    window_note: str = ""
+    unknowns: tuple[Unknown, ...] = ()
+    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    delay: float = 0.0
+
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """Measurements, then commands."""
+        return (*self.measurements, *self.commands)
+
+    @property
+    def proposed(self) -> tuple[Unknown, ...]:
+        """The unknowns that are asked for."""
+        return tuple(unknown for unknown in self.unknowns if not unknown.left_out)
+
+    @property
+    def told(self) -> list[str]:
+        """Everything that could not be decided."""
+        own = [self.clock.doubt] if self.clock.doubt else []
+        return own + [f"{r.match.column!r}: {doubt}" for r in self.readings for doubt in r.doubts] + list(self.doubts)
+
+    def config(self, folder: Path) -> Config:
+        """The configuration that it stands for; paths are relative to the folder."""
+        columns: Row = {"time": {"column": self.clock.column, "unit": self.clock.unit}}
+        columns |= {"episode": self.episode} if self.episode else {}
+        data: Row = {
+            "model": self.model,
+            "window": self.window,
+            "columns": columns,
+            "commands": [reading.row() for reading in self.commands],
+            "measurements": [reading.row() for reading in self.measurements],
+            "logs": [log.row() for log in self.logs],
+            "parameters": [unknown.row() for unknown in self.proposed],
+        }
+        return Config.model_validate(data, context={"folder": folder})

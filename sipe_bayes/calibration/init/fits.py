@@ -1,0 +1,194 @@
+"""What is left of windows when the model's unknowns and the windows' starts may move, for each delay of the commands.
+
+Gauss-Newton on the windows of a ``Trial``: starts are eliminated window by window, unknowns stay within their bounds.
+Each delay has values and starts of its own; the slopes are those at the best delay, for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+
+from sipe_bayes.calibration.init.trials import Assumption, Trial, spread_of
+from sipe_bayes.core.arrays import FloatArray
+
+_STEP = 0.02  # of the cube, of finite differences
+_START_STEP = 1e-4  # rad or m, rad/s or m/s
+_PRIOR = 0.4  # sd in the cube of what a model does not know
+_LOOSE = 1e-6  # what starts that nothing tells are held by
+_LOST = 1e6  # of a simulation that has diverged
+_LEAST = 2e-3  # of the motion: noise is taken for no smaller
+_SETTLED = 0.1  # of the logarithm of what is left, of all channels together
+_EVEN = 4.0  # both sides of the best delay are about as steep, or no parabola goes through them
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What is left when the unknowns may move.
+
+    Args:
+        delays: control steps that were tried, rising.
+        miss: (D,) what is left at each, in terms of what is at the best.
+        theta: (N,) of the unknowns at the best.
+        jacobian: (R, N) of what is left there, in units of its size.
+        misses: (C,) as ``Trial.misses``, starts having moved.
+    """
+
+    delays: tuple[int, ...]
+    miss: FloatArray
+    theta: FloatArray
+    jacobian: FloatArray
+    misses: FloatArray
+
+    @property
+    def best(self) -> int:
+        """The delay that leaves least."""
+        return self.delays[int(np.argmin(self.miss))]
+
+    @property
+    def finer(self) -> float:
+        """The same, between control steps: where a parabola through three has its lowest point."""
+        i = int(np.argmin(self.miss))
+        if 0 < i < len(self.delays) - 1:
+            x, y = np.array(self.delays[i - 1 : i + 2], float), self.miss[i - 1 : i + 2] ** 2
+            curve = np.polyfit(x, y, 2)
+            if curve[0] > 0 and y.max() - y[1] < _EVEN * (y[y > y[1]].min() - y[1]):
+                return float(np.clip(-curve[1] / (2 * curve[0]), x[0], x[2]))
+        return float(self.delays[i])
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Values (N,) and moved starts (W, F) at one delay, and the logarithm of what they leave; infinite before."""
+
+    theta: FloatArray
+    starts: FloatArray
+    cost: float = np.inf
+
+
+@dataclass(frozen=True)
+class _Slopes:
+    """Differences left (D, W, R) in units of ``size`` (C,), slopes by_theta (N, W, R) and by_start (W, R, F)."""
+
+    left: FloatArray
+    by_theta: FloatArray
+    by_start: FloatArray
+    size: FloatArray
+
+    @property
+    def inner(self) -> FloatArray:
+        """(W, F, F) of the starts."""
+        free = self.by_start
+        return np.einsum("wrf,wrg->wfg", free, free) + _LOOSE * np.eye(free.shape[2])
+
+    def start_of(self, values: FloatArray) -> FloatArray:
+        """What starts (..., W, F) take of differences (..., W, R)."""
+        taken = np.einsum("wrf,...wr->...wf", self.by_start, values)
+        return np.asarray(np.linalg.solve(self.inner, taken[..., None])[..., 0])
+
+    def without(self, values: FloatArray) -> FloatArray:
+        """What starts leave of differences (..., W, R)."""
+        return values - np.einsum("wrf,...wf->...wr", self.by_start, self.start_of(values))
+
+
+def fit(trial: Trial, assumption: Assumption, delays: Sequence[int], rounds: int) -> Fit:
+    """Gauss-Newton steps at every delay, of which those near the best are followed.
+
+    Args:
+        trial: windows and simulations.
+        assumption: how columns are read; its delay is where the search begins.
+        delays: control steps that are tried first.
+        rounds: of steps.
+    """
+    zero = np.zeros((trial.flight(assumption).count, 2 * trial.simulator.model.nv))
+    points = {d: _Point(trial.theta, zero) for d in sorted({*delays, assumption.delay})}
+    tentative, best = dict(points), assumption.delay
+    widest, last = max(points), np.inf
+    for turn in range(rounds):
+        slopes = _slopes(trial, assumption, tentative, best)
+        costs = _costs(slopes, trial)
+        for (d, point), cost in zip(list(tentative.items()), costs, strict=True):
+            known = points.get(d, point)
+            if cost > known.cost:  # the last step went too far
+                tentative[d] = _Point(0.5 * (known.theta + point.theta), 0.5 * (known.starts + point.starts))
+            else:
+                points[d] = replace(point, cost=cost)
+        best = min(tentative, key=lambda d: points[d].cost)
+        if turn == rounds - 1 or last - points[best].cost < _SETTLED:
+            break
+        last = points[best].cost
+        tentative = _stepped(slopes, tentative, points)
+        if turn:
+            near = [d for d in range(best - 2, best + 3) if 0 <= d <= widest]
+            tentative = {d: tentative.get(d, tentative[best]) for d in sorted({0, *near})}
+    return _outcome(trial, slopes, {d: points[d] for d in sorted(tentative) if d in points}, best)
+
+
+def _slopes(trial: Trial, assumption: Assumption, points: dict[int, _Point], best: int) -> _Slopes:
+    """Simulations at all points, and differences of them at the best one."""
+    here, simulator = points[best], trial.simulator
+    n, free = len(here.theta), here.starts.shape[1]
+    signs = np.where(here.theta + _STEP > 1, -1.0, 1.0)
+    thetas = [point.theta for point in points.values()]
+    flights = [trial.flight(replace(assumption, delay=d)).moved(simulator, p.starts) for d, p in points.items()]
+    base = trial.flight(replace(assumption, delay=best))
+    thetas += list(here.theta + _STEP * np.diag(signs)) + [here.theta] * free
+    flights += [base.moved(simulator, here.starts)] * n
+    flights += [base.moved(simulator, here.starts + _START_STEP * row) for row in np.eye(free)]
+    measured, seen = base.measured, trial.seen(flights, np.stack(thetas))
+    at, count = list(points).index(best), len(points)
+    size = np.maximum(
+        spread_of(trial.bent(measured - seen[at : at + 1]))[0], _LEAST * spread_of(trial.bent(measured[None]))[0]
+    )
+    scaled = np.nan_to_num((measured - seen) / np.maximum(size, 1e-12), nan=_LOST, posinf=_LOST, neginf=-_LOST)
+    flat = np.clip(scaled, -_LOST, _LOST).reshape(len(seen), len(measured), -1)
+    by_theta = (flat[count : count + n] - flat[at]) / (signs * _STEP)[:, None, None]
+    by_start = np.moveaxis((flat[count + n :] - flat[at]) / _START_STEP, 0, 2)
+    return _Slopes(flat[:count], by_theta, by_start, size)
+
+
+def _by_channel(values: FloatArray, channels: int) -> FloatArray:
+    """Root mean squares (D, C) of differences (D, W, R)."""
+    return np.asarray(np.sqrt((values.reshape(len(values), -1, channels) ** 2).mean(axis=1)))
+
+
+def _costs(slopes: _Slopes, trial: Trial) -> FloatArray:
+    """The logarithm of what is left at each delay (D,), starts having moved, of all channels together."""
+    sizes = slopes.size * np.maximum(_by_channel(slopes.without(slopes.left), len(slopes.size)), _LEAST)
+    return np.asarray(np.log(sizes).sum(axis=1))
+
+
+def _stepped(slopes: _Slopes, tentative: dict[int, _Point], points: dict[int, _Point]) -> dict[int, _Point]:
+    """The next step at each delay, within the bounds; those whose last one went too far keep their half of it."""
+    n = len(slopes.by_theta)
+    by_theta = slopes.without(slopes.by_theta).reshape(n, -1)
+    root = np.linalg.cholesky(by_theta @ by_theta.T + np.eye(n) / _PRIOR**2)
+    out = {}
+    for (d, point), left in zip(tentative.items(), slopes.left, strict=True):
+        if points[d].theta is not point.theta:
+            out[d] = point
+            continue
+        wanted = np.linalg.solve(root, -by_theta @ slopes.without(left[None]).ravel())
+        step = np.linalg.solve(root.T, wanted)
+        if n and ((point.theta + step < 0) | (point.theta + step > 1)).any():
+            room = (-point.theta - 1e-9, 1 - point.theta + 1e-9)
+            step = scipy.optimize.lsq_linear(root.T, wanted, room, method="bvls").x
+        moved = point.starts - slopes.start_of(left + np.einsum("n,nwr->wr", step, slopes.by_theta))
+        out[d] = _Point(np.clip(point.theta + step, 0.0, 1.0), moved)
+    return out
+
+
+def _outcome(trial: Trial, slopes: _Slopes, points: dict[int, _Point], best: int) -> Fit:
+    costs = np.array([point.cost for point in points.values()])
+    channels = len(slopes.size)
+    whole = np.maximum(spread_of(trial.bent(trial.flight(trial.given).measured[None]))[0], 1e-12)
+    n = len(slopes.by_theta)
+    by_theta = slopes.without(slopes.by_theta).reshape(n, -1)
+    at = points[best]
+    mean = float(np.exp(at.cost / channels)) / float(np.exp(np.log(slopes.size).mean()))
+    misses = np.full(channels, np.exp(at.cost / channels)) / np.exp(np.log(whole).mean())
+    miss = np.exp(np.clip((costs - at.cost) / channels, -20, 20))
+    return Fit(tuple(points), miss, at.theta, by_theta.T / max(mean, _LEAST), misses)

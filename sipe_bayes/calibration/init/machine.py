@@ -1,0 +1,94 @@
+"""What of a compiled model a log may hold: hinges and slides, actuators, free bodies, inertial sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import mujoco
+import numpy as np
+
+
+class Drive(Enum):
+    """What an actuator is given."""
+
+    FORCE = "a torque or force"
+    POSITION = "a set-point of the position"
+    VELOCITY = "a set-point of the velocity"
+    VOLTAGE = "a voltage"
+    OTHER = "a command"
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A hinge or slide and its body; rank: its place among these."""
+
+    name: str
+    body: str
+    hinge: bool
+    rank: int
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """An actuator with one control, what it is given, and the joint that it moves."""
+
+    name: str
+    drive: Drive
+    joint: Joint | None
+    rank: int
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What of a model a log may hold."""
+
+    joints: tuple[Joint, ...]
+    actuators: tuple[Actuator, ...]
+    bodies: tuple[str, ...]  # that move freely
+    sensors: tuple[tuple[str, str], ...]  # name and quantity of those of three numbers
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> Machine:
+        """Read a compiled model."""
+        scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+        named = [i for i in range(model.njnt) if int(model.jnt_type[i]) in scalar and model.joint(i).name]
+        joints = [
+            Joint(
+                model.joint(i).name, model.body(int(model.jnt_bodyid[i])).name, int(model.jnt_type[i]) == scalar[0], k
+            )
+            for k, i in enumerate(named)
+        ]
+        by_id = dict(zip(named, joints, strict=True))
+        actuators = [
+            Actuator(model.actuator(i).name, _drive(model, i), by_id.get(_joint_of(model, i)), k)
+            for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
+        ]
+        free = [i for i in range(model.njnt) if int(model.jnt_type[i]) not in scalar]
+        bodies = [model.body(int(model.jnt_bodyid[i])).name for i in free]
+        kinds = {int(mujoco.mjtSensor.mjSENS_GYRO): "gyro", int(mujoco.mjtSensor.mjSENS_ACCELEROMETER): "accelerometer"}
+        sensors = [(model.sensor(i).name, kinds.get(int(model.sensor_type[i]), "")) for i in range(model.nsensor)]
+        return cls(tuple(joints), tuple(actuators), tuple(b for b in bodies if b), tuple(s for s in sensors if s[1]))
+
+
+def _drive(model: mujoco.MjModel, index: int) -> Drive:
+    if int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_DCMOTOR):
+        return Drive.VOLTAGE
+    if int(model.actuator_gaintype[index]) != int(mujoco.mjtGain.mjGAIN_FIXED):
+        return Drive.OTHER
+    if int(model.actuator_biastype[index]) == int(mujoco.mjtBias.mjBIAS_NONE):
+        return Drive.FORCE
+    gain, (_, of_position, of_velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
+    if of_position:
+        return Drive.POSITION
+    if not of_velocity:
+        return Drive.FORCE
+    return Drive.VELOCITY if np.isclose(gain, -of_velocity) else Drive.VOLTAGE
+
+
+def _joint_of(model: mujoco.MjModel, index: int) -> int:
+    """The joint that an actuator moves, itself or by its tendon's first; -1 for none."""
+    kind, at = int(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
+    if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
+        return int(model.wrap_objid[model.tendon_adr[at]])
+    return at if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)) else -1

@@ -1,0 +1,331 @@
+"""Which column is which quantity of the model: by names, numbers and order, and by what is the slope of what."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import scipy.optimize
+
+from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
+from sipe_bayes.calibration.init.names import Kind, Label, alike, number_of, read_name
+from sipe_bayes.calibration.init.signals import slope_of
+from sipe_bayes.core.arrays import FloatArray
+
+Table = Mapping[str, FloatArray]
+
+_SURE = 1.0  # a score from which names alone decide
+_NEVER = -2.0
+_RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
+
+
+@dataclass(frozen=True)
+class Match:
+    """Columns that are taken for a quantity of the model; score: how well the names agree."""
+
+    columns: tuple[str, ...]
+    target: str
+    label: Label
+    score: float
+    quaternion: str = ""
+
+    @property
+    def column(self) -> str:
+        """The one column, or the first."""
+        return self.columns[0]
+
+    @property
+    def sure(self) -> bool:
+        """Whether names alone tell it."""
+        return self.score >= _SURE
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Every quantity of the model that has a column; rivals: commands that would have done as well."""
+
+    positions: tuple[Match, ...]
+    velocities: tuple[Match, ...]
+    commands: tuple[Match, ...]
+    vectors: tuple[Match, ...]
+    rivals: tuple[Match, ...]
+    left: tuple[str, ...]
+
+
+def match_columns(machine: Machine, table: Table) -> Matches:
+    """Match varying columns to a model; table: column -> (n,) numbers of one log, without its clocks."""
+    labels = [read_name(name) for name in table]
+    labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
+    vectors, labels = _vectors(machine, labels)
+    labels = _unravelled(machine, labels, table)
+    offsets = _ordinals(labels)
+    positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
+    velocities = _by_position(positions, _assigned(machine.joints, labels, Kind.VELOCITY, offsets), table)
+    commands, rivals = _commands(machine, labels, offsets)
+    used = {c for m in (*positions, *velocities, *commands, *vectors) for c in m.columns}
+    left = tuple(name for name in table if name not in used)
+    return Matches(tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left)
+
+
+def _ordinals(labels: Sequence[Label]) -> dict[str, int]:
+    """Of a column with a number, its place within its family, counted from 0."""
+    families: dict[str, set[int]] = defaultdict(set)
+    for label in labels:
+        if label.number is not None:
+            families[label.stem].add(label.number)
+    return {
+        x.column: sorted(families[x.stem]).index(x.number)
+        for x in labels
+        if x.number is not None and len(families[x.stem]) > 1
+    }
+
+
+def _affinity(label: Label, name: str, rank: int, hinge: bool | None, place: int | None, count: int) -> float:
+    """How well a column's name fits an object of the model."""
+    score = 3.0 * alike(label.words, name)
+    if label.words and not score:
+        score -= 0.3 * len(label.words)  # it speaks of something else
+    own = number_of(name)
+    if place is not None:
+        same = label.number == own if own is not None and not label.words else place == rank
+        score += 1.2 if place == rank else 1.0 if same else -1.5
+    elif label.number is not None and own is not None and count > 1:
+        score += 1.2 if label.number == own else -1.5
+    if hinge is not None and label.angular is not None:
+        score += 0.6 if label.angular == hinge else _NEVER
+    return score - 0.01 * rank
+
+
+def _of_joint(label: Label, joint: Joint, place: int | None, count: int) -> float:
+    """How well a column's name fits a joint, by its own name or its body's."""
+    own, body = (
+        _affinity(label, name, joint.rank, joint.hinge, place, count) for name in (joint.name, joint.body or joint.name)
+    )
+    return max(own, body - 0.1)
+
+
+def _solved(scores: FloatArray) -> list[tuple[int, int]]:
+    """Pairs (column, object) of the best assignment that are not excluded."""
+    rows, objects = scipy.optimize.linear_sum_assignment(-np.maximum(scores, _NEVER - 1))
+    return [(int(i), int(j)) for i, j in zip(rows, objects, strict=True) if scores[i, j] > _NEVER / 2]
+
+
+def _assigned(joints: Sequence[Joint], labels: Sequence[Label], kind: Kind, places: Mapping[str, int]) -> list[Match]:
+    """Columns of positions or velocities, each to the joint that it fits best."""
+    labels = [label for label in labels if label.kind == kind]
+    if not labels or not joints:
+        return []
+    scores = np.array([[_of_joint(x, j, places.get(x.column), len(joints)) for j in joints] for x in labels])
+    scores += [[0.05 * x.measured - 0.002 * k] for k, x in enumerate(labels)]
+    word = "position" if kind == Kind.POSITION else "velocity"
+    alone = len(labels) == len(joints) == 1
+    pairs = sorted(_solved(scores), key=lambda pair: pair[1])
+    return [
+        Match((labels[i].column,), f"joint:{joints[j].name}.{word}", labels[i], _surety(scores, i, j, alone))
+        for i, j in pairs
+    ]
+
+
+def _surety(scores: FloatArray, i: int, j: int, alone: bool) -> float:
+    """By how much a pair is better than the next best object for its column."""
+    if alone:
+        return _SURE
+    others = np.delete(scores[i], j)
+    return float(min(scores[i, j], scores[i, j] - others.max()) if others.size else scores[i, j] + 0.5)
+
+
+def _by_position(positions: Sequence[Match], velocities: Sequence[Match], table: Table) -> list[Match]:
+    """Velocities exchanged among the joints where the slopes of positions tell so."""
+    places = {m.target.removesuffix("position"): table[m.column] for m in positions}
+    targets = [m.target for m in velocities]
+    scores = np.zeros((len(velocities), len(velocities)))
+    for i, match in enumerate(velocities):
+        for j, target in enumerate(targets):
+            place = places.get(target.removesuffix("velocity"))
+            share = 0.0 if place is None else slope_of(place, table[match.column]).share
+            scores[i, j] = share + 0.2 * (i == j)
+    rows, objects = scipy.optimize.linear_sum_assignment(-scores)
+    pairs = sorted(zip(objects.tolist(), rows.tolist(), strict=True))
+    return [replace(velocities[i], target=targets[j]) for j, i in pairs]
+
+
+_FITS: dict[Drive, dict[Kind, float]] = {
+    Drive.FORCE: {Kind.TORQUE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 2.0, Kind.VOLTAGE: 1.8, Kind.SETPOINT: 0.3},
+    Drive.POSITION: {Kind.SETPOINT: 3.0, Kind.COMMAND: 2.6},
+    Drive.VELOCITY: {Kind.SPEED_SETPOINT: 3.0, Kind.COMMAND: 2.6, Kind.SETPOINT: 0.3},
+    Drive.VOLTAGE: {Kind.VOLTAGE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 0.5, Kind.TORQUE: 0.3, Kind.SETPOINT: 0.2},
+    Drive.OTHER: {Kind.COMMAND: 3.0, Kind.SETPOINT: 2.4, Kind.TORQUE: 2.0, Kind.VOLTAGE: 2.0, Kind.CURRENT: 1.5},
+}
+
+
+def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, int]) -> tuple[list[Match], list[Match]]:
+    """Columns of commands to actuators, and those that would have fitted as well."""
+    actuators = machine.actuators
+    labels = [x for x in labels if any(x.kind in fits for fits in _FITS.values()) or x.kind == Kind.SPEED_SETPOINT]
+    if not labels or not actuators:
+        return [], []
+
+    def score(label: Label, actuator: Actuator) -> float:
+        fit = _FITS[actuator.drive].get(label.kind)
+        if fit is None:
+            return _NEVER - 1
+        place, count = places.get(label.column), len(actuators)
+        by_name = _affinity(label, actuator.name, actuator.rank, None, place, count)
+        joint = actuator.joint
+        by_joint = _of_joint(label, replace(joint, rank=actuator.rank), place, count) if joint else by_name
+        return fit - 2.6 + max(by_name, by_joint - 0.05) - 0.3 * label.measured
+
+    scores = np.array([[score(x, a) for a in actuators] for x in labels])
+    scores -= [[0.002 * k] for k in range(len(labels))]
+    pairs = sorted(_solved(scores), key=lambda pair: pair[1])
+    alone = len(actuators) == 1
+    commands, rivals = [], []
+    for i, j in pairs:
+        target = f"actuator:{actuators[j].name}"
+        surety = _surety(scores, i, j, False) if not alone else _SURE
+        commands.append(Match((labels[i].column,), target, labels[i], surety))
+        for k in np.argsort(-scores[:, j]):
+            free = k not in {i for i, _ in pairs}
+            if free and scores[k, j] > max(scores[i, j] - _RIVAL, -0.5):
+                rivals.append(Match((labels[k].column,), target, labels[k], float(scores[k, j])))
+    return commands, rivals
+
+
+def _unravelled(machine: Machine, labels: list[Label], table: Table) -> list[Label]:
+    """Labels with kinds for columns whose names say none: by how many they are, and what is the slope of what."""
+    unknown = [x for x in labels if x.kind == Kind.UNKNOWN]
+    families: dict[str, list[Label]] = defaultdict(list)
+    for label in unknown:
+        families[label.stem if label.number is not None else ""].append(label)
+    known = {x.column: x for x in labels}
+    joints = len(machine.joints)
+    have = sum(x.kind == Kind.POSITION for x in labels)
+    for stem, family in families.items():
+        family = sorted(family, key=lambda x: x.number or 0)
+        kinds = [Kind.OTHER] * len(family)
+        if stem and joints and not have and len(family) in (joints, 2 * joints):
+            kinds = _kinds(family, table, joints)
+        elif not stem:
+            kinds = _by_slopes(family, labels, table)
+        for label, kind in zip(family, kinds, strict=True):
+            place = None if kind == Kind.OTHER or not stem else [k for k in kinds[: family.index(label)]].count(kind)
+            number = label.number if place is None else place
+            known[label.column] = replace(label, kind=kind, number=number, stem=f"{label.stem}{kind.name}")
+    return list(known.values())
+
+
+def _kinds(family: Sequence[Label], table: Table, joints: int) -> list[Kind]:
+    """Positions of a state array, then velocities; or one after the other, where the slopes tell so."""
+    if len(family) == joints:
+        return [Kind.POSITION] * joints
+    interleaved = [Kind.POSITION, Kind.VELOCITY] * joints
+    blocks = [Kind.POSITION] * joints + [Kind.VELOCITY] * joints
+    values = [table[x.column] for x in family]
+    return interleaved if joints > 1 and _slopes(values, 2, 1) > _slopes(values, 1, joints) else blocks
+
+
+def _slopes(values: Sequence[FloatArray], step: int, ahead: int) -> float:
+    """How well each column ``ahead`` of another is its slope."""
+    pairs = [(values[i], values[i + ahead]) for i in range(0, len(values) - ahead, step)][: len(values) // 2]
+    return sum(slope_of(p, v).share for p, v in pairs)
+
+
+def _by_slopes(family: Sequence[Label], labels: Sequence[Label], table: Table) -> list[Kind]:
+    """A column is a velocity where it is the slope of a position, or of another one of them, which then is one."""
+    kinds = {x.column: Kind.OTHER for x in family}
+    places = [x.column for x in labels if x.kind == Kind.POSITION]
+    for label in family:
+        if any(slope_of(table[p], table[label.column]).share > 0.8 for p in places):
+            kinds[label.column] = Kind.VELOCITY
+        elif "d" in label.column.lower() and label.column.lower().rstrip("0123456789").endswith("d"):
+            kinds[label.column] = Kind.SETPOINT  # q_d that is no slope: desired
+        elif not places:
+            others = [x.column for x in family if x is not label]
+            if any(slope_of(table[label.column], table[o]).share > 0.8 for o in others):
+                kinds[label.column] = Kind.POSITION
+            elif any(slope_of(table[o], table[label.column]).share > 0.8 for o in others):
+                kinds[label.column] = Kind.VELOCITY
+    return list(kinds.values())
+
+
+def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[Label]]:
+    """Poses of free bodies and readings of inertial sensors: groups of three or four columns; and what is left."""
+    groups: dict[str, list[Label]] = defaultdict(list)
+    for label in labels:
+        if label.axis or label.number is not None:
+            stem = label.column[: -len(label.axis)] if label.axis else label.stem
+            groups[stem if label.axis else label.stem].append(label)
+    out: list[Match] = []
+    taken: set[str] = set()
+    for wanted, size, target_of in _wanted(machine):
+        for stem, group in groups.items():
+            part = [x for x in group if x.column not in taken]
+            fitting = [x for x in part if wanted(x, stem)]
+            if len(fitting) != size:
+                continue
+            order = "xyz" if size == 3 else ("wxyz" if fitting[0].axis in ("w", "") else "xyzw")
+            if fitting[0].axis:
+                fitting = sorted(fitting, key=lambda x: order.index(x.axis))
+            else:
+                fitting = sorted(fitting, key=lambda x: x.number or 0)
+            target, score = target_of(stem)
+            if any(m.target == target for m in out):
+                continue
+            quaternion = order if size == 4 else ""
+            columns = tuple(x.column for x in fitting)
+            taken |= set(columns)
+            sure = score if fitting[0].axis or size == 3 else 0.0
+            out.append(Match(columns, target, fitting[0], sure, quaternion))
+    return out, [x for x in labels if x.column not in taken]
+
+
+Wanted = tuple[Callable[[Label, str], bool], int, Callable[[str], tuple[str, float]]]
+
+
+def _wanted(machine: Machine) -> list[Wanted]:
+    """What vectors a model may have: whether a column is one of them, how many, and the target of a stem."""
+    out: list[Wanted] = [
+        (_of_gyro if kind == "gyro" else _of_accelerometer, 3, partial(_sensor, name)) for name, kind in machine.sensors
+    ]
+    if machine.bodies:
+        out.append((_turns, 4, partial(_body, machine, "orientation")))
+        out.append((lambda x, s: x.kind == Kind.POSITION and not _turns(x, s), 3, partial(_body, machine, "position")))
+        out.append((_spins, 3, partial(_body, machine, "angular_velocity")))
+        out.append(
+            (lambda x, s: x.kind == Kind.VELOCITY and not _spins(x, s), 3, partial(_body, machine, "linear_velocity"))
+        )
+    return out
+
+
+def _speaks(stem: str, *words: str) -> bool:
+    return any(word in stem.lower() for word in words)
+
+
+def _of_gyro(label: Label, stem: str) -> bool:
+    return label.kind == Kind.VELOCITY and _speaks(stem, "gyro", "omega", "ang")
+
+
+def _of_accelerometer(label: Label, stem: str) -> bool:
+    return label.kind == Kind.ACCELERATION and _speaks(stem, "acc", "linear")
+
+
+def _turns(label: Label, stem: str) -> bool:
+    return label.kind == Kind.QUATERNION or (label.number is not None and _speaks(stem, "quat", "orientation"))
+
+
+def _spins(label: Label, stem: str) -> bool:
+    return label.kind == Kind.VELOCITY and (_speaks(stem, "ang", "omega", "gyro") or stem.lower() in ("w", "w_"))
+
+
+def _sensor(name: str, stem: str) -> tuple[str, float]:
+    return f"sensor:{name}", _SURE
+
+
+def _body(machine: Machine, quantity: str, stem: str) -> tuple[str, float]:
+    """The free body that a stem speaks of, and how sure that is."""
+    words = read_name(stem).words
+    best = max(machine.bodies, key=lambda name: alike(words, name))
+    return f"body:{best}.{quantity}", _SURE if len(machine.bodies) == 1 or alike(words, best) > 0.5 else 0.0

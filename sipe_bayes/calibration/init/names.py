@@ -1,0 +1,268 @@
+"""What the name of a column says: the kind of quantity, its unit, its number, its axis."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class Kind(Enum):
+    """What a column may be, by its name."""
+
+    TIME = auto()
+    EPISODE = auto()
+    POSITION = auto()
+    VELOCITY = auto()
+    ACCELERATION = auto()
+    COMMAND = auto()
+    SETPOINT = auto()  # of a position
+    SPEED_SETPOINT = auto()
+    TORQUE = auto()  # or force
+    CURRENT = auto()
+    VOLTAGE = auto()
+    QUATERNION = auto()
+    OTHER = auto()  # which no joint has: temperatures, flags
+    UNKNOWN = auto()
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a column's name says.
+
+    Args:
+        column: the name.
+        kind: of quantity.
+        words: of the name, without numbers, units and words of the quantity.
+        number: the last one in it.
+        stem: the name without that number; columns of one stem are a family.
+        unit: unit word; "" where it names none.
+        angular: whether it speaks of an angle; None where it says nothing.
+        axis: "x", "y", "z" or "w".
+        measured: whether it says so, as in ``tau_measured``.
+    """
+
+    column: str
+    kind: Kind
+    words: tuple[str, ...]
+    number: int | None
+    stem: str
+    unit: str = ""
+    angular: bool | None = None
+    axis: str = ""
+    measured: bool = False
+
+
+_GREEK = str.maketrans(
+    {"θ": "theta", "τ": "tau", "ω": "omega", "φ": "phi", "ϕ": "phi", "α": "alpha", "β": "beta", "ψ": "psi", "°": "deg"}
+)
+_ANGLES = {"angle", "angles", "theta", "phi", "alpha", "beta", "gamma", "psi", "th", "ang", "rotation", "heading"}
+_LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel", "extension", "height"}
+_PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
+_POSITIONS = _ANGLES | _LENGTHS | _PLACES
+_SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av", "angvel"}
+_ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"}
+_TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
+_COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
+    "input", "drive", "pwm", "duty", "act", "applied", "a",
+}  # fmt: skip
+_DESIRED = {"des", "desired", "ref", "reference", "setpoint", "sp", "set", "target", "goal", "demand", "wanted"} | {
+    "requested", "dem",
+}  # fmt: skip
+_MEASURED = {"meas", "measured", "actual", "present", "est", "estimated", "observed", "observation", "filtered", "sens"}
+_CURRENTS = {"current", "currents", "amps", "ampere", "cur", "iq", "i"}
+_VOLTAGES = {"voltage", "voltages", "volt", "volts"}
+_TIMES = {"time", "t", "timestamp", "timestamps", "stamp", "clock", "elapsed", "seconds", "secs", "millis"} | {
+    "micros", "nanos", "tick", "ticks", "timestep", "sec",
+}  # fmt: skip
+_EPISODES = {"episode", "trial", "rollout", "demo", "toss", "experiment", "ep", "traj", "trajectory"}
+_OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "index", "frame", "id", "reward"} | {
+    "done", "battery", "task", "count", "seq", "step", "contact", "success", "residual", "power", "energy", "noise",
+}  # fmt: skip
+_UNITS = {
+    "rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degs": "deg", "degree": "deg",
+    "degrees": "deg", "mrad": "mrad", "rev": "rev", "revs": "rev", "turns": "rev", "rpm": "rpm", "dps": "deg/s",
+    "radps": "rad/s", "degps": "deg/s", "mps": "m/s", "mmps": "mm/s", "rps": "rev/s", "mm": "mm", "cm": "cm",
+    "um": "um", "meter": "m", "meters": "m", "metre": "m", "nm": "N m", "mnm": "mN m", "newton": "N", "newtons": "N",
+    "mn": "mN", "kn": "kN", "volt": "V", "volts": "V", "mv": "mV", "amp": "A", "amps": "A", "ma": "mA", "ms": "ms",
+    "msec": "ms", "millis": "ms", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "nanos": "ns",
+    "sec": "s", "secs": "s", "seconds": "s", "pct": "%", "percent": "%", "m": "m", "n": "N", "v": "V", "a": "A",
+    "s": "s",
+}  # fmt: skip
+_RATES = {"rad": "rad/s", "deg": "deg/s", "m": "m/s", "mm": "mm/s", "cm": "cm/s", "rev": "rev/s"}
+_PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
+
+
+def read_name(column: str) -> Label:
+    """What a name says."""
+    plain = column.translate(_GREEK)
+    unit = ""
+    for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
+        if word := _unit_of([piece.lower() for piece in re.findall(r"[A-Za-z%]+", match[1])]):
+            unit, plain = word, plain.replace(match[0], " ")
+    pieces = [piece.lower() for piece in _PIECE.findall(plain)]
+    numbers = [int(piece) for piece in pieces if piece.isdigit()]
+    words = [piece for piece in pieces if not piece.isdigit()]
+    if not unit and len(words) > 1:
+        for length in (3, 2, 1):  # rad_per_s, rad_s, rad
+            if len(words) > length and (word := _unit_of(words[-length:])):
+                unit, words = word, words[:-length]
+                break
+    if len(words) == 1 and words[0] in ("us", "ms", "ns"):
+        return Label(column, Kind.TIME, (), None, column, words[0])
+    flags, rest = _flags(words)
+    flags |= {"length"} if words and words[-1] in ("px", "py", "pz") else set()
+    kind = _kind(flags, unit, words)
+    axis = _axis(words)
+    if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
+        kind = Kind.QUATERNION
+    angular = True if flags & {"angle"} or unit in ("rad", "deg", "rev", "mrad", "rpm", "rad/s", "deg/s") else None
+    angular = False if flags & {"length"} or unit in ("m", "mm", "cm", "um", "m/s", "mm/s", "N") else angular
+    number = numbers[-1] if numbers else None
+    stem = column if number is None else re.sub(r"\d+(?=\D*$)", "#", column)
+    return Label(column, kind, tuple(rest), number, stem, unit, angular, axis, bool(flags & {"measured"}))
+
+
+def _unit_of(pieces: list[str]) -> str:
+    """The unit of the last words of a name."""
+    pieces = [piece for piece in pieces if piece != "per"]
+    if len(pieces) == 2 and pieces[1] in ("s", "sec", "second"):
+        return _RATES.get(_UNITS.get(pieces[0], ""), "")
+    if pieces in (["n", "m"], ["newton", "meters"]):
+        return "N m"
+    if pieces in (["m", "nm"], ["mn", "m"]):
+        return "mN m"
+    if pieces == ["%"]:
+        return "%"
+    return _UNITS.get(pieces[0], "") if len(pieces) == 1 else ""
+
+
+def _flags(words: list[str]) -> tuple[set[str], list[str]]:
+    """Which kinds of words a name has, and the words that are none of these."""
+    table = {
+        "angle": _ANGLES, "length": _LENGTHS, "place": _PLACES, "speed": _SPEEDS, "acceleration": _ACCELERATIONS,
+        "torque": _TORQUES, "command": _COMMANDS, "desired": _DESIRED, "measured": _MEASURED, "current": _CURRENTS,
+        "voltage": _VOLTAGES, "time": _TIMES, "episode": _EPISODES, "other": _OTHERS,
+    }  # fmt: skip
+    flags: set[str] = set()
+    rest = []
+    for word in words:
+        own = {flag for flag, members in table.items() if word in members}
+        derived, whole = _derivative_of(word)
+        if not own and derived:
+            own = {"speed"} | ({"angle"} & _flags([whole])[0]) | ({"length"} & _flags([whole])[0])
+        flags |= own
+        if not own and word not in ("d", "dot", "joint", "joints", "state", "states", "data", "sensor", "log"):
+            rest.append(word)
+    if "dot" in words or (words and words[0] == "d" and flags & {"angle", "length", "place"}):
+        flags.add("speed")
+    if "d" in words[1:] and flags & {"angle", "length", "place"}:
+        flags.add("d")  # q_d: desired, or derived
+    return flags, rest
+
+
+def _derivative_of(word: str) -> tuple[bool, str]:
+    """Whether a word is a position's with a mark of a derivative, and that position's: dq, qd, thetadot."""
+    for before, after in (("d", ""), ("", "dot"), ("", "d"), ("", "p")):
+        inner = word[len(before) : len(word) - len(after)]
+        if word.startswith(before) and word.endswith(after) and inner in _POSITIONS and inner != word:
+            return True, inner
+    return False, word
+
+
+def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
+    place = bool(flags & {"angle", "length", "place"})
+    drive = _driven(flags, place)
+    if "episode" in flags and not place and not flags & {"speed", "torque"}:
+        return Kind.EPISODE
+    if "time" in flags and not place and not flags & {"speed", "torque", "command", "desired"}:
+        return Kind.TIME
+    if drive is not None:
+        return drive
+    if flags & {"acceleration"}:
+        return Kind.ACCELERATION
+    for flag, kind in (("torque", Kind.TORQUE), ("voltage", Kind.VOLTAGE)):
+        if flag in flags:
+            return kind
+    if "speed" in flags and not (words == ["v"] and unit):
+        return Kind.VELOCITY
+    if "current" in flags and not place:
+        return Kind.CURRENT
+    if "other" in flags:
+        return Kind.OTHER
+    if place:
+        return Kind.UNKNOWN if "d" in flags else Kind.POSITION
+    by_unit = {
+        "s": Kind.TIME,
+        "ms": Kind.TIME,
+        "us": Kind.TIME,
+        "ns": Kind.TIME,
+        "N m": Kind.TORQUE,
+        "mN m": Kind.TORQUE,
+    }
+    by_unit |= {"rad": Kind.POSITION, "deg": Kind.POSITION, "mm": Kind.POSITION, "rpm": Kind.VELOCITY}
+    by_unit |= {"rad/s": Kind.VELOCITY, "deg/s": Kind.VELOCITY, "V": Kind.VOLTAGE, "A": Kind.CURRENT, "N": Kind.TORQUE}
+    by_unit |= {"m/s": Kind.VELOCITY, "mm/s": Kind.VELOCITY, "m": Kind.POSITION, "cm": Kind.POSITION}
+    return by_unit.get(unit, Kind.OTHER if "measured" in flags and not words else Kind.UNKNOWN)
+
+
+def _driven(flags: set[str], place: bool) -> Kind | None:
+    """The kind of a command or a set-point; None for what is neither."""
+    if not flags & {"command", "desired"}:
+        return None
+    for flag, kind in (("torque", Kind.TORQUE), ("voltage", Kind.VOLTAGE), ("acceleration", Kind.OTHER)):
+        if flag in flags:
+            return kind
+    if "speed" in flags:
+        return Kind.SPEED_SETPOINT
+    if place:
+        return Kind.SETPOINT
+    if "current" in flags:
+        return Kind.CURRENT
+    return Kind.SETPOINT if "desired" in flags else Kind.COMMAND
+
+
+def _axis(words: list[str]) -> str:
+    """The axis of a vector's or quaternion's component: pos_x, qw, px."""
+    last = words[-1] if words else ""
+    if last in ("x", "y", "z", "w"):
+        return last
+    return last[-1] if len(last) == 2 and last[-1] in "xyzw" and last[0] in "qprvw" else ""
+
+
+def _is_quaternion(words: list[str]) -> bool:
+    last = words[-1]
+    return last[0] == "q" or bool({"quat", "quaternion", "orientation", "rotation"} & set(words))
+
+
+def alike(words: tuple[str, ...], name: str) -> float:
+    """How much of a name of the model stands in a column's words, from 0 to 1; spelt shorter counts too."""
+    own = [piece.lower() for piece in _PIECE.findall(name) if not piece.isdigit()]
+    if not own or not words:
+        return 0.0
+    return sum(max(_similar(mine, word) for word in words) for mine in own) / len(own)
+
+
+def _similar(a: str, b: str) -> float:
+    if a == b:
+        return 1.0
+    short, long = sorted((a, b), key=len)
+    if len(short) >= 2 and long.startswith(short):
+        return 0.8
+    if len(short) >= 3 and long[0] == short[0] and _in_order(short, long):
+        return 0.7  # shldr, shoulder
+    ratio = difflib.SequenceMatcher(None, a, b).ratio()
+    return ratio if ratio >= 0.8 else 0.0
+
+
+def _in_order(short: str, long: str) -> bool:
+    letters = iter(long)
+    return all(letter in letters for letter in short)
+
+
+def number_of(name: str) -> int | None:
+    """The last number in a name of the model."""
+    numbers = re.findall(r"\d+", name)
+    return int(numbers[-1]) if numbers else None

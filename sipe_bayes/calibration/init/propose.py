@@ -1,0 +1,238 @@
+"""What ``sipe init`` does: a model and logs in, a configuration with its evidence out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.calibration.init.decisions import decide
+from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
+from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Matches, match_columns
+from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
+from sipe_bayes.calibration.init.tables import Opened, open_table
+from sipe_bayes.calibration.init.trials import Trial
+from sipe_bayes.calibration.init.unknowns import Sizes, candidates, delay_of, told_apart
+from sipe_bayes.calibration.init.windows import (
+    FEW,
+    MANY,
+    Source,
+    delays_of,
+    loaded,
+    rough_unknowns,
+    share_of,
+    trial_of,
+    tried_part,
+)
+from sipe_bayes.calibration.readers.base import LogError
+from sipe_bayes.calibration.readers.many import episodes_of, matching
+from sipe_bayes.calibration.readers.tables import READERS, read_table
+from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.envs.mjcf import compile_spec, load_spec
+from sipe_bayes.envs.poses import has_pose
+from sipe_bayes.likelihood.starts import estimate_states
+
+_LOOKED_AT = 3  # logs that are simulated
+_CHECKED = 60  # logs whose columns are looked at
+_HELD = 0.75  # share of a single log that trains
+_SHORT = 2.0  # s: logs as short are one window each
+
+
+def propose(model_path: Path, logs: Sequence[Path], folder: Path) -> Draft:
+    """A configuration for a model and its logs.
+
+    Args:
+        model_path: the MJCF.
+        logs: files, folders of files, or patterns.
+        folder: of the configuration, to which its paths are relative.
+
+    Raises:
+        ModelError: for a model that does not compile.
+        LogError: for logs that can not be read, or that hold nothing of the model.
+    """
+    model = compile_spec(load_spec(str(model_path)), str(model_path))
+    machine = Machine.of(model)
+    files = _files(logs)
+    opened = open_table(files[0], read_table(files[0]))
+    matches = match_columns(machine, opened.columns)
+    _check_some(machine, matches, opened, files[0])
+    tables = [opened.columns, *(open_table(f, read_table(f)).columns for f in _others(files))]
+    table, turns = straightened(tables, matches, machine)
+    measurements, commands = first_readings(machine, matches, table, turns, opened.clock)
+    lines, sources, dropped = _split(files, opened, measurements, commands, folder)
+    draft = Draft(
+        _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
+        doubts=(*dropped, *_unmatched(model, machine, matches, commands)),
+        notes=_unused(matches),
+    )  # fmt: skip
+    trained = _decided(draft, model, machine, sources, folder)
+    return replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
+
+
+def _files(logs: Sequence[Path]) -> list[Path]:
+    """The logs' files: of a pattern those that match, of a folder that is no log itself those within."""
+    out: list[Path] = []
+    for log in logs:
+        inner = [kind for kind in READERS if not kind.startswith(".")]
+        if log.is_dir() and not any((log / kind).is_file() for kind in inner):
+            within = sorted(p for p in log.iterdir() if p.suffix.lower() in READERS or (p.is_dir() and _is_log(p)))
+            if not within:
+                raise LogError(f"{log}: a folder without logs; name the files")
+            out += within
+            continue
+        found = matching(log, Path())
+        if not found:
+            raise LogError(f"{log}: no file matches; correct the pattern")
+        out += found
+    return list(dict.fromkeys(out))
+
+
+def _others(files: Sequence[Path]) -> list[Path]:
+    """Some of the files beside the first."""
+    return [files[i] for i in _spread(len(files)) if i]
+
+
+def _is_log(folder: Path) -> bool:
+    return any((folder / kind).is_file() for kind in READERS if not kind.startswith("."))
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
+def _check_some(machine: Machine, matches: Matches, opened: Opened, file: Path) -> None:
+    if matches.positions or matches.velocities or matches.vectors:
+        return
+    joints = ", ".join(joint.name for joint in machine.joints) or "none with a name"
+    columns = ", ".join(map(repr, list(opened.columns)[:20])) or "none that change"
+    raise LogError(
+        f"{file}: no column could be matched to a joint or free body of the model (joints: {joints}; columns: "
+        f"{columns}); rename the columns after the joints, such as `NAME_position`, or write the configuration by hand"
+    )
+
+
+def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, commands: Sequence[Reading]) -> list[str]:
+    """What of the model has no column."""
+    out = []
+    driven = {reading.match.target for reading in commands}
+    still = [a.name for a in machine.actuators if f"actuator:{a.name}" not in driven]
+    if still:
+        out.append(f"no column drives {', '.join(still)}: it gets zero; name its column under [[commands]]")
+    measured = {m.target.rpartition(".")[0] for m in (*matches.positions, *matches.velocities, *matches.vectors)}
+    blind = [joint.name for joint in machine.joints if f"joint:{joint.name}" not in measured]
+    bodies = [body for body in machine.bodies if f"body:{body}" not in measured]
+    unnamed = sum(not has_pose(model, j) and not model.joint(j).name for j in range(model.njnt))
+    if blind or bodies:
+        names = ", ".join([*blind, *bodies])
+        out.append(f"no column measures {names}: windows start it where the model does")
+    if unnamed:
+        out.append(f"{unnamed} joints have no name; give them one in the MJCF, so that they can be measured")
+    return out
+
+
+def _unused(matches: Matches) -> tuple[str, ...]:
+    others = f" and {len(matches.left) - 12} others" if len(matches.left) > 12 else ""
+    return (f"not used: {', '.join(matches.left[:12])}{others}",) if matches.left else ()
+
+
+def _split(
+    files: Sequence[Path], opened: Opened, measurements: Sequence[Reading], commands: Sequence[Reading], folder: Path
+) -> tuple[tuple[LogLine, ...], list[Source], list[str]]:
+    """Logs that train and that are held out, those to be simulated, and what is said of files that lack columns."""
+    wanted = [c for reading in (*measurements, *commands) for c in reading.match.columns]
+    kept, lost = [files[0]], []
+    for file in files[1:]:
+        if len(kept) > _CHECKED or not [c for c in wanted if c not in read_table(file, [])]:
+            kept.append(file)
+        else:
+            lost.append(file.name)
+    said = [f"left out, for they lack columns: {', '.join(lost[:6])}"] if lost else []
+    if opened.episodes is not None:
+        return (*_episodes(kept, opened.episodes, folder), said)
+    if len(kept) == 1:
+        cut = _HELD * opened.seconds
+        name, only = kept[0].stem, _relative(kept[0], folder)
+        spans = ((0.0, float(f"{cut:.4g}")), (float(f"{cut:.4g}"), float(f"{opened.seconds:.6g}")))
+        train = LogLine(only, "train", f"{name}-begin", spans[0])
+        return (train, LogLine(only, "holdout", f"{name}-end", spans[1])), [Source(kept[0])], said
+    held = max(1, len(kept) // 5)
+    stems = [file.stem for file in kept]
+    names = stems if len(set(stems)) == len(stems) else [f"{s}-{k}" for k, s in enumerate(stems)]
+    lines = tuple(
+        LogLine(_relative(f, folder), "holdout" if k >= len(kept) - held else "train", n if n != f.stem else "")
+        for k, (f, n) in enumerate(zip(kept, names, strict=True))
+    )
+    train_files = kept[: len(kept) - held]
+    return lines, [Source(train_files[i]) for i in _spread(len(train_files))], said
+
+
+def _episodes(files: Sequence[Path], column: str, folder: Path) -> tuple[tuple[LogLine, ...], list[Source]]:
+    """Episodes of files: of each the last fifth is held out."""
+    lines, sources = [], []
+    for file in files:
+        numbers = episodes_of(file, column)
+        held = max(1, len(numbers) // 5)
+        path = _relative(file, folder)
+        lines.append(LogLine(path, "train", f"{file.stem}-train", None, tuple(numbers[:-held])))
+        lines.append(LogLine(path, "holdout", f"{file.stem}-held", None, tuple(numbers[-held:])))
+        sources += [Source(file, number) for number in numbers[:-held]]
+    return tuple(lines), [sources[i] for i in _spread(len(sources))]
+
+
+def _spread(count: int) -> list[int]:
+    return np.unique(np.round(np.linspace(0, count - 1, min(count, _LOOKED_AT))).astype(int)).tolist()
+
+
+def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: list[Source], folder: Path) -> Draft:
+    """Units, signs, delay, unknowns and the window's length, by simulations of the logs."""
+    part = tried_part(draft)
+    rest = tuple(r for r in draft.measurements if r not in part.measurements)
+    part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
+    trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
+    part = decide(part, machine, trial, layout)
+    logs = loaded(part, sources, folder)
+    unknowns, delay, notes = _unknowns(part, model, machine, logs, folder)
+    window, why = _window(machine, logs, trial)
+    return replace(
+        part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
+        notes=(*draft.notes, *notes), delay=delay,
+    )  # fmt: skip
+
+
+def _unknowns(
+    draft: Draft, model: mujoco.MjModel, machine: Machine, logs: Sequence[Trajectory], folder: Path
+) -> tuple[list[Unknown], float, list[str]]:
+    """Parameters with bounds of the size of the motion, the delay, and which of them these logs tell apart."""
+    trial, _ = trial_of(draft, model, machine, logs, folder, FEW)
+    states, controls = [], []
+    for log, starts in zip(logs, trial.places, strict=True):
+        states.append(estimate_states(trial.simulator, log)[starts])
+        controls.append(trial.simulator.environment.control(trial.simulator.model, states[-1], log.actions[starts]))
+    sizes = Sizes.of(model, machine, np.concatenate(states), np.concatenate(controls))
+    unknowns = candidates(model, machine, draft.readings, sizes)
+    trial, _ = trial_of(replace(draft, unknowns=tuple(unknowns)), model, machine, logs, folder, MANY)
+    names = list(trial.simulator.space.names)
+    unknowns = [unknown for unknown in unknowns if unknown.name in names]
+    if trial.simulator.environment.rotations:
+        return unknowns, 0.0, []
+    actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
+    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=6)
+    late, note = delay_of(actuators, left, logs[0].dt)
+    samples = left.finer if late else 0.0
+    return [*late, *told_apart(unknowns, left)], samples, [note] if note and not late else []
+
+
+def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str, str]:
+    """Length of the windows of the fit: half of the time in which the motion goes to and fro."""
+    durations = [len(log) * log.dt for log in logs]
+    if max(durations) <= _SHORT:
+        return "log", "each log as one: they are short"
+    swing = trial.length * logs[0].dt / share_of(machine)
+    length = float(np.clip(0.5 * swing, max(0.2, 20 * logs[0].dt), min(2.0, min(durations) / 4)))
+    return float(f"{length:.2g}"), f"s; the motion goes to and fro in about {swing:.2g} s"

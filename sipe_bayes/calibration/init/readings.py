@@ -1,0 +1,229 @@
+"""From matched columns to readings: first units, wrap-around, velocities held against slopes, what looks filtered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sipe_bayes.calibration.init.draft import Reading
+from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
+from sipe_bayes.calibration.init.matching import Match, Matches
+from sipe_bayes.calibration.init.names import Kind
+from sipe_bayes.calibration.init.signals import Slope, likeness, slope_of, turn_of, white_share
+from sipe_bayes.calibration.init.tables import Clock
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.units import find_unit, unit_words
+
+Table = Mapping[str, FloatArray]
+
+_FOLLOWS = 0.8  # share of variance from which a column is another's slope
+_NEAR = 0.12  # relative: a factor between units that is as near is that factor
+_FILTERED = 0.05  # of white noise in the upper frequencies
+_LATE = 1.0  # samples
+_ALIKE = 0.9  # share of variance from which a command is a set-point
+_UNLIKE = 0.2
+_TURNS = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}
+
+
+def straightened(
+    tables: Sequence[Table], matches: Matches, machine: Machine
+) -> tuple[dict[str, FloatArray], dict[str, float]]:
+    """The first table with angles that wrap round in one of them written on, and the turn of each such column."""
+    hinges = {f"joint:{joint.name}.position" for joint in machine.joints if joint.hinge}
+    columns = [m.column for m in matches.positions if m.target in hinges]
+    turns = {c: max((turn_of(table[c]) for table in tables if c in table), default=0.0) for c in columns}
+    turns = {column: turn for column, turn in turns.items() if turn}
+    return {n: _written_on(v, turns[n]) if n in turns else v for n, v in tables[0].items()}, turns
+
+
+def _written_on(values: FloatArray, turn: float) -> FloatArray:
+    known = np.isfinite(values)
+    out = values.copy()
+    out[known] = np.unwrap(values[known], period=turn)
+    return out
+
+
+def first_readings(
+    machine: Machine, matches: Matches, table: Table, turns: Mapping[str, float], clock: Clock
+) -> tuple[tuple[Reading, ...], tuple[Reading, ...]]:
+    """Measurements and commands as names and numbers alone tell them."""
+    positions = [_position(machine, m, table, turns) for m in matches.positions]
+    positions = [_by_velocity(reading, matches, table, clock) for reading in positions]
+    vectors = [_vector(m, table) for m in matches.vectors]
+    velocities = [Reading(m, _unit(m, _joint_unit(machine, m, "/s"))) for m in matches.velocities]
+    commands = [_command(machine, m, matches, table) for m in matches.commands]
+    return (*positions, *velocities, *vectors), tuple(commands)
+
+
+def _joint_unit(machine: Machine, match: Match, per: str = "") -> str:
+    joint = next(j for j in machine.joints if match.target.startswith(f"joint:{j.name}."))
+    return ("rad" if joint.hinge else "m") + per
+
+
+def _unit(match: Match, default: str) -> str:
+    """The unit in the name where it is of the right kind."""
+    named = match.label.unit
+    return named if named in unit_words(find_unit(default).dimension) else default
+
+
+def _position(machine: Machine, match: Match, table: Table, turns: Mapping[str, float]) -> Reading:
+    reading = Reading(match, _unit(match, _joint_unit(machine, match)), notes=_matched(match))
+    turn = turns.get(match.column)
+    if turn:
+        unit = _TURNS[turn]
+        label = replace(match.label, unit=unit)
+        note = f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out"
+        return replace(reading, match=replace(match, label=label), unit=unit, wraps=True, notes=(*reading.notes, note))
+    if white_share(table[match.column]) < _FILTERED:
+        note = "looks filtered: hardly any noise at its highest frequencies; its lag would count as a delay"
+        reading = replace(reading, notes=(*reading.notes, note))
+    return reading
+
+
+def _matched(match: Match) -> tuple[str, ...]:
+    return () if match.sure else (f"taken for {match.target} by the order of names alone",)
+
+
+def _by_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock) -> Reading:
+    """Where only the velocity's name has a unit, it tells that of the position too."""
+    joint = reading.match.target.removesuffix("position")
+    partner = next((m for m in matches.velocities if m.target == f"{joint}velocity"), None)
+    if partner is None or reading.match.label.unit or not partner.label.unit:
+        return reading
+    slope = slope_of(table[reading.match.column], table[partner.column], clock.period)
+    if slope.share < _FOLLOWS:
+        return reading
+    per_second = slope.factor / find_unit(clock.unit).factor  # position's unit, for each unit of the velocity
+    wanted = find_unit(partner.label.unit).factor / abs(per_second)
+    for word in unit_words(find_unit(reading.unit).dimension):
+        if abs(np.log(wanted / find_unit(word).factor)) < _NEAR:
+            note = f"{word}: {partner.column!r} in {partner.label.unit} is its slope"
+            label = replace(reading.match.label, unit=word)
+            match = replace(reading.match, label=label)
+            return replace(reading, match=match, unit=word, notes=(*reading.notes, note))
+    return reading
+
+
+def _vector(match: Match, table: Table) -> Reading:
+    """Poses and inertial sensors, whose units their sizes tell."""
+    kind = match.target.rpartition(".")[2]
+    if match.quaternion:
+        axes = "by its axes" if match.label.axis else "OPEN"
+        reading = Reading(match, "1", notes=(f"a quaternion in the order {match.quaternion}, {axes}",))
+        if not match.label.axis:
+            doubt = f"is the quaternion {match.quaternion} or xyzw? its columns do not say"
+            reading = replace(reading, notes=(), doubts=(doubt,), instead=('quaternion = "xyzw"',))
+        return reading
+    size = float(np.nanmedian(np.linalg.norm([table[c] for c in match.columns], axis=0)))
+    if match.label.kind == Kind.ACCELERATION:
+        unit = "g0" if 0.5 < size < 2.0 else "m/s^2"
+        return Reading(match, unit, fit=False, notes=(f"{unit}: its usual length is {size:.3g}",))
+    if match.label.kind == Kind.VELOCITY:
+        unit = _unit(match, "m/s" if kind == "linear_velocity" else "rad/s")
+        return Reading(match, unit, fit=False, notes=("starts windows; poses are fitted",))
+    return Reading(match, _unit(match, "m"), notes=_matched(match))
+
+
+def _command(machine: Machine, match: Match, matches: Matches, table: Table) -> Reading:
+    actuator = next(a for a in machine.actuators if match.target == f"actuator:{a.name}")
+    hinge = actuator.joint is None or actuator.joint.hinge
+    force = "N m" if hinge else "N"
+    default = {
+        Drive.FORCE: {Kind.CURRENT: "A", Kind.VOLTAGE: "V"}.get(match.label.kind, force),
+        Drive.POSITION: "rad" if hinge else "m",
+        Drive.VELOCITY: "rad/s" if hinge else "m/s",
+        Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(match.label.kind, "V"),
+        Drive.OTHER: "1",
+    }[actuator.drive]
+    named = match.label.unit
+    fits = named in (unit_words(find_unit(default).dimension)) or (
+        actuator.drive in (Drive.FORCE, Drive.OTHER, Drive.VOLTAGE) and named not in ("", "rad", "deg", "m", "mm")
+    )
+    reading = Reading(match, named if named and fits else default, notes=_matched(match))
+    if named and not fits:
+        reading = replace(reading, match=replace(match, label=replace(match.label, unit="")))
+    reading = _looked_through(reading, actuator, matches, table)
+    others = [m.column for m in matches.rivals if m.target == match.target]
+    if others:
+        doubt = f"{match.column!r} or {', '.join(map(repr, others[:3]))}? both may drive {actuator.name}"
+        instead = tuple(f'column = "{other}"' for other in others[:3])
+        reading = replace(reading, doubts=(*reading.doubts, doubt), instead=(*reading.instead, *instead))
+    return reading
+
+
+def _looked_through(reading: Reading, actuator: Actuator, matches: Matches, table: Table) -> Reading:
+    """Whether a command is a set-point, and what the actuator makes of it."""
+    joint = actuator.joint
+    place = None if joint is None else next(
+        (m for m in matches.positions if m.target == f"joint:{joint.name}.position"), None
+    )  # fmt: skip
+    if place is None:
+        return reading
+    alike = likeness(table[reading.match.column], table[place.column])
+    if actuator.drive == Drive.POSITION:
+        if alike.share < _UNLIKE and reading.match.label.kind != Kind.SETPOINT:
+            doubt = (
+                f"{actuator.name} takes a set-point of the position, and this does not look like {place.column!r} "
+                f"({100 * alike.share:.0f} % of its variance); if it is a torque, make the actuator a <motor>"
+            )
+            return replace(reading, doubts=(*reading.doubts, doubt))
+        note = f"a set-point: {place.column!r} follows it ({100 * alike.share:.0f} % of its variance)"
+        return replace(reading, notes=(*reading.notes, note))
+    if reading.match.label.kind == Kind.SETPOINT or (
+        alike.share > _ALIKE and reading.match.label.kind == Kind.COMMAND and actuator.drive == Drive.FORCE
+    ):
+        doubt = (
+            f"it looks like a set-point of {place.column!r} ({100 * alike.share:.0f} % of its variance), but "
+            f"{actuator.name} takes {actuator.drive.value}; make it a <position> actuator, or name the torque"
+        )
+        return replace(reading, doubts=(*reading.doubts, doubt))
+    return reading
+
+
+def with_velocities(measurements: Sequence[Reading], table: Table, clock: Clock) -> tuple[Reading, ...]:
+    """Velocities in the unit and direction that the slopes of their positions ask for."""
+    places = {r.match.target: r for r in measurements}
+    out = []
+    for reading in measurements:
+        target = reading.match.target
+        place = places.get(target.removesuffix("velocity") + "position") if target.startswith("joint:") else None
+        if not target.endswith(".velocity") or place is None:
+            out.append(reading)
+            continue
+        slope = slope_of(table[place.match.column], table[reading.match.column], clock.period)
+        out.append(_as_slope(reading, place, slope, clock))
+    return tuple(out)
+
+
+def _as_slope(reading: Reading, place: Reading, slope: Slope, clock: Clock) -> Reading:
+    """One velocity beside its position."""
+    own, late = place.match.column, slope.lag * clock.period * find_unit(clock.unit).factor
+    reading = replace(reading, fit=False)
+    if slope.share < _FOLLOWS:
+        doubt = (
+            f"taken for the velocity of {own!r} by name, but it is not its slope ({100 * slope.share:.0f} % of the "
+            "variance); it only starts windows"
+        )
+        return replace(reading, doubts=(*reading.doubts, doubt))
+    wanted = slope.factor * place.sign * find_unit(place.unit).factor * place.factor / find_unit(clock.unit).factor
+    words = unit_words(find_unit(reading.unit).dimension)
+    word = min(words, key=lambda w: abs(np.log(abs(wanted) / find_unit(w).factor)))
+    sign = 1 if wanted > 0 else -1
+    near = abs(wanted) / find_unit(word).factor
+    notes = [
+        f"{'-' if sign < 0 else ''}{word}: the slope of {own!r} is {slope.factor:.4g} times it for each {clock.unit}"
+    ]
+    if slope.lag > _LATE:
+        notes.append(f"late by {slope.lag:.1f} samples ({1e3 * late:.2g} ms), as a filter makes it")
+    notes.append("it starts windows and is not fitted: the position says the same")
+    doubts = list(reading.doubts)
+    named = reading.match.label.unit
+    if abs(np.log(near)) > _NEAR:
+        doubts.append(
+            f"{near:.3g} times the slope of {own!r} even in {word}: one of the two, or the clock, has another unit"
+        )
+    elif named and named != word and named in words:
+        doubts.append(f"its name says {named}, but as the slope of {own!r} it is {word}")
+    return replace(reading, unit=word, sign=sign, notes=(*reading.notes, *notes), doubts=tuple(doubts))

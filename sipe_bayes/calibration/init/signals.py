@@ -1,0 +1,127 @@
+"""What a column's numbers say by themselves: steps of a clock, wrap-around, slopes, filters, set-points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+
+_FEWEST = 20  # samples from which anything is said
+_LATEST = 25  # samples that a column may lag behind another
+_JUMP = 0.8  # of a turn, from one sample to the next
+
+
+@dataclass(frozen=True)
+class Slope:
+    """How one column (n,) follows another's slope.
+
+    Args:
+        factor: of the other's slope in this one's terms: value = slope / factor.
+        share: of its variance that the slope explains.
+        lag: samples by which it is late.
+    """
+
+    factor: float
+    share: float
+    lag: float
+
+
+def slope_of(position: FloatArray, velocity: FloatArray, dt: float = 1.0) -> Slope:
+    """Whether a column is the slope of another; both (n,), dt in the clock's terms.
+
+    Over a few samples the mean velocity is compared with the way travelled, which noise and rounding spoil less than
+    differences of single samples.
+    """
+    known = np.isfinite(position) & np.isfinite(velocity)
+    if known.sum() < _FEWEST or np.ptp(position[known]) == 0 or np.ptp(velocity[known]) == 0:
+        return Slope(1.0, 0.0, 0.0)
+    position, velocity = position[known], velocity[known]
+    span = int(np.clip(len(position) // 60, 2, 12))
+    way = (position[span:] - position[:-span]) / (span * dt)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
+    mean = (total[span:] - total[:-span]) / span
+    reach = min(_LATEST, len(way) // 4)
+    shares = np.array([_explained(way, mean, lag) for lag in range(-2, reach + 1)])
+    best = int(np.argmax(shares))
+    share, lag = float(shares[best]), float(best - 2)
+    if 0 < best < len(shares) - 1:
+        below, above = shares[best - 1], shares[best + 1]
+        bend = below - 2 * share + above
+        lag += 0.5 * (below - above) / bend if bend < 0 else 0.0
+    a, b = _shifted(way, mean, best - 2)
+    # the geometric mean of both regressions, so that noise of either does not shrink it
+    factor = float(np.sign(a @ b) * np.sqrt((a @ a) / max(float(b @ b), 1e-300))) or 1.0
+    return Slope(factor, share, lag)
+
+
+def _shifted(way: FloatArray, mean: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
+    a, b = (way[: len(way) - lag], mean[lag:]) if lag >= 0 else (way[-lag:], mean[:lag])
+    return a - a.mean(), b - b.mean()
+
+
+def _explained(way: FloatArray, mean: FloatArray, lag: int) -> float:
+    a, b = _shifted(way, mean, lag)
+    size = float((a @ a) * (b @ b))
+    return float((a @ b) ** 2 / size) if size > 0 else 0.0
+
+
+def turn_of(values: FloatArray) -> float:
+    """The turn by which a column (n,) jumps where its angle wraps round, in its own unit; 0 where it never does."""
+    finite = values[np.isfinite(values)]
+    if len(finite) < _FEWEST:
+        return 0.0
+    steps = np.abs(np.diff(finite))
+    for turn in (360.0, 2 * np.pi, 1.0):
+        jumps = steps > _JUMP * turn
+        usual = np.quantile(steps, 0.9) < 0.25 * turn
+        inside = np.ptp(finite) <= 1.02 * turn and np.ptp(finite) > 0.9 * turn
+        if jumps.any() and usual and inside:
+            return turn
+    return 0.0
+
+
+def white_share(values: FloatArray) -> float:
+    """Power of a column (n,) in its upper quarter of frequencies over that in the quarter below; 1 for white noise.
+
+    The motion itself lies further down. A filtered column has far less; rounding alone is white.
+    """
+    finite = values[np.isfinite(values)]
+    if len(finite) < 8 * _FEWEST:
+        return 1.0
+    bent = np.diff(finite, 2)  # takes the motion down; whitened below
+    power = np.abs(np.fft.rfft(bent * np.hanning(len(bent)))) ** 2
+    frequency = np.linspace(0, np.pi, len(power))
+    power = power[1:] / (2 - 2 * np.cos(frequency[1:])) ** 2
+    quarter = len(power) // 4
+    high, low = power[3 * quarter :].mean(), power[2 * quarter : 3 * quarter].mean()
+    return float(high / low) if low > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How a command (n,) follows a measurement: value = factor * measurement, share of variance, samples ahead."""
+
+    factor: float
+    share: float
+
+
+def likeness(command: FloatArray, measured: FloatArray) -> Likeness:
+    """Whether a command looks like a measurement that comes later."""
+    known = np.isfinite(command) & np.isfinite(measured)
+    a, b = command[known], measured[known]
+    if len(a) < _FEWEST or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return Likeness(1.0, 0.0)
+    shares = [_explained(a, b, lag) for lag in range(min(_LATEST, len(a) // 4))]
+    best = int(np.argmax(shares))
+    x, y = _shifted(a, b, best)
+    return Likeness(float(x @ y) / max(float(y @ y), 1e-300), float(shares[best]))
+
+
+def time_unit(period: float) -> str:
+    """The unit of a clock by its usual step: robots are logged at 4 Hz to 4 kHz."""
+    for unit, largest in (("s", 0.25), ("ms", 250.0), ("us", 250e3)):
+        if period < largest:
+            return unit
+    return "ns"

@@ -1,0 +1,248 @@
+"""Which parameters to ask for, between which bounds, and which of these the logs tell apart."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.calibration.init.draft import Reading, Unknown
+from sipe_bayes.calibration.init.fits import Fit
+from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
+from sipe_bayes.calibration.init.names import Kind
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.targets import bind
+
+_MOST = 12  # parameters that are asked for
+_GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
+_WEAK = 3.0  # of the noise, what a parameter has to move over its range
+_APART = 0.15  # share of its effect that no other parameter has
+_TELLING = 0.02  # of the squared miss, from which a delay is asked for
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of each joint by name: force or torque, speed and inertia that are usual in the logs, in SI."""
+
+    force: dict[str, float]
+    speed: dict[str, float]
+    inertia: dict[str, float]
+
+    @classmethod
+    def of(
+        cls, model: mujoco.MjModel, machine: Machine, states: FloatArray | None, controls: FloatArray | None
+    ) -> Sizes:
+        """Read from states (n, S) and controls (n, nu) of the logs; from the model alone where there are none."""
+        data = mujoco.MjData(model)
+        forces, speeds, inertias = [], [], []
+        rows = 1 if states is None else len(states)
+        for k in range(rows):
+            if states is not None:
+                data.qpos[:] = states[k, 1 : 1 + model.nq]
+                data.qvel[:] = states[k, 1 + model.nq : 1 + model.nq + model.nv]
+            if controls is not None:
+                data.ctrl[:] = controls[k]
+            mujoco.mj_forward(model, data)
+            full = np.zeros((model.nv, model.nv))
+            mujoco.mj_fullM(model, data, full)
+            inertia = np.diag(full).copy()
+            speed = np.abs(data.qvel.copy())
+            moving = _BRISK * inertia if states is None else np.zeros(model.nv)
+            gravity = np.abs(data.qfrc_bias) + (0.5 * _GRAVITY * np.sqrt(inertia) if states is None else 0.0)
+            forces.append(np.abs(data.qfrc_actuator) + gravity + moving)
+            speeds.append(speed if states is not None else np.full(model.nv, 3.0))
+            inertias.append(inertia)
+        force, speed = np.quantile(forces, 0.9, axis=0), np.quantile(speeds, 0.9, axis=0)
+        inertia = np.mean(inertias, axis=0)
+        at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
+
+        def by_name(values: FloatArray, least: float) -> dict[str, float]:
+            return {name: max(float(values[i]), least) for name, i in at.items()}
+
+        return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
+
+
+def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
+    """Parameters that may be unknown, those first that show most.
+
+    Args:
+        model: as given.
+        machine: what of it logs hold.
+        readings: measurements and commands.
+        sizes: of the motion.
+    """
+    measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
+    joints = [joint for joint in machine.joints if joint.name in measured]
+    driven = [(a, r) for a in machine.actuators for r in readings if r.match.target == f"actuator:{a.name}"]
+    gains = [unknown for a, r in driven for unknown in _of_actuator(model, a, r)]
+    known_force = any(r.match.label.kind == Kind.TORQUE or r.unit in ("N m", "N") for _, r in driven)
+    fixed_scale = not driven or (bool(gains) and not known_force and any(a.drive != Drive.POSITION for a, _ in driven))
+    masses = [] if fixed_scale and len(joints) < 2 else _masses(model, joints, first=fixed_scale)
+    return gains + masses + [u for joint in joints for u in _of_joint(model, joint, sizes)] + _contacts(model, machine)
+
+
+def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) -> list[Unknown]:
+    """Gains of an actuator whose command is no force."""
+    name, at = actuator.name, f"actuator:{actuator.name}"
+    index = model.actuator(name).id
+    gain, (_, _, of_velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
+    word = _word(name)
+    if actuator.drive == Drive.POSITION:
+        out = [_factor(f"{word}_kp", f"{at}.kp", 0.3, 3.0, f"position gain, {gain:g} in the model")]
+        if of_velocity:
+            return [*out, _factor(f"{word}_kv", f"{at}.kv", 0.1, 4.0, f"velocity gain, {-of_velocity:g} in the model")]
+        return out
+    if actuator.drive == Drive.VOLTAGE and int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_FIXED):
+        back = _factor(f"{word}_back_emf", f"{at}.bias_velocity", 0.2, 4.0, "back-EMF")
+        return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, f"force for each unit, {gain:g} in the model"), back]
+    if actuator.drive == Drive.VELOCITY:
+        both = (f"{at}.gain", f"{at}.bias_velocity")
+        return [Unknown(f"{word}_kv", both, 0.2, 5.0, True, f"velocity gain, {gain:g} in the model")]
+    in_force = reading.match.label.kind == Kind.TORQUE or reading.unit in ("N m", "mN m", "N", "mN")
+    if actuator.drive != Drive.FORCE or in_force:
+        return []
+    gear = float(model.actuator_gear[index, 0])
+    note = f"force for each unit of command, {gear * gain:g} in the model: the command is no force"
+    return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, note)]
+
+
+def _factor(name: str, target: str, low: float, high: float, note: str) -> Unknown:
+    return Unknown(name, (target,), low, high, True, note)
+
+
+def _masses(model: mujoco.MjModel, joints: Sequence[Joint], first: bool) -> list[Unknown]:
+    """The heaviest body behind each joint; with ``first`` not that of the first joint, to which others are relative."""
+    out, seen = [], set()
+    for joint in joints:
+        body = int(model.joint(joint.name).bodyid[0])
+        moved = [b for b in range(1, model.nbody) if int(model.body_weldid[b]) == int(model.body_weldid[body])]
+        heaviest = max(moved, key=lambda b: float(model.body_mass[b]))
+        mass, name = float(model.body_mass[heaviest]), model.body(heaviest).name
+        if mass <= 0 or not name or name in seen:
+            continue
+        seen.add(name)
+        out.append(_factor(f"{_word(name)}_mass", f"body:{name}.mass", 0.5, 2.0, f"{mass:g} kg in the model"))
+    return out[1:] if first else out
+
+
+def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown]:
+    """Friction and the inertia of rotor and gears."""
+    name, at, dof = joint.name, f"joint:{joint.name}", int(model.joint(joint.name).dofadr[0])
+    force, speed, inertia = (table[name] for table in (sizes.force, sizes.speed, sizes.inertia))
+    damping, dry, rotor = (
+        float(getattr(model, f"dof_{field}")[dof]) for field in ("damping", "frictionloss", "armature")
+    )
+    word = _word(name)
+    rows = (
+        ("damping", _round(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
+        ("frictionloss", _round(max(4 * dry, 0.4 * force)), dry, "dry friction"),
+        ("armature", _round(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
+    )
+    return [
+        Unknown(f"{word}_{field}", (f"{at}.{field}",), 0.0, high, False, f"{what}, {own:g} in the model")
+        for field, high, own, what in rows
+    ]
+
+
+def _contacts(model: mujoco.MjModel, machine: Machine) -> list[Unknown]:
+    """Friction and bounce of free bodies with what they touch."""
+    out = []
+    for body in machine.bodies:
+        own = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) == model.body(body).id]
+        still = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+        touching = [g for g in own if model.geom_contype[g] or model.geom_conaffinity[g]]
+        names = [model.geom(g).name for g in (*touching, *still) if model.geom(g).name]
+        if not touching or not still or len(names) < 2:
+            continue
+        word, step = _word(body), float(model.opt.timestep)
+        for field, low, high, what in (
+            ("friction", 0.02, 1.5, "sliding friction; name both geoms, MuJoCo takes the larger one"),
+            (
+                "solref_timeconst",
+                _round(2 * step),
+                max(0.05, _round(10 * step)),
+                "of the contact: the shorter the harder",
+            ),
+            ("solref_dampratio", 0.1, 1.5, "of the contact: below 1 it bounces"),
+        ):
+            out.append(Unknown(f"{word}_{field}", tuple(f"geom:{n}.{field}" for n in names), low, high, False, what))
+    return out
+
+
+def _round(value: float) -> float:
+    """Upwards to two digits."""
+    digits = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{np.ceil(value / digits) * digits:.2g}")
+
+
+def _word(name: str) -> str:
+    return re.sub(r"\W+", "_", name).strip("_") or "unknown"
+
+
+def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Parameter]:
+    """Unknowns as parameters of an environment; those that the model can not have are left out."""
+    out = []
+    for unknown in unknowns:
+        values = [bind(model, target).value for target in unknown.targets]
+        own = values[0] if np.isfinite(values[0]) else None
+        if unknown.relative and not own:
+            continue
+        ends = (unknown.low * own, unknown.high * own) if unknown.relative and own else (unknown.low, unknown.high)
+        low, high = min(ends), max(ends)
+        if own is not None and not low <= own <= high:
+            low, high = min(low, own), max(high, own)
+        out.append(Parameter(unknown.name, low, high, targets=unknown.targets))
+    return out
+
+
+def told_apart(unknowns: Sequence[Unknown], fit: Fit) -> list[Unknown]:
+    """The unknowns, with the reason where one is better left out: it shows too little, or as another one does.
+
+    Args:
+        unknowns: of the fit, those first that are to be kept first.
+        fit: with the effects of each.
+    """
+    kept: list[int] = []
+    out = []
+    effects = fit.jacobian / np.sqrt(max(1.0, len(fit.jacobian) / 400.0))  # residuals are correlated
+    for k, unknown in enumerate(unknowns):
+        effect = effects[:, k]
+        size = float(np.linalg.norm(effect))
+        reason = ""
+        if size < _WEAK:
+            reason = "moves too little in these logs"
+        elif kept:
+            basis = effects[:, kept]
+            weights = np.linalg.lstsq(basis, effect, rcond=None)[0]
+            alone = float(np.linalg.norm(effect - basis @ weights))
+            if alone < _APART * size or alone < _WEAK:
+                share = np.abs(weights) * np.linalg.norm(basis, axis=0)
+                names = " and ".join(unknowns[kept[i]].name for i in np.argsort(-share)[:2] if share[i] > 0.3 * size)
+                reason = f"shows as {names or unknowns[kept[int(np.argmax(share))]].name} does in these logs"
+        if not reason and len(kept) >= _MOST:
+            reason = f"{_MOST} are enough to begin with"
+        if not reason:
+            kept.append(k)
+        out.append(replace(unknown, left_out=reason))
+    return out
+
+
+def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknown], str]:
+    """The delay as an unknown where one shows, and what is to be said of it; dt in s."""
+    if not actuators or len(fit.delays) < 2:
+        return [], ""
+    at_zero = float(fit.miss[fit.delays.index(0)] ** 2)
+    best, late = fit.best, fit.finer
+    if not best or at_zero - 1 < _TELLING:
+        return [], "commands arrive at once: a delay would not lessen what simulations miss"
+    high = _round(dt * max(2 * best, best + 3))
+    targets = tuple(f"actuator:{name}.delay" for name in actuators)
+    note = (
+        f"commands arrive about {1e3 * dt * late:.3g} ms late, {late:.2g} samples: without that, simulated windows "
+        f"miss {np.sqrt(at_zero):.2f} times as much"
+    )
+    return [Unknown("delay", targets, 0.0, high, False, note)], note

@@ -1,0 +1,91 @@
+"""The configuration as TOML with its evidence in comments, and what the terminal says of it."""
+
+from __future__ import annotations
+
+import textwrap
+
+from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
+from sipe_bayes.core.toml import to_toml
+
+_WIDTH = 118
+_LINES = 20
+_INLINE = 6  # logs from which they stand on one line each
+
+
+def toml_of(draft: Draft, command: str) -> str:
+    """The whole file; command: what wrote it."""
+    parts = [_comment(f"Written by: {command}"), *(_comment(note) for note in draft.notes), *map(_open, draft.doubts)]
+    text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, "window": draft.window}).rstrip("\n")
+    text += f" # {draft.window_note}\n"
+    if len(draft.logs) >= _INLINE:
+        rows = [to_toml({"row": [log.row()]}) for log in draft.logs]
+        lines = ["{" + ", ".join(row.splitlines()[1:]) + "}" for row in rows]
+        text += "logs = [\n" + "".join(f"    {line},\n" for line in lines) + "]\n"
+    clock = draft.clock
+    text += "\n[columns]\n" + "".join(f"{_open(clock.doubt)}\n" for _ in range(bool(clock.doubt)))
+    text += f"time = {{ column = {_string(clock.column)}, unit = {_string(clock.unit)} }} # {clock.why}\n"
+    text += f"episode = {_string(draft.episode)}\n" if draft.episode else ""
+    blocks = [_reading("commands", reading) for reading in draft.commands]
+    blocks += [_reading("measurements", reading) for reading in draft.measurements]
+    if len(draft.logs) < _INLINE:
+        blocks += [to_toml({"logs": [log.row()]}) for log in draft.logs]
+    blocks += [_unknown(unknown) for unknown in draft.unknowns]
+    return text + "\n" + "\n".join(blocks)
+
+
+def _string(word: str) -> str:
+    return to_toml({"w": word}).split(" = ", 1)[1].rstrip("\n")
+
+
+def _comment(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="#   "))
+
+
+def _open(doubt: str) -> str:
+    return _comment(f"OPEN: {doubt}")
+
+
+def _reading(table: str, reading: Reading) -> str:
+    """A command or measurement: evidence, what is open, its keys, and what would stand there instead."""
+    lines = [_comment(note) for note in reading.notes] + [_open(doubt) for doubt in reading.doubts]
+    body = to_toml({table: [reading.row()]}).rstrip("\n")
+    instead = [f"# {line}" for line in reading.instead]
+    return "\n".join([*lines, body, *instead]) + "\n"
+
+
+def _unknown(unknown: Unknown) -> str:
+    body = to_toml({"parameters": [unknown.row() | {"description": unknown.note}]})
+    if not unknown.left_out:
+        return body
+    return _comment(f"left out: {unknown.left_out}") + "\n" + "".join(f"# {line}\n" for line in body.splitlines())
+
+
+def summary(draft: Draft, path: str) -> list[str]:
+    """At most 20 lines: what was found, what is open, and what to do next."""
+    lines = [_said(reading) for reading in draft.readings]
+    if len(lines) > 8:
+        lines = [*lines[:7], f"and {len(lines) - 7} columns more"]
+    held, train = (
+        sum(max(1, len(log.episodes)) for log in draft.logs if log.use == use) for use in ("holdout", "train")
+    )
+    lines.append(f"time {draft.clock.column!r} in {draft.clock.unit}; {train} logs train, {held} held out")
+    names = [unknown.name for unknown in draft.proposed]
+    lines.append(_short(f"{len(names)} unknowns: {', '.join(names)}"))
+    lines += [_short(u.note) for u in draft.proposed if u.name == "delay"]
+    told = [f"OPEN: {doubt}" for doubt in draft.told]
+    room = _LINES - len(lines) - 2
+    if len(told) > room:
+        told = [*told[: room - 1], f"and {len(told) - room + 1} more that are open, see OPEN in {path}"]
+    return [*lines, *map(_short, told), f"{path} is written; look it through, then: sipe calibrate {path}"]
+
+
+def _said(reading: Reading) -> str:
+    columns = ", ".join(reading.match.columns)
+    sign = "-" if reading.sign < 0 else ""
+    unit = f"quaternion {reading.match.quaternion}" if reading.match.quaternion else f"{sign}{reading.unit}"
+    extra = ", wraps" * reading.wraps + ", starts windows only" * (not reading.fit)
+    return _short(f"{reading.match.target} <- {columns} [{unit}]{extra}")
+
+
+def _short(line: str) -> str:
+    return line if len(line) <= 160 else f"{line[:157]}..."

@@ -1,0 +1,44 @@
+"""The command ``sipe init``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sipe_bayes.cli.errors import command_line, exit_on_error
+
+
+def init(
+    model: Annotated[Path | None, typer.Argument(help="The MJCF.")] = None,
+    logs: Annotated[list[Path] | None, typer.Argument(help="Logs: files, folders or patterns.")] = None,
+    out: Annotated[Path, typer.Option(help="The configuration to write.")] = Path("calibrate.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Overwrite it.")] = False,
+    check: Annotated[Path | None, typer.Option(help="Say instead what is odd in this configuration.")] = None,
+) -> None:
+    """A first configuration of `sipe calibrate` from a model and its logs, each guess with its evidence."""
+    with exit_on_error():
+        if check is not None:
+            if model is not None or logs or force:
+                raise ValueError("--check: takes one configuration and nothing else; drop the other arguments")
+            from sipe_bayes.calibration.init.check import oddities
+
+            odd = oddities(check)
+            for line in odd or [f"{check}: nothing is odd: units, signs, delays and columns agree with simulations"]:
+                print(line)
+            if odd:
+                raise typer.Exit(1)
+            return
+        if model is None or not logs:
+            raise ValueError("expected a model and at least one log: sipe init MODEL.xml LOG...")
+        if out.exists() and not force:
+            raise ValueError(f"--out {out}: exists already; give --force to overwrite it, or another name")
+        from sipe_bayes.calibration.init.propose import propose
+        from sipe_bayes.calibration.init.write import summary, toml_of
+        from sipe_bayes.core.files import write_text
+
+        draft = propose(model, logs, out.parent)
+        write_text(out, toml_of(draft, command_line()))
+    for line in summary(draft, str(out)):
+        print(line)

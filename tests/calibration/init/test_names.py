@@ -1,0 +1,52 @@
+"""What names say."""
+
+import pytest
+
+from sipe_bayes.calibration.init.names import Kind, alike, read_name
+
+
+@pytest.mark.parametrize(
+    ("column", "kind", "unit", "number"),
+    [
+        ("time", Kind.TIME, "", None),
+        ("t_ms", Kind.TIME, "ms", None),
+        ("us", Kind.TIME, "us", None),
+        ("Time [s]", Kind.TIME, "s", None),
+        ("timestamp_ns", Kind.TIME, "ns", None),
+        ("episode_index", Kind.EPISODE, "", None),
+        ("frame_index", Kind.OTHER, "", None),
+        ("joint_1_pos", Kind.POSITION, "", 1),
+        ("/joint_states.position[0]", Kind.POSITION, "", 0),
+        ("observation.state[shoulder_pan.pos]", Kind.POSITION, "", None),
+        ("angle [deg]", Kind.POSITION, "deg", None),
+        ("x_mm", Kind.POSITION, "mm", None),
+        ("dq2", Kind.VELOCITY, "", 2),
+        ("theta_dot", Kind.VELOCITY, "", None),
+        ("vel_deg_s", Kind.VELOCITY, "deg/s", None),
+        ("speed_rad_per_s", Kind.VELOCITY, "rad/s", None),
+        ("omega (rpm)", Kind.VELOCITY, "rpm", None),
+        ("tau_mNm", Kind.TORQUE, "mN m", None),
+        ("torque_cmd", Kind.TORQUE, "", None),
+        ("motor_voltage_V", Kind.VOLTAGE, "V", None),
+        ("i_A", Kind.CURRENT, "A", None),
+        ("cmd", Kind.COMMAND, "", None),
+        ("action[shoulder_pan.pos]", Kind.SETPOINT, "", None),
+        ("goal_position", Kind.SETPOINT, "", None),
+        ("qw", Kind.QUATERNION, "", None),
+        ("px", Kind.POSITION, "", None),
+        ("θ1", Kind.POSITION, "", 1),
+        ("temp_C", Kind.OTHER, "", None),
+        ("states[3]", Kind.UNKNOWN, "", 3),
+        ("q_d", Kind.UNKNOWN, "", None),
+    ],
+)
+def test_what_a_name_says(column: str, kind: Kind, unit: str, number: int | None) -> None:
+    label = read_name(column)
+    assert (label.kind, label.unit, label.number) == (kind, unit, number)
+
+
+def test_names_that_are_spelt_shorter_are_alike() -> None:
+    assert alike(("shldr",), "shoulder") > 0.6
+    assert alike(("elb",), "elbow") > 0.6
+    assert alike(("wrist",), "elbow") == 0.0
+    assert alike(("shoulder", "pan"), "shoulder_pan") > alike(("shoulder", "lift"), "shoulder_pan")

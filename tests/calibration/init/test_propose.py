@@ -1,0 +1,140 @@
+"""`sipe init` on made-up logs: units, signs and delays come out, or it says that they do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from sipe_bayes.calibration.config import load_config
+from sipe_bayes.calibration.init.draft import Draft
+from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.write import summary, toml_of
+from sipe_bayes.calibration.logs import load_log
+from sipe_bayes.cli.app import app
+from tests.problems.made_up_logs import KINDS, PENDULUM, Truth, make_log
+
+LOGS = [(kind, variant) for kind in KINDS for variant in range(5)]
+
+
+def wrong(draft: Draft, truth: Truth) -> list[str]:
+    """What came out other than it is. Signs that are all turned are the same machine in a mirror: they must be told."""
+    out, signs = [], []
+    readings = {reading.match.target: reading for reading in draft.readings}
+    for (column, target), (unit, sign) in truth.columns.items():
+        reading = readings.get(target)
+        if reading is None or reading.match.column != column:
+            out.append(f"{target} is {column}, not {reading and reading.match.column}")
+            continue
+        if reading.unit != unit:
+            out.append(f"{column} is in {unit}, not {reading.unit}")
+        signs.append(reading.sign * sign)
+    if len(set(signs)) > 1:
+        out.append(f"signs {signs} of {list(truth.columns)}")
+    elif signs[0] < 0 and not any("turned round together" in doubt for doubt in draft.told):
+        out.append("a mirror image, and nothing is told")
+    if (draft.clock.column, draft.clock.unit) != truth.clock:
+        out.append(f"clock {draft.clock}")
+    if round(draft.delay) != truth.delay:
+        out.append(f"delay of {draft.delay}, not {truth.delay} samples")
+    return out
+
+
+def test_units_signs_and_delays_of_twenty_logs(tmp_path: Path) -> None:
+    mistakes = {}
+    for seed, (kind, variant) in enumerate(LOGS):
+        folder = tmp_path / f"{kind}{variant}"
+        folder.mkdir()
+        truth = make_log(folder, KINDS[kind], variant, seed)
+        draft = propose(folder / "model.xml", [folder / "log.csv"], folder)
+        (folder / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
+        config = load_config(folder / "calibrate.toml")
+        assert len(config.logs) == 2
+        assert len(summary(draft, "calibrate.toml")) <= 20
+        if mistake := wrong(draft, truth):
+            mistakes[kind, variant] = mistake
+    assert len(mistakes) <= 1, mistakes
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder with an arm's model and log, and the configuration that is written for them."""
+    folder = tmp_path_factory.mktemp("arm")
+    make_log(folder, KINDS["arm"], 1, 1)
+    result = CliRunner().invoke(app, init_of(folder))
+    assert result.exit_code == 0, result.output
+    assert result.output.count("\n") <= 20
+    return folder, (folder / "calibrate.toml").read_text()
+
+
+def init_of(folder: Path, *more: str) -> list[str]:
+    return ["init", str(folder / "model.xml"), str(folder / "log.csv"), "--out", str(folder / "calibrate.toml"), *more]
+
+
+def test_a_configuration_is_not_overwritten_unless_forced(arm: tuple[Path, str]) -> None:
+    folder, text = arm
+    refused = CliRunner().invoke(app, init_of(folder))
+    assert refused.exit_code == 2
+    assert "--force" in refused.output
+    assert CliRunner().invoke(app, init_of(folder, "--force")).exit_code == 0
+    assert (folder / "calibrate.toml").read_text().splitlines()[2:] == text.splitlines()[2:]  # below the command
+    assert {path.name for path in folder.iterdir()} == {"model.xml", "log.csv", "calibrate.toml"}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("", "", []),
+        ('unit = "deg"', 'unit = "rad"', ["joint_1_pos", "'deg' fits"]),
+        ('column = "torque_1"\nunit = "N m"\nsign = -1', 'column = "torque_1"\nunit = "N m"', ["torque_1", "sign 1"]),
+        ('column = "torque_1"', 'column = "torque_3"', ["torque_1", "torque_2", "swapped"]),
+        ('column = "joint_1_vel"\nunit = "rad/s"', 'column = "joint_1_vel"\nunit = "deg/s"', ["joint_1_vel", "slope"]),
+        ('name = "delay"', 'name = "slow"', ["late", "beyond the bounds"]),
+    ],
+)
+def test_what_is_odd_is_named(arm: tuple[Path, str], before: str, after: str, words: list[str]) -> None:
+    folder, text = arm
+    assert before in text
+    odd = text.replace(before, after)
+    if "torque_3" in after:
+        odd = odd.replace("torque_2", "torque_1").replace("torque_3", "torque_2")
+    if "slow" in after:
+        odd = odd.replace("bounds = [0.0, 0.02]", "bounds = [0.0, 0.001]")
+    (folder / "odd.toml").write_text(odd)
+    result = CliRunner().invoke(app, ["init", "--check", str(folder / "odd.toml")])
+    assert result.exit_code == (1 if words else 0), result.output
+    assert all(word in result.output for word in words), result.output
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"a": [3.0, 1.0, 2.0], "theta": [1.0, 2.0, 1.0]}, ["clock", "'a'", "theta"]),
+        ({"time": [0.0, 0.1, 0.2], "abc": [1.0, 2.0, 1.0]}, ["no column", "hinge", "abc"]),
+    ],
+)
+def test_what_can_not_be_matched_is_refused(tmp_path: Path, columns: dict[str, list[float]], words: list[str]) -> None:
+    (tmp_path / "model.xml").write_text(PENDULUM)
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+    result = CliRunner().invoke(app, init_of(tmp_path))
+    assert result.exit_code == 2
+    assert result.output.count("\n") == 1
+    assert all(word in result.output for word in words), result.output
+    assert not (tmp_path / "calibrate.toml").exists()
+
+
+def test_angles_that_come_round_are_written_on(tmp_path: Path) -> None:
+    time = np.arange(400) * 0.01
+    angle = 9.0 * np.sin(0.9 * time)
+    (tmp_path / "model.xml").write_text(PENDULUM)
+    table = {"time": time, "angle": (np.degrees(angle) + 180) % 360 - 180, "tau": np.sin(time)}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    (reading,) = draft.measurements
+    assert (reading.unit, reading.wraps) == ("deg", True)
+    config = draft.config(tmp_path)
+    read, _ = load_log(config, config.logs[0])
+    assert read.observations[:, 0] == pytest.approx(angle[: len(read.observations)], abs=1e-9)
