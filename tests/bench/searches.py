@@ -64,7 +64,10 @@ def table(pendulum: Problem) -> None:
     print(f"{'machine':<44}{'s':>6}{'rollouts':>10}  found")
     made_up = logs()
     real = pendulum.simulator, pendulum.train
-    _row("real pendulum (bar 180 s)", lambda: discover(*real, prior=pendulum.prior, likelihood=pendulum.segments))
+    _row(
+        "real pendulum (bar 180 s)",
+        lambda: discover(*real, holdout=pendulum.holdout, prior=pendulum.prior, likelihood=pendulum.segments),
+    )
     _row("two joints, 3 logs of 10 s at 500 Hz (900 s)", lambda: discover(double(), made_up, likelihood=Segments(1.0)))
 
 
