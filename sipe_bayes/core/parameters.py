@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.html import html_table
 
 Scale = Literal["linear", "log"]
 
@@ -185,6 +186,10 @@ class ParameterSpace(Sequence[Parameter]):
 
     def __repr__(self) -> str:
         return f"ParameterSpace({', '.join(self.names)})"
+
+    def _repr_html_(self) -> str:
+        rows = [(p.name, f"{p.low:g} to {p.high:g}", p.unit, p.scale, ", ".join(p.targets)) for p in self]
+        return html_table("ParameterSpace", ("parameter", "bounds", "unit", "scale", "writes"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:

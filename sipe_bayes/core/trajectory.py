@@ -17,6 +17,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.files import replacing
+from sipe_bayes.core.html import html_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,19 @@ class Trajectory:
             states=_part(self.states, samples),
             rewards=_part(self.rewards, steps),
         )
+
+    def _repr_html_(self) -> str:
+        names = self.channels or [f"channel {k}" for k in range(self.observations.shape[1])]
+        rows = [_channel_row(name, series) for name, series in zip(names, self.observations.T, strict=True)]
+        what = f"{len(self)} control steps of {self.dt:g} s, {self.actions.shape[1]} actions"
+        return html_table(f"Trajectory {self.name}", ("channel", "range", "missing"), rows, [what])
+
+
+def _channel_row(name: str, values: FloatArray) -> tuple[object, ...]:
+    """Name, range and samples that are missing of a channel's values (...)."""
+    there = values[np.isfinite(values)]
+    span = f"{there.min():.4g} to {there.max():.4g}" if there.size else "nothing measured"
+    return name, span, values.size - there.size
 
 
 def _part(array: FloatArray | None, rows: Any) -> FloatArray | None:

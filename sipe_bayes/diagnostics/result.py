@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
 from sipe_bayes.core.findings import Code, Finding, Findings
+from sipe_bayes.core.html import html_table
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
     ChannelNoise,
@@ -123,6 +124,17 @@ class Calibration:
     rollouts: int = 0
     seconds: float = 0.0
     out: str = ""
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (p.name, f"{p.mode:.4g}", f"{p.q05:.4g} to {p.q95:.4g}", p.unit, ", ".join(self.flags(p.name)))
+            for p in self.parameters
+        ]
+        errors = [
+            f"held out {s.log}, {s.channel}: {s.rmse:.3g} {s.unit}, as given {s.rmse_default:.3g}" for s in self.holdout
+        ]
+        headings = ("parameter", "value", "90 % interval", "unit", "flags")
+        return html_table(f"{self.name}, {self.estimator}", headings, rows, [*errors, *self.warnings])
 
     @property
     def warnings(self) -> list[str]:

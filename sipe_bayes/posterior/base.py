@@ -16,9 +16,10 @@ from torch import Generator, Tensor
 from torch.distributions import constraints
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.html import html_table
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import at_least, whole
-from sipe_bayes.posterior.storage import Header, write_pair
+from sipe_bayes.posterior.storage import Header, draws_by_name, write_pair
 
 if TYPE_CHECKING:
     import arviz
@@ -79,15 +80,6 @@ def check_bandwidth(bandwidth: object) -> float:
     if isinstance(bandwidth, (int, float)) and 0 < bandwidth < float("inf"):
         return float(bandwidth)
     raise ValueError(f"bandwidth: expected a positive number in theta units, got {bandwidth!r}; try 0.02")
-
-
-def _drawn(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> dict[str, NDArray[Any]]:
-    """Arrays (chain, draw, ...) by name, one for each draw of theta (chain, draw, N)."""
-    arrays = {key: np.asarray(x) for key, x in (given or {}).items()}
-    for key, x in arrays.items():
-        if x.shape[:2] != theta.shape[:2]:
-            raise ValueError(f"{name}: expected {key} {(*theta.shape[:2], '...')}, chains and draws, got {x.shape}")
-    return arrays
 
 
 class DrawsFamily(Protocol):
@@ -151,6 +143,12 @@ class Posterior(TorchDistribution):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(self.space.names)})"
+
+    def _repr_html_(self) -> str:
+        low, middle, high = (self.space.values(q) for q in self.quantile([0.05, 0.5, 0.95]).numpy())
+        ends = zip(self.space, middle, low, high, strict=True)
+        rows = [(p.name, f"{m:.4g}", f"{a:.4g} to {b:.4g}", p.unit) for p, m, a, b in ends]
+        return html_table(type(self).__name__, ("parameter", "median", "90 % interval", "unit"), rows)
 
     # What a family writes.
 
@@ -380,8 +378,8 @@ class Posterior(TorchDistribution):
             posterior=self._by_name(theta),
             prior=None if before is None else self._by_name(before),
             observed_data={name: np.asarray(x) for name, x in (observed_data or {}).items()} or None,
-            posterior_predictive=_drawn("posterior_predictive", posterior_predictive, theta) or None,
-            log_likelihood=_drawn("log_likelihood", log_likelihood, theta) or None,
+            posterior_predictive=draws_by_name("posterior_predictive", posterior_predictive, theta) or None,
+            log_likelihood=draws_by_name("log_likelihood", log_likelihood, theta) or None,
             sample_stats={name: x.numpy() for name, x in self._sample_stats().items()} or None,
         )
         for group in (data.posterior, *([] if before is None else [data.prior])):

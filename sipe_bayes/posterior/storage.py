@@ -9,10 +9,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypedDict, cast
 
+import numpy as np
 import safetensors.torch
+from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from torch import Tensor
 
@@ -84,3 +87,16 @@ def read_pair(path: str | os.PathLike[str]) -> tuple[Header, dict[str, Tensor]]:
         return cast(Header, header), safetensors.torch.load(content)
     except SafetensorError as error:
         raise ValueError(f"{tensor_path}: not a safetensors file ({error}); {_SAVE_AGAIN}") from error
+
+
+def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> dict[str, NDArray[Any]]:
+    """Arrays (chain, draw, ...) by name, one for each draw of theta (chain, draw, N).
+
+    Raises:
+        ValueError: for other chains or draws; the message names the argument ``name``.
+    """
+    arrays = {key: np.asarray(x) for key, x in (given or {}).items()}
+    for key, x in arrays.items():
+        if x.shape[:2] != theta.shape[:2]:
+            raise ValueError(f"{name}: expected {key} {(*theta.shape[:2], '...')}, chains and draws, got {x.shape}")
+    return arrays

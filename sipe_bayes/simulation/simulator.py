@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.html import html_table
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.base import Simulated
@@ -50,6 +51,13 @@ class Simulator(Simulated):
     """
 
     episodes: Episodes | None = None
+
+    def _repr_html_(self) -> str:
+        model = self.model
+        rows = [(p.name, f"{p.low:g} to {p.high:g}", p.unit, ", ".join(p.targets)) for p in self.space]
+        what = f"{model.nv} degrees of freedom, {model.nu} actuators, control step {self.dt:g} s"
+        seen = f"observes {', '.join(self.environment.channels)}"
+        return html_table("Simulator", ("parameter", "bounds", "unit", "writes"), rows, [what, seen])
 
     def rollout(
         self,

@@ -23,6 +23,7 @@ from sipe_bayes.posterior import (
     SurrogatePosterior,
     load_posterior,
 )
+from tests.problems.html import cells
 from tests.problems.posteriors import EXAMPLES, SIGMAS, example, seeded
 
 
@@ -32,6 +33,13 @@ def posterior(request: pytest.FixtureRequest) -> Posterior:
     if name not in EXAMPLES:
         pytest.fail(f"{name} is registered but has no example here: add one line to EXAMPLES")
     return example(name, n)
+
+
+def test_shows_its_medians_in_a_notebook(posterior: Posterior) -> None:
+    rows = cells(posterior._repr_html_())
+    assert [row[0] for row in rows] == list(posterior.space.names)
+    medians = posterior.space.values(posterior.quantile(0.5).numpy())
+    np.testing.assert_allclose([float(row[1]) for row in rows], medians, rtol=1e-3, atol=1e-12)
 
 
 def test_density_integrates_to_one(posterior: Posterior) -> None:
