@@ -39,10 +39,12 @@ def video(
     with exit_on_error():
         from dataclasses import replace
 
+        _load_mujoco()
         from sipe_bayes.calibration.problem import prepare
         from sipe_bayes.calibration.run import run_name
         from sipe_bayes.posterior import load_posterior
         from sipe_bayes.report import video as drawing
+        from sipe_bayes.simulation.rendering import Stage, with_sky
 
         whole("--width", width, 16)
         positive("--fps", fps)
@@ -53,6 +55,9 @@ def video(
         if not path.with_suffix(".json").is_file():
             raise ValueError(f"--posterior {path}: no such posterior; run `sipe calibrate {config}` first")
         known = load_posterior(path)
+        difference = known.space.difference(problem.simulator.space)
+        if difference:
+            raise ValueError(f"--posterior {path}: {difference} in {config}; give that of a run of it")
         logs = [*(problem.holdout or ()), *problem.train]
         chosen = next((one for one in logs if log in (None, one.name)), None)
         if chosen is None:
@@ -67,9 +72,19 @@ def video(
         at = 0 if channel is None else channels.index(channel)
         label = f"{channels[at]} ({problem.environment.channel_units[at]})"
         shown = drawing.motion(problem.simulator, settings, chosen, theta, at, label)
-        stage = drawing.Stage(problem.environment.spec(), width, width, camera)
+        stage = Stage(with_sky(problem.environment.spec()), width, width, camera)
         try:
             drawing.save(drawing.pictures(stage, shown, fps, speed), out, fps)
         finally:
             stage.close()
     print(f"{out}: log {chosen.name}, {chosen.dt * len(chosen):.3g} s, {out.stat().st_size / 2**20:.2g} MiB")
+
+
+def _load_mujoco() -> None:
+    """Import MuJoCo, which loads what MUJOCO_GL names; raises ImportError with the remedy where that fails."""
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:  # each backend has its own
+        backend, remedy = os.environ.get("MUJOCO_GL"), "install libegl1 or libosmesa6, or set another backend"
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ImportError(f"MUJOCO_GL={backend}: OpenGL cannot be loaded ({reason}); {remedy}") from None

@@ -89,7 +89,7 @@ def read_pair(path: str | os.PathLike[str]) -> tuple[Header, dict[str, Tensor]]:
         raise ValueError(f"{tensor_path}: not a safetensors file ({error}); {_SAVE_AGAIN}") from error
 
 
-def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> dict[str, NDArray[Any]]:
+def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> dict[str, NDArray[np.generic]]:
     """Arrays (chain, draw, ...) by name, one for each draw of theta (chain, draw, N).
 
     Raises:

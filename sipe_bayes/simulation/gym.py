@@ -20,6 +20,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.episodes import Episodes, Step
+from sipe_bayes.simulation.rendering import Picture, Pose, Stage
 from sipe_bayes.simulation.simulator import Simulator
 
 Space = gymnasium.Space[FloatArray]
@@ -124,15 +125,53 @@ class SipeEnv(_Face, gymnasium.Env[FloatArray, FloatArray]):
     Args:
         task: its name, or the task.
         variant: whose parameters it has.
+        render_mode: ``"rgb_array"`` for pictures, which want a backend of OpenGL (``simulation.rendering``).
+
+    Raises:
+        ValueError: for an unknown task, variant or mode.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium declares it so)
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
+    picture_size: int = 480  # pixels
+    _stage: tuple[bytes, Stage] | None = None  # with the theta that it shows
 
-    def __init__(self, task: str | Task, variant: str = "default") -> None:
+    def __init__(self, task: str | Task, variant: str = "default", render_mode: str | None = None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")
+        self.render_mode = render_mode
         self.task = make_task(task) if isinstance(task, str) else task
         self.theta = self.task.theta(variant)
         self.simulator = Simulator(self.task, num_threads=1)
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.simulator.dt))}
         self.observation_space, self.action_space = _spaces(self.task)
+
+    def render(self) -> Picture | None:
+        """A picture (480, 480, 3) of the present state; None without a ``render_mode``.
+
+        Raises:
+            ValueError: before the first ``reset``.
+            RuntimeError: where no backend of OpenGL is there.
+        """
+        if self.render_mode is None:
+            return None
+        if self._episodes is None:
+            raise ValueError("render: nothing has begun yet; call reset first")
+        theta = self._episodes.theta[0].tobytes()
+        if self._stage is None or self._stage[0] != theta:
+            self.close()
+            model = self._episodes.models[0]
+            tracks = any(model.camera(i).name == "track" for i in range(model.ncam))
+            camera = "track" if tracks else None
+            stage = Stage(model, self.picture_size, self.picture_size, camera)
+            stage.frame(self._episodes.states, room=2.0)
+            self._stage = theta, stage
+        return self._stage[1].draw([Pose(self._episodes.states[0])])
+
+    def close(self) -> None:
+        """Give OpenGL's context back."""
+        if self._stage is not None:
+            self._stage[1].close()
+            self._stage = None
 
     def set_parameters(self, theta: FloatArray, allow_outside: bool = False) -> None:
         """Give the simulator parameters.
