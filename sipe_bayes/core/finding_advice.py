@@ -61,6 +61,11 @@ ADVICE: dict[Code, str] = {
         "How much is process noise and how much measurement noise was still moving. Give `search.restarts`, or "
         "`measurements.noise_sd` where it is known."
     ),
+    Code.NOT_THE_NORMAL: (
+        "Contact makes the likelihood many-valleyed, and the search stands in a valley that its curvature does not "
+        "describe. Give `search.restarts` and a larger `search.budget`, cut the logs shorter, or measure velocities."
+    ),
+    Code.NOT_JUDGED: "Raise `search.budget`: simulating 120 draws from the posterior takes as many rollouts of each log.",
     Code.SEARCHED_ON_PARTS: (
         "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "
         "shows in a few moments only, cut the logs to these."

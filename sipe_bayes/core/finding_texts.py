@@ -114,6 +114,14 @@ class Code(Enum):
     PROCESS_NOISE_UNSETTLED = blocking(
         "the process noise had not settled: do not rely on the intervals; more restarts may help"
     )
+    NOT_THE_NORMAL = blocking(
+        "around the optimum the likelihood is not the normal that the intervals are taken from (Pareto k = {k:.1f}, "
+        "{effective:.0f} of {draws} draws effective), as in a wrong valley between contacts: do not rely on the "
+        "intervals; more restarts, shorter logs or more measured channels may help"
+    )
+    NOT_JUDGED = blocking(
+        "the budget left no room to see whether the posterior is the normal that the intervals are taken from: raise it"
+    )
     SEARCH_CUT_SHORT = blocking(
         "the budget ended before the search had settled: the estimate is the best so far, and its intervals are "
         "guessed from the way it has come; raise the budget"

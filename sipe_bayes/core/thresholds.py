@@ -98,6 +98,13 @@ class Thresholds(Options):
     )
     shown_interval: float = option(0.9, "the central interval whose coverage sentences speak of", "of the mass")
 
+    pareto_k: float = option(
+        0.7, "above it importance weights have so heavy a tail that no number of draws mends them", "Pareto shape k"
+    )
+    effective_share: float = option(
+        0.5, "weights of which more is effective are nearly alike, whatever the shape of their tail", "of the draws"
+    )
+
     # searches
     search_wide: float = option(
         0.15, "a search whose distribution is wider was cut short: half of a uniform prior's sd", "sd, of the range"

@@ -12,12 +12,17 @@ posterior's density by that of all batches together. They end with enough effect
 kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M. West 1993,
 "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
 
+``judged``: how far draws from a normal are from the posterior that it stands for, by the shape k of the Pareto
+distribution of their largest weights (A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, "Pareto Smoothed Importance
+Sampling", JMLR 25, 2024, https://arxiv.org/abs/1507.02646).
+
 Deviation: the batches' covariance is drawn towards the first normal's by the effective draws there are, so that few do
 not make it singular.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
@@ -27,6 +32,7 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.search.gaussians import log_normal
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
@@ -48,6 +54,8 @@ class ImportanceTuning(Options):
     wider: float = option(1.3, "width of later ones over the draws'", above=0)
     enough: float = option(100.0, "effective draws with which it ends", above=1)
     least: float = option(30.0, "effective draws that may be relied on", above=1)
+    judges: int = option(120, "draws that judge a normal: 33 of them are the tail that its k is fitted to", least=40)
+    at_once: int = option(50_000, "control steps simulated at a time when a normal is judged: memory", least=1)
     kernels: int = option(60, "kernels of the posterior", least=2)
     narrower: float = option(0.5, "width of kernels over Silverman's rule, for the bounds' sake", above=0, below=1)
 
@@ -107,6 +115,44 @@ def is_normal(
     energies = 0.5 * np.einsum("bi,ij,bj->b", gaps, precision, gaps)
     ratios = (values[0] - values[1:] + tuning.slack) / (energies[1:] - energies[0] + tuning.slack)
     return bool((ratios > tuning.least_fall).all() and (ratios < tuning.most_fall).all())
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What draws say of a normal: the Pareto shape k of their weights, and how many of them are effective."""
+
+    pareto_k: float
+    effective: float
+    draws: int
+
+    @property
+    def normal(self) -> bool:
+        """Whether it stands; weights that are nearly alike have a tail of any shape."""
+        return self.pareto_k <= THRESHOLDS.pareto_k or self.effective >= THRESHOLDS.effective_share * self.draws
+
+
+def judged(target: Target, normal: GaussianMixture, seed: int, tuning: ImportanceTuning, steps: int) -> Judgement:
+    """Hold draws from a normal against the log density that it stands for; steps: control steps of the logs."""
+    generator = torch.Generator().manual_seed(int(np.random.default_rng([seed, 1]).integers(2**31)))
+    points = normal.sample((tuning.judges,), generator=generator)
+    chunks = np.array_split(points.numpy(), max(1, round(tuning.judges * steps / tuning.at_once)))
+    ratios = np.concatenate([target(chunk) for chunk in chunks]) - normal.log_prob(points).numpy()
+    valid = np.isfinite(ratios)
+    if not valid.any():
+        return Judgement(np.inf, 0.0, tuning.judges)
+    # arviz takes no infinity; what is 50 nats below the others counts for nothing
+    ratios = np.where(valid, ratios, ratios[valid].min() - 50.0)
+    relative = np.exp(ratios - ratios.max())
+    return Judgement(pareto_shape(ratios), effective(relative / relative.sum()), tuning.judges)
+
+
+def pareto_shape(log_ratios: FloatArray) -> float:
+    """Shape k of the generalised Pareto distribution of the largest of exp(log_ratios (M,))."""
+    from arviz import psislw  # heavy
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns of what is returned
+        return float(psislw(log_ratios - log_ratios.max())[1])
 
 
 def batch_size(size: int, tuning: ImportanceTuning) -> int:

@@ -15,18 +15,19 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.importance import Draws
+from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
+from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.settings import BudgetTooSmall
+from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
@@ -39,11 +40,13 @@ class LaplaceState:
     Args:
         search: the state of its ``Strategy``.
         draws: those that take the normal's place; None before them, and where it stands.
-        done: whether both have ended.
+        judgements: of the normals of a chain's optima, best first.
+        done: whether all have ended.
     """
 
     search: WindowState | StateSpaceState | KnownStartState
     draws: Draws | None = None
+    judgements: tuple[Judgement, ...] = ()
     done: bool = False
 
 
@@ -106,7 +109,9 @@ class Laplace(Estimator[LaplaceState]):
     def _probed(self, windows: Windows | Chain, state: LaplaceState) -> LaplaceState:
         """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
         ended, tuning, n = replace(state, done=True), self.options.tuning.importance, len(self.space)
-        if isinstance(windows, Chain) or windows.num_start or windows.settings.noise == "sandwich":
+        if isinstance(windows, Chain):
+            return replace(ended, judgements=self._judged(windows, distinct(state.search.optima)))
+        if windows.num_start or windows.settings.noise == "sandwich":
             return ended
         kept = distinct(state.search.optima)
         batches = tuning.hopeless_after * importance.batch_size(n, tuning)
@@ -119,6 +124,19 @@ class Laplace(Estimator[LaplaceState]):
         if target.silent or importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
             return ended
         return replace(state, draws=Draws.none(n))
+
+    def _judged(self, chain: Chain, kept: list[Optimum]) -> tuple[Judgement, ...]:
+        """Of the normals of a chain's optima; fewer where the budget ends."""
+        out: list[Judgement] = []
+        for optimum in kept:
+            assert isinstance(optimum, ChainOptimum)
+            try:
+                target = ChainTarget(self.prior, chain, ChainFit.at(chain, optimum))
+                normal = mixture([optimum], self.space)
+                out.append(importance.judged(target, normal, self.seed, self.options.tuning.importance, len(chain.log)))
+            except BudgetExhausted:
+                break
+        return tuple(out)
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts."""
@@ -148,7 +166,7 @@ class Laplace(Estimator[LaplaceState]):
                 f"budget: {self.budget} rollouts were not enough for one optimum; "
                 f"one step takes {step} rollouts, so raise the budget"
             )
-        self._report(kept)
+        self._report(kept, state)
         normals = mixture(kept, self.space)
         if state.draws is None:
             return normals
@@ -161,7 +179,7 @@ class Laplace(Estimator[LaplaceState]):
             self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
         return normals
 
-    def _report(self, kept: list[Optimum]) -> None:
+    def _report(self, kept: list[Optimum], state: LaplaceState) -> None:
         """Diagnostics of the best optimum, and what is to be said against any that is kept."""
         best = kept[0]
         self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
@@ -169,6 +187,12 @@ class Laplace(Estimator[LaplaceState]):
             self.diagnostics |= best.diagnostics()
             if not best.settled:
                 self.find(Code.PROCESS_NOISE_UNSETTLED)
+            self.diagnostics["pareto_k"] = [one.pareto_k for one in state.judgements]
+            for one in state.judgements:
+                if not one.normal:
+                    self.find(Code.NOT_THE_NORMAL, k=one.pareto_k, effective=one.effective, draws=one.draws)
+            if state.done and len(state.judgements) < len(kept):
+                self.find(Code.NOT_JUDGED)
         for optimum in kept:
             if isinstance(optimum, WindowOptimum) and optimum.finding is not None:
                 self.findings.add(optimum.finding)
