@@ -95,7 +95,15 @@ class Laplace(Estimator[LaplaceState]):
         if state.draws is not None:
             return self._drawn(self.windows(trajectories), state, state.draws)
         windows = self.bound(trajectories)
-        search = self._strategy(windows).step(state.search)
+        strategy = self._strategy(windows)
+        if state.search.done:
+            assert isinstance(strategy, StateSpaceSearch)
+            assert isinstance(state.search, StateSpaceState)
+            search = strategy.shoot(state.search)
+            if search.done:
+                return replace(state, search=search, done=not self._shots_left(search))
+            return replace(state, search=search, judgements=())
+        search = strategy.step(state.search)
         state = replace(state, search=search)
         return self._probed(windows, state) if search.done else state
 
@@ -110,7 +118,9 @@ class Laplace(Estimator[LaplaceState]):
         """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
         ended, tuning, n = replace(state, done=True), self.options.tuning.importance, len(self.space)
         if isinstance(windows, Chain):
-            return replace(ended, judgements=self._judged(windows, distinct(state.search.optima)))
+            judgements = self._judged(windows, distinct(state.search.optima))
+            stands = not judgements or judgements[0].normal
+            return replace(state, judgements=judgements, done=stands or not self._shots_left(state.search))
         if windows.num_start or windows.settings.noise == "sandwich":
             return ended
         kept = distinct(state.search.optima)
@@ -124,6 +134,10 @@ class Laplace(Estimator[LaplaceState]):
         if target.silent or importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
             return ended
         return replace(state, draws=Draws.none(n))
+
+    def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
+        """Whether a finished search may go on from where windows of the logs lead."""
+        return isinstance(search, StateSpaceState) and search.shots < self.options.tuning.state_space.shooting.shots
 
     def _judged(self, chain: Chain, kept: list[Optimum]) -> tuple[Judgement, ...]:
         """Of the normals of a chain's optima; fewer where the budget ends."""

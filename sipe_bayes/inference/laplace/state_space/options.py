@@ -86,6 +86,18 @@ class HorizonTuning(Options):
 
 
 @dataclass(frozen=True)
+class ShootingTuning(Options):
+    """How windows grow where the smoother's optimum is not the posterior's; see ``shooting``."""
+
+    shots: int = option(2, "how often it is tried, the budget allowing", least=0)
+    window: int = option(8, "control steps of the first windows: hardly more than one impact", least=2)
+    first: int = option(4, "control steps of their first beginnings", least=2)
+    follows: float = option(3.0, "residual up to which longer windows count as following", "noise sds", above=0)
+    steps: int = option(15, "of the smoother for which it leaves room in the budget", least=1)
+    process: float = option(0.01, "process noise of the smoother that goes on from there", "of the movement", above=0)
+
+
+@dataclass(frozen=True)
 class ChainTuning(Options):
     """Numbers of the searches over a chain of states."""
 
@@ -95,3 +107,4 @@ class ChainTuning(Options):
     smoothing: SmoothingTuning = option(SmoothingTuning(), "the search from measured states")
     known_starts: KnownStartTuning = option(KnownStartTuning(), "the search from known first states")
     horizon: HorizonTuning = option(HorizonTuning(), "how its starting points are found")
+    shooting: ShootingTuning = option(ShootingTuning(), "how a trajectory through contacts is found otherwise")

@@ -10,6 +10,9 @@
    search goes on; from the optimum without them the filter tries to make do without outliers, and where that is
    likelier the search goes on from there. It turns to the next starting point once it comes to nothing likelier.
 
+5. Where draws find that the best optimum is not the posterior's (``inference.importance.judged``), windows of the logs
+   that grow (``shooting``) lead to further starting points.
+
 Of each starting point the likeliest optimum is kept: its normal in theta, with the states integrated out, is what
 ``laplace`` makes its truncated normal of. Where the logs' first states are known another search is made
 (``known_starts``).
@@ -24,8 +27,15 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.inference.laplace.state_space.kalman_filter import filtered
-from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise, likeliest_share, regress
+from sipe_bayes.inference.laplace.state_space.noise import (
+    first_noise,
+    infer_noise,
+    likeliest_share,
+    regress,
+    roughness,
+)
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import needed, outstanding
+from sipe_bayes.inference.laplace.state_space.shooting import shot
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
     ChainSearch,
@@ -61,10 +71,12 @@ class StateSpaceState(ChainState[SmoothingPosition]):
 
     Args:
         regressed: thetas (R, N) at which regressions have ended.
+        shots: how often windows have led to a further starting point, or failed to.
     """
 
     here: SmoothingPosition
     regressed: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    shots: int = 0
 
 
 @dataclass(frozen=True)
@@ -111,6 +123,31 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         phase, ones = Phase.REGRESS if chain.determined.all() else Phase.FOLLOW, np.ones(chain.num_start)
         none, damping = np.zeros(len(chain.linked), bool), self.tuning.damping.first
         return SmoothingPosition(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
+
+    def shoot(self, state: StateSpaceState) -> StateSpaceState:
+        """A finished search, once more from where windows of the logs end; as it was where they lead nowhere.
+
+        They begin at the best optimum's theta, then at the starting points.
+        """
+        chain, tuning = self.chain, self.tuning.shooting
+        begin = max(state.optima, key=lambda one: one.evidence).theta if not state.shots else state.points[0]
+        state = replace(state, shots=state.shots + 1)
+        room = tuning.steps * self.step_rollouts + self.problem.options.tuning.importance.judges * len(
+            chain.trajectories
+        )
+        end = shot(self.problem, chain, begin, chain.budget - chain.rollouts - room)
+        if end is None:
+            return replace(state, uncounted=chain.uncounted)
+        movement, fixed = chain.movement(end.states), chain.fixed_sd
+        sd = np.where(np.isnan(fixed), np.maximum(roughness(chain), chain.least[0]), fixed)
+        process = np.maximum(tuning.process * movement, chain.least[1])
+        here = replace(self._begin(end.theta), states=end.states, movement=movement, phase=Phase.NOISE)
+        here = replace(here, noise=self._guessed(ChainNoise(sd, process), movement))
+        here = replace(
+            here, estimates=self.tuning.smoothing.most_filters
+        )  # whose states would be lost for the filter's
+        points = np.concatenate([state.points, end.theta[None]])
+        return replace(state, points=points, point=len(points) - 1, here=here, done=False, uncounted=chain.uncounted)
 
     # ------------------------------------------------------------------ phases
 
