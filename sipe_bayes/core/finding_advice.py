@@ -63,9 +63,9 @@ ADVICE: dict[Code, str] = {
     ),
     Code.NOT_THE_NORMAL: (
         "Contact makes the likelihood many-valleyed, and the search stands in a valley that its curvature does not "
-        "describe. Give `search.restarts` and a larger `search.budget`, cut the logs shorter, or measure velocities."
+        "describe. Give `search.restarts` and a larger `budget`, cut the logs shorter, or measure velocities."
     ),
-    Code.NOT_JUDGED: "Raise `search.budget`: simulating 120 draws from the posterior takes as many rollouts of each log.",
+    Code.NOT_JUDGED: "Raise `budget`: simulating 120 draws from the posterior takes as many rollouts of each log.",
     Code.SEARCHED_ON_PARTS: (
         "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "
         "shows in a few moments only, cut the logs to these."
