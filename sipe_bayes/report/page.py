@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from sipe_bayes.core.files import write_bytes
-from sipe_bayes.core.findings import Findings
+from sipe_bayes.core.finding_advice import ADVICE
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing
@@ -198,7 +199,7 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, o
         "tone": "bad" if "bad" in tones else "fair" if "fair" in tones or calibration.warnings else "good",
         "headline": sentences[0].text,
         "sentences": sentences[1:],
-        "warnings": calibration.warnings,
+        "warnings": noticed(calibration.findings),
         "parameters": [row for p, row in rows if not p.nuisance],
         "nuisance": [row for p, row in rows if p.nuisance],
         "scores": [
@@ -214,6 +215,15 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, o
         "details": run_details(calibration.run),
         "limits": {"well": f"{100 * THRESHOLDS.well_determined:.0f} %"},
     }
+
+
+def noticed(findings: Sequence[Finding]) -> list[dict[str, object]]:
+    """The findings that are no notes, those of one code together, with what to do about them, split at code."""
+    groups: dict[Code, list[str]] = {}
+    for item in findings:
+        if item.severity is not Severity.NOTE:
+            groups.setdefault(item.code, []).append(item.text)
+    return [{"texts": texts, "advice": ADVICE[code].split("`")} for code, texts in groups.items()]
 
 
 def render(calibration: Calibration, images: Sequence[Picture]) -> str:

@@ -10,6 +10,7 @@ import matplotlib
 import pytest
 
 from sipe_bayes.core import files
+from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.records import (
@@ -62,8 +63,16 @@ def test_page_says_what_matters_first(page: str) -> None:
     second = text.index(
         "On held-out logs the calibrated model is better than the model you had: its error is 3.1 times smaller"
     )
-    assert first < second < text.index("90 % interval") < text.index("1 warning") < text.index("Parameters in detail")
-    assert second < text.index("at a bound") < text.index("1 warning")
+    order = (
+        "90 % interval",
+        "What was noticed",
+        "Prediction error",
+        "measured against simulated",
+        "Parameters in detail",
+    )
+    assert first < second < text.index(order[0])
+    assert [text.index(words) for words in order] == sorted(text.index(words) for words in order)
+    assert second < text.index("at a bound") < text.index("What was noticed")
     assert "Left out." not in text
 
 
@@ -105,7 +114,6 @@ def test_page_stands_alone(page: str, images: list[report.Picture]) -> None:
     assert all((value or "").startswith("data:image/png;base64,") for value in sources)
     anchors = {value for _, key, value in found.attributes if key == "id"}
     links = [value for _, key, value in found.attributes if key == "href"]
-    assert links
     assert all((value or "").startswith("#") and (value or "")[1:] in anchors for value in links)
 
 
@@ -158,6 +166,16 @@ def test_the_least_there_can_be(tmp_path: Path) -> None:
     assert "No log was held out" in text
     assert "warning" not in text
     assert [p.name for p in (tmp_path / "figures").iterdir()] == ["marginals.png"]
+
+
+def test_findings_of_one_kind_stand_together_with_what_to_do(calibration: Calibration) -> None:
+    many = tuple(noticed(Code.DEAD_RANGE, f"p{k}", text=f"dead range {k}") for k in range(200))
+    found = dataclasses.replace(calibration, findings=(*many, noticed(Code.NO_EFFECT, "x", text="nothing of x")))
+    page = Page(report.render(found, []))
+    assert page.text.count("and 199 more like it") == 1
+    assert all(item.text in page.text for item in found.findings)
+    assert page.text.count(ADVICE[Code.DEAD_RANGE].replace("`", "")) == 1
+    assert ADVICE[Code.NO_EFFECT].replace("`", "") in page.text
 
 
 # Files
