@@ -45,7 +45,8 @@ class Columns(Table):
 
     time: TimeColumn = TimeColumn()
     episode: Text | None = None
-    """column that numbers the episodes of a file, each of which is then a log of its own"""
+    """column that numbers the episodes of a file, each of which is then a log of its own; `"data/demo_*"` for numbered
+    groups of HDF5, `"runs[*]"` for cells of MATLAB"""
 
 
 class Resample(Table):

@@ -19,6 +19,7 @@ Table = Mapping[str, FloatArray]
 
 _SURE = 1.0  # a score from which names alone decide
 _NEVER = -2.0
+_CALLED = 0.65  # how alike a column and a joint are, from which it is called after it
 _RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
 
 
@@ -60,7 +61,7 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     labels = [read_name(name) for name in table]
     labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
     vectors, labels = _vectors(machine, labels)
-    labels = _unravelled(machine, labels, table)
+    labels = _unravelled(machine, _called_as_joints(machine, labels), table)
     offsets = _ordinals(labels)
     positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
     velocities = _by_position(positions, _assigned(machine.joints, labels, Kind.VELOCITY, offsets), table)
@@ -192,6 +193,20 @@ def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, in
             if free and scores[k, j] > max(scores[i, j] - _RIVAL, -0.5):
                 rivals.append(Match((labels[k].column,), target, labels[k], float(scores[k, j])))
     return commands, rivals
+
+
+def _called_as_joints(machine: Machine, labels: list[Label]) -> list[Label]:
+    """Labels of which those with nothing but the name of a joint or its body are positions, where it has no other."""
+
+    def speaks(label: Label, joint: Joint) -> bool:
+        return max(alike(label.words, joint.name), alike(label.words, joint.body)) > _CALLED
+
+    places = [x for x in labels if x.kind == Kind.POSITION]
+    open_joints = [j for j in machine.joints if not any(speaks(x, j) for x in places)]
+    return [
+        replace(x, kind=Kind.POSITION) if x.kind == Kind.UNKNOWN and any(speaks(x, j) for j in open_joints) else x
+        for x in labels
+    ]
 
 
 def _unravelled(machine: Machine, labels: list[Label], table: Table) -> list[Label]:

@@ -65,12 +65,24 @@ _SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate
 _ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"}
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
-    "input", "drive", "pwm", "duty", "act", "applied", "a",
+    "input", "drive", "pwm", "duty", "applied", "a",
 }  # fmt: skip
 _DESIRED = {"des", "desired", "ref", "reference", "setpoint", "sp", "set", "target", "goal", "demand", "wanted"} | {
     "requested", "dem",
 }  # fmt: skip
-_MEASURED = {"meas", "measured", "actual", "present", "est", "estimated", "observed", "observation", "filtered", "sens"}
+_MEASURED = {
+    "meas",
+    "measured",
+    "actual",
+    "act",
+    "present",
+    "est",
+    "estimated",
+    "observed",
+    "observation",
+    "filtered",
+    "sens",
+}
 _CURRENTS = {"current", "currents", "amps", "ampere", "cur", "iq", "i"}
 _VOLTAGES = {"voltage", "voltages", "volt", "volts"}
 _TIMES = {"time", "t", "timestamp", "timestamps", "stamp", "clock", "elapsed", "seconds", "secs", "millis"} | {
@@ -105,6 +117,10 @@ def read_name(column: str) -> Label:
     pieces = [piece.lower() for piece in _PIECE.findall(plain)]
     numbers = [int(piece) for piece in pieces if piece.isdigit()]
     words = [piece for piece in pieces if not piece.isdigit()]
+    last = re.split(r"[^A-Za-z]+", plain.rstrip("0123456789_ "))[-1]
+    parts = len(_PIECE.findall(last))
+    if not unit and 1 < parts < len(words) and last.lower() in _UNITS:  # mA, mNm, kN
+        unit, words = _UNITS[last.lower()], words[:-parts]
     if not unit and len(words) > 1:
         for length in (3, 2, 1):  # rad_per_s, rad_s, rad
             if len(words) > length and (word := _unit_of(words[-length:])):
@@ -132,8 +148,6 @@ def _unit_of(pieces: list[str]) -> str:
         return _RATES.get(_UNITS.get(pieces[0], ""), "")
     if pieces in (["n", "m"], ["newton", "meters"]):
         return "N m"
-    if pieces in (["m", "nm"], ["mn", "m"]):
-        return "mN m"
     if pieces == ["%"]:
         return "%"
     return _UNITS.get(pieces[0], "") if len(pieces) == 1 else ""
@@ -175,12 +189,14 @@ def _derivative_of(word: str) -> tuple[bool, str]:
 def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
     place = bool(flags & {"angle", "length", "place"})
     drive = _driven(flags, place)
+    if words and words[-1] in ("time", "stamp", "timestamp"):
+        return Kind.TIME
+    if drive is not None:
+        return drive
     if "episode" in flags and not place and not flags & {"speed", "torque"}:
         return Kind.EPISODE
     if "time" in flags and not place and not flags & {"speed", "torque", "command", "desired"}:
         return Kind.TIME
-    if drive is not None:
-        return drive
     if flags & {"acceleration"}:
         return Kind.ACCELERATION
     for flag, kind in (("torque", Kind.TORQUE), ("voltage", Kind.VOLTAGE)):

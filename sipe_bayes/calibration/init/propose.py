@@ -32,6 +32,7 @@ from sipe_bayes.calibration.init.windows import (
 )
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.many import episodes_of, matching
+from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.mjcf import compile_spec, load_spec
@@ -41,6 +42,7 @@ from sipe_bayes.likelihood.starts import estimate_states
 _LOOKED_AT = 3  # logs that are simulated
 _CHECKED = 60  # logs whose columns are looked at
 _HELD = 0.75  # share of a single log that trains
+_SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
 _SHORT = 2.0  # s: logs as short are one window each
 
 
@@ -148,7 +150,7 @@ def _split(
     wanted = [c for reading in (*measurements, *commands) for c in reading.match.columns]
     kept, lost = [files[0]], []
     for file in files[1:]:
-        if len(kept) > _CHECKED or not [c for c in wanted if c not in read_table(file, [])]:
+        if len(kept) > _CHECKED or not [c for c in wanted if c not in read_table(file, starred(wanted))]:
             kept.append(file)
         else:
             lost.append(file.name)
@@ -229,10 +231,11 @@ def _unknowns(
 
 
 def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str, str]:
-    """Length of the windows of the fit: half of the time in which the motion goes to and fro."""
+    """Length of the windows of the fit, a part of the time in which the motion goes to and fro: joints couple soon."""
     durations = [len(log) * log.dt for log in logs]
     if max(durations) <= _SHORT:
         return "log", "each log as one: they are short"
     swing = trial.length * logs[0].dt / share_of(machine)
-    length = float(np.clip(0.5 * swing, max(0.2, 20 * logs[0].dt), min(2.0, min(durations) / 4)))
+    part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE
+    length = float(np.clip(part * swing, max(0.1, 20 * logs[0].dt), min(2.0, min(durations) / 4)))
     return float(f"{length:.2g}"), f"s; the motion goes to and fro in about {swing:.2g} s"

@@ -13,9 +13,11 @@ from sipe_bayes.calibration.init.names import Kind, read_name
 from sipe_bayes.calibration.init.signals import time_unit
 from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers
+from sipe_bayes.calibration.readers.numbered import gathered, numbered
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 
+_EPISODES = ("demo", "episode", "ep_", "run", "trial", "toss", "traj", "rollout", "log", "exp", "test", "swing")
 _MOST = 20_000  # rows that are looked at
 _UNLIKE = 0.3  # share of steps that are far from the usual one, beyond which a column is no clock
 
@@ -51,8 +53,10 @@ class Opened:
 
 def open_table(path: Path, table: Columns) -> Opened:
     """Read what a file holds; raises LogError where nothing in it can be a clock."""
+    prefix = numbered(table, _EPISODES)
+    table = table if prefix is None else gathered(table, prefix)
     numbers = {name: values for name, column in table.items() if (values := _numbers(column)) is not None}
-    episodes = _episodes(numbers)
+    episodes = _episodes(numbers) if prefix is None else prefix
     if episodes is not None:
         ids = episode_numbers(path, table, episodes)
         values, counts = np.unique(ids, return_counts=True)

@@ -189,11 +189,12 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
     for unknown in unknowns:
         values = [bind(model, target).value for target in unknown.targets]
         own = values[0] if np.isfinite(values[0]) else None
-        if unknown.relative and not own:
+        if unknown.relative:
+            if own:
+                out.append(Parameter(unknown.name, unknown.low, unknown.high, targets=unknown.targets, relative=True))
             continue
-        ends = (unknown.low * own, unknown.high * own) if unknown.relative and own else (unknown.low, unknown.high)
-        low, high = min(ends), max(ends)
-        if own is not None and not low <= own <= high:
+        low, high = unknown.low, unknown.high
+        if own is not None:
             low, high = min(low, own), max(high, own)
         out.append(Parameter(unknown.name, low, high, targets=unknown.targets))
     return out

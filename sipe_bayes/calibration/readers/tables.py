@@ -13,6 +13,7 @@ from sipe_bayes.calibration.readers.hdf5_file import read_hdf5
 from sipe_bayes.calibration.readers.lerobot import INFO, read_lerobot
 from sipe_bayes.calibration.readers.matlab import read_matlab
 from sipe_bayes.calibration.readers.npz_arrays import read_npz
+from sipe_bayes.calibration.readers.numbered import gathered, starred
 from sipe_bayes.calibration.readers.parquet_table import read_parquet
 from sipe_bayes.calibration.readers.ros_bag import read_bag
 from sipe_bayes.calibration.readers.ulog import read_ulog
@@ -51,7 +52,7 @@ def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
 
     Args:
         path: a file with a suffix of ``READERS``, or a folder with one of its files.
-        wanted: columns that will be asked for; none for all.
+        wanted: columns that will be asked for; none for all. With ``*``, those of numbered episodes together.
 
     Returns:
         The columns, each (n,); they may differ in length.
@@ -74,6 +75,8 @@ def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
         raise LogError(f"{path}: cannot be read as {kind} ({_reason(error)}); {READERS[kind].remedy}") from error
     if not columns or not max(len(values) for values in columns.values()):
         raise LogError(f"{path}: holds no samples; record the log again or drop it")
+    for prefix in starred(wanted):
+        columns |= gathered(columns, prefix)
     return columns
 
 

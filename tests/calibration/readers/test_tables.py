@@ -51,7 +51,7 @@ def test_a_reader_is_added_by_one_line(tmp_path: Path, monkeypatch: pytest.Monke
     def read_lines(path: Path, wanted: Collection[str]) -> Columns:
         return {"value": np.array([float(line) for line in path.read_text().split()])}
 
-    monkeypatch.setitem(READERS, ".txt", Format(read_lines))
+    monkeypatch.setitem(READERS, ".txt", Format(read_lines, "`value`"))
     (tmp_path / "log.txt").write_text("1 2.5")
     assert read_table(tmp_path / "log.txt")["value"].tolist() == [1.0, 2.5]
     (tmp_path / "log.txt").write_text("1 two")
