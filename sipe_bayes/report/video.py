@@ -139,11 +139,18 @@ def save(frames: Iterator[Image.Image], path: Path, frames_per_second: float) ->
         import imageio
 
         try:
-            imageio.mimwrite(path, [np.asarray(f) for f in frames], fps=frames_per_second, macro_block_size=2)
+            imageio.mimwrite(path, [_even(f) for f in frames], fps=frames_per_second, macro_block_size=2)
         except ImportError:
-            raise ImportError("--out: an mp4 wants `pip install imageio-ffmpeg`; or write a .gif or .webp") from None
+            raise ImportError(
+                "--out: an mp4 wants `pip install 'sipe-bayes[video]'`; or write a .gif or .webp"
+            ) from None
         return
     first, *others = frames
     settings = {"quality": 70, "method": 4} if path.suffix == ".webp" else {"optimize": True}
     duration = round(1000 / frames_per_second)
     first.save(path, save_all=True, append_images=others, duration=duration, loop=0, **settings)
+
+
+def _even(frame: Image.Image) -> NDArray[np.uint8]:
+    """A picture of even width and height, which is what the codec takes."""
+    return np.asarray(frame, np.uint8)[: frame.height // 2 * 2, : frame.width // 2 * 2]
