@@ -116,13 +116,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Of one cell."""
     covered, z = np.array([r["covered"] for r in rows], float), np.abs([r["z"] for r in rows]).max(1)
     blocked = np.array([bool(r["blocking"]) for r in rows])
-    spread = covered.mean(1).std(ddof=1) / np.sqrt(len(rows)) if len(rows) > 1 else np.nan
+    spread = float(covered.mean(1).std(ddof=1) / np.sqrt(len(rows))) if len(rows) > 1 else None
     return {
         "seeds": [r["seed"] for r in rows],
         "mean_error": round(float(np.mean([r["error"] for r in rows])), 5),
         "mean_sd": round(float(np.mean([r["sd"] for r in rows])), 5),
         "coverage_90": round(float(covered.mean()), 3),
-        "standard_error": round(float(spread), 3),
+        "standard_error": None if spread is None else round(spread, 3),
         "coverage_90_without_blocking": round(float(covered[~blocked].mean()), 3) if (~blocked).any() else None,
         "fits_with_blocking": int(blocked.sum()),
         "silent_misses": int(((z > 5) & ~blocked).sum()),
@@ -152,7 +152,7 @@ def main() -> None:
     for row in fits(file):
         cells.setdefault(f"{row['model']}, {row['level']:.0%}, {row['steps']} steps", []).append(row)
     found = {
-        "command": "python examples/studies/contact.py",
+        "command": f"python examples/studies/contact.py --seeds {given.seeds[0]} {given.seeds[1]}",
         "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
         "cells": {cell: summary(rows) for cell, rows in cells.items()},
     }
