@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import os
@@ -33,6 +34,7 @@ OWN = [README, *(ROOT / name for name in ("CHANGELOG.md", "SECURITY.md", "llms.t
 PAGES = OWN + sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts)
 BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", flags=re.DOTALL)
 KINDS = {"python", "toml", "bash"}
+COMMAND: Any = typer.main.get_command(app)
 
 
 def blocks(page: Path, kind: str) -> list[tuple[str, str]]:
@@ -43,6 +45,7 @@ def blocks(page: Path, kind: str) -> list[tuple[str, str]]:
     return [(mark, text) for mark, text in found if not re.match(r"not run: \w", mark)]
 
 
+@functools.cache
 def generator() -> ModuleType:
     spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
     assert spec is not None
@@ -194,7 +197,7 @@ def test_commands_are_there(page: Path) -> None:
 
 
 def check_command(words: list[str], line: str) -> None:
-    command: Any = typer.main.get_command(app)
+    command = COMMAND
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         assert words[0] in command.commands, line
         command, words = command.commands[words[0]], words[1:]
@@ -205,7 +208,7 @@ def check_command(words: list[str], line: str) -> None:
 def test_every_command_has_an_example() -> None:
     """In its --help, in the order of EXAMPLES, and it is legal."""
     listed = []
-    for path, command in every_command(typer.main.get_command(app), ""):
+    for path, command in every_command(COMMAND, ""):
         assert command.epilog == f"Example: {EXAMPLES[path]}", path
         assert EXAMPLES[path].startswith(f"sipe {path}")
         check_command(shlex.split(EXAMPLES[path])[1:], EXAMPLES[path])
