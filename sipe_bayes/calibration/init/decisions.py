@@ -21,6 +21,7 @@ _CLEAR = np.log(1.5)  # of the logarithm of misses, from which a nominal simulat
 _DECIDED = np.log(1.12)  # and one whose unknowns are fitted
 _USELESS = 0.9  # of a straight line's miss, from which no simulation tells anything
 _POOR = 0.7  # of a straight line's miss, beyond which the nominal model is not believed
+_FAR = np.log(4.0)  # of the best of other units, up to which they are fitted too
 _SAME = np.log(1.02)
 _AGAINST = np.log(2.0)  # from which a simulation is believed against a name
 _UNLIKELY = 0.01  # by which what is not likely has to be better
@@ -285,7 +286,12 @@ def _rivals(ranking: _Ranking, channels: int) -> list[int]:
     if float(ranking.scores[order[0]]) > channels * np.log(_POOR):
         return order[:_FITTED]
     near = [i for i in order if behind[i] < _CLEAR]
-    return near[:_FITTED] if any(behind[i] > _SAME for i in near) else []
+    if all(behind[i] <= _SAME for i in near):
+        return []
+    units: dict[tuple[str, ...], int] = {}  # near to rest most machines are linear: every unit gets its chance
+    for i in order:
+        units.setdefault(tuple(a for a in ranking.answers[i] if isinstance(a, str)), i)
+    return list(dict.fromkeys([*near[:_FITTED], *(i for i in units.values() if behind[i] < _FAR)]))
 
 
 def _fitted(case: Case, asked: Sequence[Question], ranking: _Ranking, rivals: list[int]) -> tuple[_Ranking, FloatArray]:
@@ -296,9 +302,12 @@ def _fitted(case: Case, asked: Sequence[Question], ranking: _Ranking, rivals: li
     scores, thetas = [], []
     for i in rivals:
         readings = _answered(case.draft.readings, asked, ranking.answers[i])
-        left = fit(case.trial, case.assumption(readings), _FIRST_DELAYS, rounds=3)
+        assumption = case.assumption(readings)
+        left = fit(case.trial, assumption, _FIRST_DELAYS, rounds=3)
+        # from measured starts: where starts may move as well, motions that are read as tiny fit anything
+        misses = case.trial.misses([replace(assumption, delay=left.best)], left.theta)
         odd = _odd_sizes(case, readings) + _unlikely(asked, ranking.answers[i])
-        scores.append(float(np.log(left.misses).sum()) + odd)
+        scores.append(float(np.log(misses).sum()) + odd)
         thetas.append(left.theta)
     rest = [i for i in range(len(ranking.answers)) if i not in rivals]
     shift = max(scores) - float(ranking.scores[rivals].max())

@@ -15,6 +15,7 @@ from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.cli.app import app
+from tests.problems.log_tables import EXAMPLES
 from tests.problems.made_up_logs import KINDS, PENDULUM, Truth, make_log
 
 LOGS = [(kind, variant) for kind in KINDS for variant in range(5)]
@@ -138,3 +139,11 @@ def test_angles_that_come_round_are_written_on(tmp_path: Path) -> None:
     config = draft.config(tmp_path)
     read, _ = load_log(config, config.logs[0])
     assert read.observations[:, 0] == pytest.approx(angle[: len(read.observations)], abs=1e-9)
+
+
+def test_small_motions_of_a_real_machine_are_not_taken_for_degrees(tmp_path: Path) -> None:
+    folder = EXAMPLES / "furuta_pendulum"  # arrays without names; near to rest, every unit makes a linear machine
+    draft = propose(folder / "furuta.xml", sorted(folder.glob("qq_chrip*pos*.npz"))[:2], tmp_path)
+    units = {reading.match.target: reading.unit for reading in draft.readings}
+    expected = {"joint:arm.position": "rad", "joint:pole.position": "rad", "actuator:motor": "V"}
+    assert units == expected | {"joint:arm.velocity": "rad/s", "joint:pole.velocity": "rad/s"}
