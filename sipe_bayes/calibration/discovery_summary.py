@@ -50,7 +50,7 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
             compared += _errors(use, before, after, logs)
             drawn += _signals(use, before, after, logs, seed)
     added = [p for label in structures.best.labels for p in _added(structures, label, seed)]
-    averaged = Marginals.of(structures.posterior, problem.prior, problem.prior.space, seed)
+    averaged = Marginals.of(structures.posterior, problem.prior, seed)
     plain, left = before.stage(seed), after.stage(seed)
     further = after.further(seed) if left.misfit is None or left.misfit.matters else None
     return Discovery(
@@ -111,7 +111,7 @@ class _Model:
         """All parameters of the structure."""
         simulator = self.structures.simulator(self.one)
         prior = self.structures.search.fitting.prior_of(simulator)
-        return Marginals.of(self.structures.posterior_of(self.one), prior, simulator.space, seed).summaries()
+        return Marginals.of(self.structures.posterior_of(self.one), prior, seed).summaries()
 
     def further(self, seed: int) -> Posterior | None:
         """Of the user's parameters that a further log would ask for; None where single logs cannot be fitted."""
@@ -241,7 +241,7 @@ def _log_score(structures: Structures, label: str) -> float | None:
 def _added(structures: Structures, label: str, seed: int) -> list[ParameterSummary]:
     """Parameters of an extension of the best structure, averaged over the structures that have it."""
     posterior = structures.posterior_of_piece(label)
-    return Marginals.of(posterior, default_prior(posterior.space), posterior.space, seed).summaries()
+    return Marginals.of(posterior, default_prior(posterior.space), seed).summaries()
 
 
 def _promises(structures: Structures) -> tuple[Promise, ...]:

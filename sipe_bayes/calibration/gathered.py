@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.optimize
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
@@ -15,17 +16,45 @@ from sipe_bayes.core.findings import Code, Finding, Severity, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge
+from sipe_bayes.diagnostics.evaluate import compare_errors
+from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge, improvement
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.poses import has_pose
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts import unmeasured_joints
-from sipe_bayes.posterior import Posterior
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
 _FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
+
+
+def most_probable(posterior: Posterior) -> FloatArray:
+    """The most probable theta (N,) among those within every parameter's own 90 % interval.
+
+    Where bounds cut a ridge off, the mode sits in a corner of the cube that has next to no mass.
+    """
+    mode, levels = posterior.mode.numpy(), torch.tensor([0.05, 0.95], dtype=torch.float64)
+    low, high = posterior.quantile(levels).numpy()
+    if ((mode >= low) & (mode <= high)).all():
+        return mode
+    high = np.maximum(high, low + 1e-12)
+    if isinstance(posterior, GaussianMixture):
+        normals = zip(posterior.means.numpy(), posterior.covariances.numpy(), strict=True)
+        points = [_nearest(mean, covariance, low, high) for mean, covariance in normals]
+    else:
+        draws = posterior.sample((_DRAWS,), generator=torch.Generator().manual_seed(0)).numpy()
+        points = [*draws[((draws >= low) & (draws <= high)).all(1)], np.clip(mode, low, high)]
+    best = posterior.log_prob(torch.from_numpy(np.stack(points))).argmax()
+    return np.asarray(points[int(best)])
+
+
+def _nearest(mean: FloatArray, covariance: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """The most probable point (N,) of a normal between two corners of a box."""
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    return np.asarray(scipy.optimize.lsq_linear(root, root @ mean, (low, high), tol=1e-12).x)
 
 
 @dataclass(frozen=True)
@@ -34,7 +63,7 @@ class Marginals:
 
     Args:
         space: of the N parameters.
-        theta: (N,) the mode.
+        theta: (N,) as of ``most_probable``.
         sd: (N,) in theta.
         contraction: (N,) 1 - sd / prior sd.
         draws: (n, N) in units.
@@ -47,12 +76,12 @@ class Marginals:
     draws: FloatArray
 
     @classmethod
-    def of(cls, posterior: Posterior, prior: Posterior, space: ParameterSpace, seed: int) -> Marginals:
+    def of(cls, posterior: Posterior, prior: Posterior, seed: int) -> Marginals:
         """Those of a posterior, which started from a prior."""
         sd = posterior.stddev.numpy()
         contraction = 1 - sd / np.maximum(prior.stddev.numpy(), 1e-300)
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
-        return cls(space, posterior.mode.numpy(), sd, contraction, draws)
+        return cls(posterior.space, most_probable(posterior), sd, contraction, draws)
 
     def summaries(self, further: Posterior | None = None) -> list[ParameterSummary]:
         """One for each parameter.
@@ -140,18 +169,34 @@ def not_better(scores: Sequence[ChannelScore]) -> list[Finding]:
     for s in scores:
         if not math.isfinite(s.rmse):
             noticed.append(finding(Code.HELD_OUT_DIVERGES, log=s.log, channel=s.channel))
-        elif math.isfinite(s.rmse_default) and s.rmse >= s.rmse_default:
+        elif math.isfinite(s.rmse_default) and s.rmse > THRESHOLDS.same * s.rmse_default:
             where = functools.partial(finding, log=s.log, channel=s.channel, unit=s.unit)
             noticed.append(where(Code.HELD_OUT_WORSE, rmse=s.rmse, rmse_default=s.rmse_default))
     return noticed
 
 
+def worse_in_training(windows: Windows, theta: FloatArray, scores: Sequence[ChannelScore]) -> list[Finding]:
+    """Where theta (N,) follows the logs that it was fitted to worse than the model as given does.
+
+    From measured starts, and if it is worse from these, from those that each model fits best. scores: of these logs.
+    """
+    if not improvement(scores) < 1 / THRESHOLDS.same:
+        return []
+    compared = compare_errors(windows, theta, fit_starts=True)
+    if compared is None or compared.ratio >= 1 / THRESHOLDS.alike:
+        return []
+    return [finding(Code.TRAIN_WORSE, ratio=1 / compared.ratio)]
+
+
+def _of_log(report: LogReport, note: Finding) -> Severity:
+    """What the user should read is a caution; that all samples passed through unchanged is none."""
+    return Severity.CAUTION if report.suspect and note.code is not Code.LOG_CLOCK else note.severity
+
+
 def of_logs(reports: Sequence[LogReport]) -> list[Finding]:
     """What the readers noticed; cautions where a log is not simply as it was recorded, else notes."""
     return [
-        replace(
-            note, text=f"log {report.name}: {note.text}", severity=Severity.CAUTION if report.suspect else note.severity
-        )
+        replace(note, text=f"log {report.name}: {note.text}", severity=_of_log(report, note))
         for report in reports
         for note in report.findings
     ]

@@ -99,7 +99,7 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
         The result with what was noticed on the way.
     """
     save_posterior(calibration.posterior, folder)
-    values = problem.environment.space.values(calibration.posterior.mode.numpy())
+    values = np.array([p.mode for p in calibration.parameters])
     try:
         noticed = write_identified(problem.environment, values, folder / "identified.xml")
     except ExportError as error:

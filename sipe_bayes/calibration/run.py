@@ -10,15 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.calibration.gathered import Marginals, not_better, of_logs, uneven_targets, unmeasured_starts
-from sipe_bayes.calibration.output import CHECKPOINT, claim, describe_run, release, write_all
+from sipe_bayes.calibration.gathered import (
+    Marginals,
+    most_probable,
+    not_better,
+    of_logs,
+    uneven_targets,
+    unmeasured_starts,
+    worse_in_training,
+)
+from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claim, describe_run, release, write_all
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import disagreement, in_pieces, log_estimates
+from sipe_bayes.diagnostics.agreement import Disagreement, disagreement, in_pieces, linear_estimates, log_estimates
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
+    both_predicted,
     channel_scores,
     compare_errors,
     fitted_residuals,
@@ -36,13 +45,14 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.inference.recorded import Progress
+from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import observation_noise
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.posterior import Posterior
 
 
@@ -69,24 +79,22 @@ def calibrate(
     posterior = method.fit(problem.train)
     tell = functools.partial(_tell, method, progress)
     tell("checking what each parameter changes")
-    theta, space = posterior.mode.numpy(), problem.environment.space
+    theta, space = most_probable(posterior), problem.environment.space
     logs, problem = problem.train, _from_fitted_states(problem, method)
-    fitted = bind(problem.segments, problem.simulator, problem.train)
-    dead = dead_ranges(fitted, theta)
-    alone, unknown = _one_by_one(replace(problem, train=logs), fitted, theta, method.seed, tell)
-    conflict = disagreement(space, alone)
+    fit = _Fit.of(problem, method, theta)
+    dead = dead_ranges(fit.windows, theta)
+    alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
     # what the model lacks
-    noise = _noise_of(method, fitted, theta)
     tell("checking what the model lacks")
-    lacks, residuals = _residuals(problem, method, fitted, theta, noise, posterior.stddev.numpy(), unknown)
-    outside = _outside(problem, method, fitted, unknown)
+    lacks, residuals = _residuals(problem, method, fit, posterior.stddev.numpy(), unknown)
+    outside = _outside(problem, method, fit.windows, unknown)
     # how well it predicts
     tell("simulating the posterior's band")
-    marginals = Marginals.of(posterior, problem.prior, space, method.seed)
+    marginals = Marginals.of(posterior, problem.prior, method.seed)
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
     if doubted and len(logs) == 1:
-        alone = _by_pieces(replace(problem, train=logs), fitted, theta, method.seed, tell)
+        alone = _by_pieces(replace(problem, train=logs), fit, method.seed, tell)
     further = random_effects(alone, problem.prior, method.seed).new_log if doubted and alone[1:] else None
     predictions = _Predictions.of(problem, theta)
     noticed = (
@@ -118,7 +126,7 @@ def calibrate(
         comparison=predictions.comparison,
         misfit=lacks,
         outside=outside,
-        noise=_channel_noise(fitted, noise),
+        noise=_channel_noise(fit.windows, fit.noise),
         mixing=_mixing(method),
         logs=list(problem.reports),
         rollouts=method.rollouts,
@@ -133,33 +141,64 @@ def _from_fitted_states(problem: Problem, method: Estimator) -> Problem:
 
 
 @dataclass(frozen=True)
+class _Fit:
+    """The windows of the training logs at theta (N,): noise, best starts (W, D), and what changes them to first order.
+
+    ``lin`` is None where it is no use: without windows of the fit's own, or of bodies that tumble.
+    """
+
+    windows: Windows
+    theta: FloatArray
+    noise: Noise
+    starts: FloatArray
+    lin: Linearisation | None
+
+    @classmethod
+    def of(cls, problem: Problem, method: Estimator, theta: FloatArray) -> _Fit:
+        windows = bind(problem.segments, problem.simulator, problem.train)
+        noise = _noise_of(method, windows, theta)
+        if isinstance(problem.likelihood, StateSpace):
+            return cls(windows, theta, noise, windows.no_starts(), None)
+        starts = method.fitted_starts(theta) if isinstance(method, Laplace) else None
+        starts = best_starts(windows, theta, noise) if starts is None else starts
+        alone = grows(windows) or len(windows.trajectories) < 2
+        return cls(windows, theta, noise, starts, None if alone else windows.linearise(theta, starts))
+
+
+@dataclass(frozen=True)
 class _Predictions:
     """Of the logs at theta (N,), by use: windows from measured starts, the errors there, the held-out ones compared."""
 
     theta: FloatArray
     windows: dict[str, Windows]
+    predicted: dict[str, FloatArray]
     train: list[ChannelScore]
     holdout: list[ChannelScore]
     comparison: Comparison | None
 
     @classmethod
     def of(cls, problem: Problem, theta: FloatArray) -> _Predictions:
-        windows = {"train": _every_channel(problem, problem.train)}
-        if problem.holdout is None:
-            return cls(theta, windows, channel_scores(windows["train"], theta), [], None)
-        windows["holdout"] = held_out = _every_channel(problem, problem.holdout)
-        train, holdout = (channel_scores(one, theta) for one in windows.values())
-        return cls(theta, windows, train, holdout, compare_errors(held_out, theta))
+        logs = {"train": problem.train} | ({} if problem.holdout is None else {"holdout": problem.holdout})
+        windows = {use: _every_channel(problem, own) for use, own in logs.items()}
+        predicted = {use: both_predicted(one, theta) for use, one in windows.items()}
+        scores = {use: channel_scores(one, theta, predicted[use]) for use, one in windows.items()}
+        compared = None
+        if "holdout" in windows:
+            compared = compare_errors(windows["holdout"], theta, predicted=predicted["holdout"])
+        return cls(theta, windows, predicted, scores["train"], scores.get("holdout", []), compared)
 
     def findings(self) -> list[Finding]:
-        """Held-out errors that did not become smaller, unless they are mostly those of the measured starts."""
+        """Errors that became larger: in training, and held out unless they are mostly those of the measured starts."""
         of_starts = self.comparison is not None and self.comparison.starts is not None
-        return [] if of_starts else not_better(self.holdout)
+        worse = worse_in_training(self.windows["train"], self.theta, self.train)
+        return worse if of_starts else [*worse, *not_better(self.holdout)]
 
     def signals(self, posterior: Posterior, seed: int) -> list[Signal]:
         """What the report draws, held-out logs first."""
-        uses = reversed(self.windows.items())
-        return [s for use, windows in uses for s in signals(windows, use, self.theta, posterior, seed)]
+        drawn = []
+        for use, windows in reversed(self.windows.items()):
+            drawn += signals(windows, use, self.theta, posterior, seed, self.predicted[use])
+        return drawn
 
 
 def _every_channel(problem: Problem, logs: Trajectories) -> Windows:
@@ -173,24 +212,30 @@ def _tell(method: Estimator, progress: Progress | None, what: str) -> None:
 
 
 def _one_by_one(
-    problem: Problem, fitted: Windows, theta: FloatArray, seed: int, tell: Callable[[str], None]
-) -> tuple[list[LogEstimate], list[Finding]]:
-    """What each of several logs says by itself, and a finding for each that could not be fitted.
+    problem: Problem, fit: _Fit, seed: int, tell: Callable[[str], None]
+) -> tuple[list[LogEstimate], Disagreement | None, list[Finding]]:
+    """What each of several logs says by itself, how they disagree, and a finding for each that could not be fitted.
 
-    Not asked of bodies that tumble: one log says too little of them by itself, and its scatter is in the posterior.
+    To first order, and where they then disagree, by a fit of each. Not asked of bodies that tumble: one log says too
+    little of them by itself, and its scatter is in the posterior.
     """
-    if grows(fitted):
-        return [], []
-    alone, skipped = log_estimates(problem.simulator, problem.likelihood, problem.train, theta, seed, tell)
-    return alone, [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
+    if grows(fit.windows):
+        return [], None, []
+    space = problem.environment.space
+    if fit.lin is not None and fit.lin.valid:
+        alone = linear_estimates(fit.windows, fit.theta, fit.starts, fit.noise, fit.lin)
+        if disagreement(space, alone) is None:
+            return alone, None, []
+    alone, skipped = log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell)
+    return alone, disagreement(space, alone), [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
 
 
-def _by_pieces(
-    problem: Problem, fitted: Windows, theta: FloatArray, seed: int, tell: Callable[[str], None]
-) -> list[LogEstimate]:
+def _by_pieces(problem: Problem, fit: _Fit, seed: int, tell: Callable[[str], None]) -> list[LogEstimate]:
     """What pieces of a single log say, each by itself."""
-    pieces = replace(problem, train=in_pieces(problem.train, fitted.start))
-    return _one_by_one(pieces, fitted, theta, seed, tell)[0]
+    if grows(fit.windows):
+        return []
+    pieces = in_pieces(problem.train, fit.windows.start)
+    return log_estimates(problem.simulator, problem.likelihood, pieces, fit.theta, seed, tell)[0]
 
 
 def _mixing(method: Estimator) -> Mixing | None:
@@ -210,13 +255,7 @@ def _channel_noise(fitted: Windows, noise: Noise) -> dict[str, ChannelNoise]:
 
 
 def _residuals(
-    problem: Problem,
-    method: Estimator,
-    fitted: Windows,
-    theta: FloatArray,
-    noise: Noise,
-    sd: FloatArray,
-    unknown: list[Finding],
+    problem: Problem, method: Estimator, fit: _Fit, sd: FloatArray, unknown: list[Finding]
 ) -> tuple[Misfit | None, list[Residual]]:
     """What the residuals look like, and the residuals.
 
@@ -225,17 +264,17 @@ def _residuals(
     """
     if isinstance(problem.likelihood, StateSpace):
         return None, []
-    starts = best_starts(fitted, theta, noise)
+    windows, theta, noise, starts = fit.windows, fit.theta, fit.noise, fit.starts
     if {Code.SCATTER, Code.SCATTER_UNKNOWN} & {item.code for item in method.findings}:
         unknown.append(finding(Code.MISFIT_NOT_ASKED))
-        return None, fitted_residuals(fitted, theta, noise, starts)
+        return None, fitted_residuals(windows, theta, noise, starts)
     try:
         prior = QuadraticPrior.of(problem.prior)
-        lacks = misfit(fitted, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed)
+        lacks = misfit(windows, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed, lin=fit.lin)
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         lacks = None
-    return lacks, fitted_residuals(fitted, theta, noise, starts)
+    return lacks, fitted_residuals(windows, theta, noise, starts)
 
 
 def _outside(problem: Problem, method: Estimator, fitted: Windows, unknown: list[Finding]) -> list[OutsidePrior]:
@@ -307,7 +346,8 @@ def run(
     chosen_budget = problem.config.budget if budget is None else budget
     folder = Path("runs") / f"{run_name(problem.config.path)}-{name}" if out is None else out
     record = describe_run(problem, name, chosen_seed, chosen_budget)
-    claim(folder, {**record, "status": "started"})
+    keys = [key for key in IDENTITY if key != "budget" or not estimator_class(name).goes_on]
+    claim(folder, {**record, "status": "started"}, keys=keys)
     try:
         calibration = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
     except ValueError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,9 +27,13 @@ from sipe_bayes.core import __version__
 from sipe_bayes.inference.registry import ESTIMATORS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
 
+    from sipe_bayes.core.findings import Findings
     from sipe_bayes.diagnostics.catalogue import TaskDescription, TaskRow
+    from sipe_bayes.diagnostics.records import ChannelScore
     from sipe_bayes.diagnostics.result import Calibration
 
 app = typer.Typer(
@@ -40,6 +45,8 @@ app = typer.Typer(
 # what the parser says of options and arguments, whose name typer keeps private
 _REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
+_LINES, _SENTENCES, _WARNINGS, _CHANNELS = 20, 3, 3, 3  # that a calibration may fill, and of each kind of line
+_LONGEST = 300  # characters of a sentence on the terminal
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
@@ -186,24 +193,40 @@ def print_task(described: TaskDescription) -> None:
 
 
 def print_calibration(calibration: Calibration) -> None:
-    """What to think of it, parameters, errors, warnings and where the report lies, on standard output."""
+    """What to think of it, on standard output in at most 20 lines; all else is in the report."""
+    from rich.text import Text
+
+    from sipe_bayes.core.findings import Findings
+    from sipe_bayes.report.verdicts import headline, verdicts
+
+    console, findings = _console(), Findings(calibration.findings)
+    console.print(Text(f"{calibration.name}: posterior by {calibration.estimator}"))
+    brief = headline(calibration.parameters, findings, brief=True)
+    said = [brief if v == headline(calibration.parameters, findings) else v for v in verdicts(calibration)]
+    for verdict in said[:_SENTENCES]:
+        console.print(Text(_cut(verdict.text), style=_TONES[verdict.tone]))
+    below = [*_pooled(calibration)[:_CHANNELS], *_worst(findings)]
+    below.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s" + _report(calibration))
+    _print_parameters(console, calibration, findings, _LINES - 1 - min(len(said), _SENTENCES) - len(below))
+    for line in below:
+        console.print(line, highlight=False, markup=False)
+
+
+def _print_parameters(console: Console, calibration: Calibration, findings: Findings, lines: int) -> None:
+    """The table of the parameters in so many lines at most; the heading is one."""
     from rich.table import Table
     from rich.text import Text
 
-    from sipe_bayes.core.findings import Findings, Severity
-    from sipe_bayes.report.verdicts import parameter_verdict, verdicts
+    from sipe_bayes.report.verdicts import parameter_verdict
     from sipe_bayes.report.words import significant
 
-    console = _console()
-    console.print(Text(f"{calibration.name}: posterior by {calibration.estimator}"))
-    for verdict in verdicts(calibration):
-        console.print(Text(verdict.text, style=_TONES[verdict.tone]))
-    findings, table = Findings(calibration.findings), Table()
-    numbers, words = ["value", "90 % interval"], ["unit", "verdict"]
+    table, numbers, words = Table(box=None, pad_edge=False), ["value", "90 % interval"], ["unit", "verdict"]
     numbers += ["a further log's"] * any(p.further is not None for p in calibration.parameters)
     for heading in ("parameter", *numbers, *words):
-        table.add_column(heading, justify="right" if heading in numbers else "left")
-    for p in calibration.parameters:
+        table.add_column(heading, justify="right" if heading in numbers else "left", no_wrap=True)
+    shown = calibration.parameters
+    shown = shown if len(shown) < lines else shown[: lines - 2]
+    for p in shown:
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
         verdict = parameter_verdict(p, findings)
@@ -213,23 +236,48 @@ def print_calibration(calibration: Calibration) -> None:
             cells.append(" .. ".join(ends))
         # brackets of a name are not markup
         table.add_row(Text(p.name), *cells, p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
+    if len(shown) < len(calibration.parameters):
+        table.add_row(f"and {len(calibration.parameters) - len(shown)} more, in the report")
     console.print(table)
+
+
+def _pooled(calibration: Calibration) -> list[str]:
+    """A line for each channel: the root-mean-square of the errors on held-out logs, or where there are none on all."""
+    from sipe_bayes.report.words import times
+
+    title, scores = ("held out", calibration.holdout) if calibration.holdout else ("train", calibration.train)
     lines = []
-    for title, scores in (("held out", calibration.holdout), ("train", calibration.train)):
-        for s in scores:
-            ratio = s.rmse_default / s.rmse if s.rmse else float("inf")
-            lines.append(
-                f"{title} {s.log}, {s.channel}: RMSE {s.rmse:.3g} {s.unit}; model as given {s.rmse_default:.3g} "
-                f"({ratio:.1f} times that of the estimate)"
-            )
-    lines += [f"left out: {sentence}" for sentence in calibration.left_out]
-    lines += [f"warning: {warning}" for warning in calibration.warnings]
-    codes = dict.fromkeys(str(item.code) for item in calibration.findings if item.severity is not Severity.NOTE)
-    lines += [f"what these mean and what to do: sipe explain {' '.join(codes)}"] * bool(codes)
-    lines.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s")
-    lines += [f"report: {Path(calibration.out) / 'report.html'}"] * bool(calibration.out)
-    for line in lines:
-        console.print(line, highlight=False, markup=False)
+    for channel in dict.fromkeys(s.channel for s in scores):
+        mine = [s for s in scores if s.channel == channel]
+        own, given = (math.sqrt(sum(e * e for e in rmse) / len(mine)) for rmse in _errors(mine))
+        logs = f"{title} {mine[0].log}" if len(mine) == 1 else f"{title}, {len(mine)} logs"
+        ratio = times(given / own if own else float("inf"))
+        lines.append(f"{logs}, {channel}: RMSE {own:.3g} {mine[0].unit}; model as given {given:.3g} (now {ratio})")
+    return lines
+
+
+def _errors(scores: Sequence[ChannelScore]) -> tuple[list[float], list[float]]:
+    """Of the calibrated model and of that as given."""
+    return [s.rmse for s in scores], [s.rmse_default for s in scores]
+
+
+def _worst(findings: Findings) -> list[str]:
+    """The warnings that matter most; how many there are beside them."""
+    kinds = findings.kinds
+    lines = [f"warning: {_cut(text)}" for text in kinds[:_WARNINGS]]
+    if len(kinds) > len(lines):
+        lines[-1] += f" [{len(kinds) - len(lines)} more in the report]"
+    codes = dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS])
+    return lines + [f"what these mean and what to do: sipe explain {' '.join(codes)}"] * bool(codes)
+
+
+def _report(calibration: Calibration) -> str:
+    return f"; report: {Path(calibration.out) / 'report.html'}" if calibration.out else ""
+
+
+def _cut(text: str) -> str:
+    """A sentence that does not fill the screen."""
+    return text if len(text) <= _LONGEST else text[: text.rindex(" ", 0, _LONGEST)].rstrip(",;:") + " ..."
 
 
 _PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which a newcomer needs them

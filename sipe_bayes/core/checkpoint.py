@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import json
+import time
 import types
 import typing
 from dataclasses import dataclass
@@ -64,6 +65,34 @@ def save_state(path: Path, state: object, fingerprint: str) -> None:
     plain = _flattened("", state, arrays)
     arrays.setdefault("_", np.zeros(1))  # safetensors wants at least one
     write_bytes(path, save(arrays, metadata={"plain": json.dumps(plain), "fingerprint": fingerprint}))
+
+
+class Stored(Generic[S]):
+    """A search's file, which holds the last state that the end of the budget had not touched.
+
+    Args:
+        path: of the file; None for none.
+        fingerprint: which run it belongs to.
+        first: the state to begin with.
+        seconds: from one writing to the next.
+    """
+
+    def __init__(self, path: Path | None, fingerprint: str, first: S, seconds: float) -> None:
+        self.path, self.fingerprint, self.last, self.seconds = path, fingerprint, first, seconds
+        self._written, self._short = time.monotonic(), False
+
+    def offer(self, state: S, done: bool, short: bool) -> None:
+        """A further state; short: whether there would have been more with a larger budget, now or before."""
+        self._short = self._short or short
+        self.last = self.last if self._short else state
+        if done or time.monotonic() - self._written > self.seconds:
+            self.write()
+
+    def write(self) -> None:
+        """Write what is to be kept."""
+        if self.path is not None:
+            save_state(self.path, self.last, self.fingerprint)
+            self._written = time.monotonic()
 
 
 def load_state(path: Path, kind: type[S], fingerprint: str) -> S:

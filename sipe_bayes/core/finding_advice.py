@@ -140,6 +140,10 @@ ADVICE: dict[Code, str] = {
         "The calibrated model explodes on a motion that it was not fitted on: look at parameters at a bound, train "
         "on such motion too."
     ),
+    Code.TRAIN_WORSE: (
+        "The search did not find what it already had. Begin it from better values with `search.start`, narrow the "
+        "bounds, or shorten the windows."
+    ),
     Code.HELD_OUT_WORSE: (
         "The calibration did not help there. It fits what is peculiar to the training logs, or the model lacks "
         "what matters on this one."

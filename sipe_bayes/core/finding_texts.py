@@ -56,7 +56,10 @@ class Code(Enum):
         return self.name.lower()
 
     # any estimator
-    BUDGET_SPENT = blocking("the budget of {budget} rollouts ran out before the method had converged")
+    BUDGET_SPENT = blocking(
+        "the budget of {budget} rollouts ran out before the method had converged: give a larger one; laplace "
+        "goes on with it in the same folder"
+    )
     AT_BOUND = caution(
         "{parameters} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
     )
@@ -124,7 +127,7 @@ class Code(Enum):
     )
     SEARCH_CUT_SHORT = blocking(
         "the budget ended before the search had settled: the estimate is the best so far, and its intervals are "
-        "guessed from the way it has come; raise the budget"
+        "guessed from the way it has come; give a larger budget, and the same folder goes on"
     )
     SEARCH_UNSETTLED = blocking(
         "the search had not settled after {steps} steps: look at the residuals before you trust the intervals"
@@ -155,7 +158,8 @@ class Code(Enum):
         "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim"
     )
     NOT_LOOKED_AROUND = blocking(
-        "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow"
+        "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow; "
+        "give a larger budget, and the same folder goes on"
     )
     TOO_FEW_DRAWS = blocking(
         "the posterior is no normal, and {draws} draws from it came to {effective:.1f} effective ones: compare with "
@@ -237,6 +241,11 @@ class Code(Enum):
         "disagrees between logs",
     )
     AGREEMENT_UNKNOWN = caution("log {log} could not be fitted by itself; whether it agrees is unknown")
+    TRAIN_WORSE = blocking(
+        "on the very logs that it was fitted to the calibrated model is worse than the model as given (its error is "
+        "{ratio:.3g} times larger): the search ended in a wrong place; set search.start, narrow the bounds or shorten "
+        "the windows"
+    )
     HELD_OUT_DIVERGES = caution("held-out {log}, {channel}: the calibrated model diverges there")
     HELD_OUT_WORSE = caution(
         "held-out {log}, {channel}: {rmse:.3g} {unit} is not better than the model as given ({rmse_default:.3g})"

@@ -109,6 +109,17 @@ class Findings:
         return [item.text for item in self._items if item.severity is not Severity.NOTE]
 
     @property
+    def kinds(self) -> list[str]:
+        """The warnings, worst first, those of one kind about several logs as one with their number."""
+        worth = [item for item in self._items if item.severity is not Severity.NOTE]
+        groups: dict[tuple[object, ...], list[Finding]] = {}
+        for item in sorted(worth, key=lambda item: item.severity is not Severity.BLOCKING):
+            alike = (item.code, item.severity, item.parameters) if item.log is not None else (item,)
+            groups.setdefault(alike, []).append(item)
+        others = ((items[0].text, len(items) - 1) for items in groups.values())
+        return [text + (f" (and so {n} more)" if n else "") for text, n in others]
+
+    @property
     def doubts(self) -> list[str]:
         """The texts of those that block."""
         return [item.text for item in self.blocking]

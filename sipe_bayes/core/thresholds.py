@@ -87,6 +87,7 @@ class Thresholds(Options):
         0.05, "false alarms of one method compared with another, or with a baseline", "p-value"
     )
     alike: float = option(1.05, "errors within this factor of one another count as the same", "ratio")
+    same: float = option(1.005, "errors within this factor agree to about three digits: they are the same", "ratio")
     starts_rule: float = option(
         0.95, "measured starts that make more of the error rule it: both models get starts of their own", "of the error"
     )

@@ -30,11 +30,15 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.random_effects import LogEstimate
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 _BUDGET = 5000  # rollouts for each log
 _PIECES = 5  # of a single log, where there is no other to compare it with
+_FLAT = 1e-6  # precision that keeps a log's information invertible where it leaves a direction open
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,39 @@ def log_estimates(
     return estimates, skipped
 
 
+def linear_estimates(
+    windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise, lin: Linearisation
+) -> list[LogEstimate]:
+    """What each log by itself says to first order, with noise of its own: no simulation beside the linearisation.
+
+    Args:
+        windows: the logs.
+        theta: (N,) the estimate from all of them.
+        starts: (W, D) there.
+        noise: (C,) there, from which that of each log is searched.
+        lin: the linearisation at both.
+
+    Returns:
+        One for each log, none for a single one.
+    """
+    logs, n, estimates = windows.trajectories, len(theta), []
+    if len(logs) < 2:
+        return []
+    for k, name in enumerate(logs.names):
+        mine = np.flatnonzero(windows.log == k)
+        part, pull = windows.part(mine), -windows.start_precision * starts[mine]
+        moments = part.moments(Linearisation(lin.residual[mine], lin.jacobian[mine], True))
+        pulls = Pulls(_FLAT * np.eye(n), np.zeros(n), windows.start_precision, pull, np.ones(n, bool))
+        span = float(part.dt.min()), logs.longest
+        coloured = bool((noise.tau > 0).any())
+        own = estimate_noise(moments, noise, pulls, windows.fixed_sd, coloured, *span, windows.scales)
+        own = Noise(np.maximum(own.sd, windows.rounding), own.tau)
+        solved = eliminate_starts(moments.normal(own), n, windows.start_precision, pull)
+        step = np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
+        estimates.append(LogEstimate(name, theta + step, solved.precision))
+    return estimates
+
+
 def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
     """The disagreement of two or more logs, or None; only parameters shared by all logs are compared."""
     shared = [j for j, p in enumerate(space) if p.log is None]
@@ -142,8 +179,9 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
     parameter, per_log = space[shared[worst]], []
     for log, theta, sd in zip(logs, *apart[worst].own, strict=True):
         if sd < (1 - THRESHOLDS.not_determined) / np.sqrt(12):  # of the uniform prior's
-            slope = float(parameter.value(theta + 1e-6) - parameter.value(theta - 1e-6)) / 2e-6
-            per_log.append((log.name, float(parameter.value(theta)), float(sd) * slope))
+            inside = float(np.clip(theta, 0.0, 1.0))  # what lies beyond a bound, to first order, is at it
+            slope = float(parameter.value(inside + 1e-6) - parameter.value(inside - 1e-6)) / 2e-6
+            per_log.append((log.name, float(parameter.value(inside)), float(sd) * slope))
     left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
     agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree

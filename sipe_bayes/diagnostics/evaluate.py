@@ -26,6 +26,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
 _BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
+_NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
@@ -83,12 +84,26 @@ def _roots(windows: Windows, square: FloatArray) -> FloatArray:
 
 def _squares(windows: Windows, theta: FloatArray) -> FloatArray:
     """Squared errors (B, W, L, C) of theta (B, N) from measured starts, zero where nothing was measured."""
-    predicted, _ = windows.predict(theta, measured_starts(windows, theta))
+    return _off(windows, windows.predict(theta, measured_starts(windows, theta))[0])
+
+
+def _off(windows: Windows, predicted: FloatArray) -> FloatArray:
+    """Squared errors (B, W, L, C) of predictions, zero where nothing was measured."""
     return np.where(windows.observed, (windows.measured - predicted) ** 2, 0.0)
 
 
+def both_predicted(windows: Windows, theta: FloatArray) -> FloatArray:
+    """Predictions (2, W, L, C) from measured starts: of theta (N,) and of the model as given."""
+    thetas = np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)])
+    return windows.predict(thetas, measured_starts(windows, thetas))[0]
+
+
 def compare_errors(
-    windows: Windows, theta: FloatArray, reference: tuple[Windows, FloatArray] | None = None, fit_starts: bool = False
+    windows: Windows,
+    theta: FloatArray,
+    reference: tuple[Windows, FloatArray] | None = None,
+    fit_starts: bool = False,
+    predicted: FloatArray | None = None,
 ) -> Comparison | None:
     """Errors of theta against those of a reference, the model as given if nothing else is named.
 
@@ -105,12 +120,16 @@ def compare_errors(
         theta: (N,).
         reference: the same windows of another simulator, and its theta (M,).
         fit_starts: whether both are compared from the starts that each fits best in any case.
+        predicted: what ``both_predicted`` gave, where there is no other reference.
 
     Returns:
         None where there is nothing finite to compare.
     """
     others, at = reference or (windows, np.clip(windows.simulator.space.default_theta, 0, 1))
-    square = np.concatenate([_squares(windows, theta[None]), _squares(others, at[None])])
+    if predicted is None:
+        square = np.concatenate([_squares(windows, theta[None]), _squares(others, at[None])])
+    else:
+        square = _off(windows, predicted)
     fitted = _best_squares(windows, theta)
     share = _share_of_starts(windows, square[0], fitted)
     by_starts = share > THRESHOLDS.starts_rule
@@ -184,9 +203,10 @@ def fitted_units(windows: Windows) -> list[str]:
     return ["" if units is None else units[c] for c in windows.channels]
 
 
-def channel_scores(windows: Windows, theta: FloatArray) -> list[ChannelScore]:
-    """One row for each log and channel, theta (N,) beside the model as given."""
-    rmse = errors(windows, np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)]))
+def channel_scores(windows: Windows, theta: FloatArray, predicted: FloatArray | None = None) -> list[ChannelScore]:
+    """One row for each log and channel, theta (N,) beside the model as given; predicted: by ``both_predicted``."""
+    predicted = both_predicted(windows, theta) if predicted is None else predicted
+    rmse = _roots(windows, _off(windows, predicted))
     return [
         ChannelScore(log, *channel, float(rmse[0, k, c]), float(rmse[1, k, c]))
         for k, log in enumerate(windows.trajectories.names)
@@ -201,8 +221,15 @@ def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
     return np.concatenate([predicted[:, w][:, windows.owned[w]] for w in mine], axis=1)
 
 
-def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior, seed: int) -> list[Signal]:
-    """What the report draws of each log and channel.
+def signals(
+    windows: Windows,
+    use: str,
+    theta: FloatArray,
+    posterior: Posterior,
+    seed: int,
+    predicted: FloatArray | None = None,
+) -> list[Signal]:
+    """What the report draws of each log and channel; where the posterior is narrow its band is to first order.
 
     Args:
         windows: the logs.
@@ -210,11 +237,11 @@ def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior,
         theta: (N,) the mode.
         posterior: whose draws make the band.
         seed: of the draws.
+        predicted: what ``both_predicted`` gave.
     """
-    space = windows.simulator.space
+    both = both_predicted(windows, theta) if predicted is None else predicted
     draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
-    thetas = np.concatenate([theta[None], np.clip(space.default_theta, 0, 1)[None], draws])
-    predicted, _ = windows.predict(thetas, measured_starts(windows, thetas))
+    predicted = np.concatenate([both, _band(windows, theta, draws, both[0])])
     out = []
     for k, trajectory in enumerate(windows.trajectories):
         lines = _stitched(windows, predicted, k)
@@ -228,6 +255,21 @@ def signals(windows: Windows, use: str, theta: FloatArray, posterior: Posterior,
             line = Signal(trajectory.name, use, *channel, trajectory.time, measured, mode, q05, q95, default, begins)
             out.append(line)
     return out
+
+
+def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArray) -> FloatArray:
+    """Predictions (B, W, L, C) of draws (B, N) about theta (N,), where they are those ``here`` (W, L, C).
+
+    Of a narrow posterior by differences over an sd of each parameter, else of fewer draws.
+    """
+    spread = draws.std(0)
+    if spread.max() > _NARROW:
+        few = draws[:: max(1, len(draws) // _FEW_DRAWS)]
+        return windows.predict(few, measured_starts(windows, few))[0]
+    step = np.where(theta + spread <= 1, 1.0, -1.0) * np.maximum(spread, windows.theta_step)
+    beside = theta + np.diag(step)
+    slopes = (windows.predict(beside, measured_starts(windows, beside))[0] - here) / step[:, None, None, None]
+    return np.asarray(here + np.tensordot(draws - theta, slopes, axes=1))
 
 
 def white_noise(windows: Windows, theta: FloatArray) -> Noise:

@@ -15,14 +15,16 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Ridge
+from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.likelihood.windows import Windows
 
 GRID = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta, where parameters are tried
+_LOOKED_AT = 2000  # control steps: what does something there is not asked again of all windows
 UNIFORM_PRECISION = 12.0  # of theta under a uniform prior
 
 
 def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
-    """Where parameters change nothing; costs five rollouts a parameter and log.
+    """Where parameters change nothing; costs five rollouts a parameter and log, or of many windows those of some.
 
     Args:
         windows: the logs.
@@ -32,10 +34,19 @@ def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[flo
         Parameter -> pieces [a, b] of [0, 1] over which it changes no fitted channel. A piece whose simulation diverges
         is not called dead.
     """
-    space = windows.simulator.space
+    names = list(windows.simulator.space.names)
+    some = spread_windows(windows, _LOOKED_AT)
+    if len(some) < windows.num_windows:
+        names = list(_dead(windows.part(some), theta, names))
+    return _dead(windows, theta, names)
+
+
+def _dead(windows: Windows, theta: FloatArray, names: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
+    """``dead_ranges`` of some parameters."""
     dead: dict[str, list[tuple[float, float]]] = {}
     scale = np.maximum(windows.spread, 1e-12)
-    for j, name in enumerate(space.names):
+    for name in names:
+        j = windows.simulator.space.names.index(name)
         batch = np.tile(theta, (len(GRID), 1))
         batch[:, j] = GRID
         predicted, valid = windows.predict(batch, np.tile(windows.no_starts(), (len(GRID), 1, 1)))

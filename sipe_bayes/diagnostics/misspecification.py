@@ -41,12 +41,13 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.records import Misfit
+from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.structure.probes import Probe, probes
 
 _FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
@@ -57,11 +58,12 @@ _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 class MisfitOptions(Options):
     """What residuals are asked, and how the null is simulated."""
 
-    simulated: int = option(199, "draws of the null: p resolves half a percent", least=1)
+    simulated: int = option(99, "draws of the null: p resolves a percent", least=1)
     pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
     alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
+    steps: int = option(1600, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
     batch: int = option(16, "draws of the null whose products are formed together", least=1)
 
 
@@ -78,8 +80,11 @@ def misfit(
     prior: QuadraticPrior | None = None,
     seed: int = 0,
     simulated: int = MISFIT.simulated,
+    lin: Linearisation | None = None,
 ) -> Misfit:
     """How odd the residuals of fitted windows are; costs a linearisation and a rollout for each probe.
+
+    Of long or many logs some windows are looked at, spread evenly.
 
     Args:
         windows: the logs, W windows of C channels.
@@ -90,6 +95,7 @@ def misfit(
         prior: of the fit; default flat.
         seed: of the null.
         simulated: draws of the null.
+        lin: at theta and starts, where it is known.
 
     Returns:
         What they look like most, and how odd that is.
@@ -97,9 +103,14 @@ def misfit(
     Raises:
         ValueError: where the simulation diverges at theta.
     """
+    kept = spread_windows(windows, MISFIT.steps)
+    if len(kept) < windows.num_windows:
+        windows, starts = windows.part(kept), None if starts is None else starts[kept]
+        lin = None if lin is None else Linearisation(lin.residual[kept], lin.jacobian[kept], lin.valid)
     starts = best_starts(windows, theta, noise) if starts is None else starts
     prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
-    return _Residuals(windows, theta, noise, starts, prior).misfit(np.random.default_rng(seed), simulated, sd)
+    residuals = _Residuals(windows, theta, noise, starts, prior, lin)
+    return residuals.misfit(np.random.default_rng(seed), simulated, sd)
 
 
 @dataclass(frozen=True)
@@ -131,10 +142,16 @@ class _Residuals:
     """The log linearised at the estimate, with K probes beside the N parameters."""
 
     def __init__(
-        self, windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray, prior: QuadraticPrior
+        self,
+        windows: Windows,
+        theta: FloatArray,
+        noise: Noise,
+        starts: FloatArray,
+        prior: QuadraticPrior,
+        lin: Linearisation | None = None,
     ) -> None:
         self.windows, self.theta, self.noise = windows, theta, noise
-        linearisation = windows.linearise(theta, starts)
+        linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
         self.probes, effects, self.one_sided = probes(windows, theta, starts)

@@ -18,9 +18,10 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.replicas import Replicas
-from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
@@ -29,8 +30,15 @@ from sipe_bayes.posterior import Posterior
 class PredictiveOptions(Options):
     """How the prior is simulated and a log held against it."""
 
-    simulations: int = option(59, "with the log the largest of them has a p-value of 1/60", least=1)
+    simulations: int = option(39, "with the log the largest of them has a p-value of 1/40", least=1)
+    steps: int = option(2000, "of windows spread evenly over long logs", "control steps", least=1)
     batch: int = option(10, "of them in memory at a time", least=1)
+    least: float = option(
+        0.02,
+        "a distance that counts as none: what smoothing does to a start is more than a quiet sensor's noise",
+        "of a channel's spread",
+        least=0,
+    )
     samples: int = option(50, "of a log: more are correlated, and distances in many dimensions alike", least=1)
     neighbours: int = option(20, "of the local outlier factor, as its authors advise", least=1)
 
@@ -71,8 +79,11 @@ class OutsidePrior:
         return self.finding.text
 
 
-def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
+def outside_prior(windows: Windows, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
     """For each log its place among simulations of the prior; those that diverge are left out.
+
+    It is looked at in windows: commands of a controller, replayed over a whole log, drive every model but the true one
+    away, and the log would be outside by staying.
 
     Args:
         windows: the logs, bound to the simulator.
@@ -86,7 +97,9 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
     Raises:
         ValueError: where more than half of the simulations diverge.
     """
-    logs, made = windows.trajectories, _predictive(windows, prior, noise, seed)
+    chosen = spread_windows(windows, _OPTIONS.steps, every_log=True)
+    logs = Trajectories.stack([_piece(windows, int(w)) for w in chosen])
+    made = _predictive(windows, logs, prior, noise, seed)
     if len(made) < _OPTIONS.simulations // 2:
         share = f"{len(made)} of {_OPTIONS.simulations}"
         raise ValueError(f"prior: {share} simulations did not diverge, half are needed; narrow the bounds")
@@ -99,36 +112,50 @@ def outside_prior(windows: Windows | Chain, prior: Posterior, noise: Noise, *, s
                 continue
             kept = known[np.linspace(0, len(known) - 1, min(_OPTIONS.samples, len(known))).round().astype(int)]
             simulated = np.stack([one[k, kept, c] for one in made])
-            far[k, i] = _outlier_factors(simulated, log.observations[kept, c])
-            gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(simulated.std(0), 1e-12)
+            scale = np.maximum(simulated.std(0), _OPTIONS.least * float(windows.spread[i]))
+            far[k, i] = _outlier_factors(simulated, log.observations[kept, c], scale)
+            gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(scale, 1e-12)
             farthest[k, i] = kept[gap.argmax()] * log.dt
     largest = far[..., 1:].max((0, 1))
     outcome = []
-    for k, name in enumerate(logs.names):
-        i = int(far[k, :, 0].argmax())
+    for number, name in enumerate(windows.trajectories.names):
+        mine = np.flatnonzero(windows.log[chosen] == number)
+        if not len(mine):
+            continue
+        k, i = (int(x) for x in np.unravel_index(far[mine, :, 0].argmax(), (len(mine), far.shape[1])))
+        k = int(mine[k])
         p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
         channel = windows.simulator.environment.channels[windows.channels[i]]
-        outcome.append(OutsidePrior(p, name, channel, float(farthest[k, i])))
+        begin = float(windows.start[chosen[k]] * windows.dt[chosen[k]])
+        outcome.append(OutsidePrior(p, name, channel, begin + float(farthest[k, i])))
     return outcome
 
 
-def _predictive(windows: Windows | Chain, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
+def _piece(windows: Windows, number: int) -> Trajectory:
+    """A window as a log of its own."""
+    log, start = int(windows.log[number]), int(windows.start[number])
+    whole, stop = windows.trajectories[log], start + int(windows.steps[number])
+    states = None if whole.states is None else whole.states[start : stop + 1]
+    observations, actions = whole.observations[start : stop + 1], whole.actions[start:stop]
+    return Trajectory(observations, actions, whole.dt, states, whole.name, whole.channels)
+
+
+def _predictive(windows: Windows, logs: Trajectories, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
     """Observations (R, T+1, O) of the logs at draws of the prior, orientations written near the logs' own."""
-    replicas, rng = Replicas(windows.simulator, windows.trajectories, noise), np.random.default_rng(seed)
+    replicas, rng = Replicas(windows.simulator, logs, noise), np.random.default_rng(seed)
     thetas = prior.sample((_OPTIONS.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()
     batches = np.array_split(thetas, max(1, _OPTIONS.simulations // _OPTIONS.batch))
     made = (one for batch in batches for one in replicas.many(batch, rng, estimated=True))
-    rotations, seen = windows.simulator.environment.rotations, windows.trajectories.observations
+    rotations, seen = windows.simulator.environment.rotations, logs.observations
     return [written_near(one.observations, seen, rotations) for one in made if one is not None]
 
 
-def _outlier_factors(simulated: FloatArray, log: FloatArray) -> FloatArray:
-    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another."""
+def _outlier_factors(simulated: FloatArray, log: FloatArray, scale: FloatArray) -> FloatArray:
+    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another, in scales (F,)."""
     from sklearn.neighbors import LocalOutlierFactor
 
-    every, sd = np.concatenate([log[None], simulated]), simulated.std(0)
-    varies = sd > 1e-12
+    every, varies = np.concatenate([log[None], simulated]), simulated.std(0) > 1e-12
     if not varies.any():
         return np.zeros(len(every))
     factor = LocalOutlierFactor(n_neighbors=min(_OPTIONS.neighbours, len(simulated) - 1))
-    return np.asarray(-factor.fit(every[:, varies] / sd[varies]).negative_outlier_factor_)
+    return np.asarray(-factor.fit(every[:, varies] / scale[varies]).negative_outlier_factor_)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from numbers import Real
 
@@ -32,6 +33,13 @@ class ChannelScore:
     unit: str
     rmse: float
     rmse_default: float
+
+
+def improvement(scores: Iterable[ChannelScore]) -> float:
+    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares."""
+    ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
+    ratios = [r for r in ratios if math.isfinite(r)]
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import copy
 import hashlib
 import inspect
 import json
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import replace
@@ -18,17 +17,15 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
-import torch
 
-from sipe_bayes.core.checkpoint import SearchState, Snapshot, load_state, save_state
+from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
 from sipe_bayes.core.findings import Code, Findings, Severity, finding
 from sipe_bayes.core.options import Options
-from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.inference.arguments import check_simulator, stated_prior
-from sipe_bayes.inference.recorded import Progress, Recorded, digest
+from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest
 from sipe_bayes.likelihood.binding import bind, default_likelihood
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -117,7 +114,8 @@ class Estimator(ABC, Generic[S]):
     - ``uses_prior = False``: the prior plays no part, or only at the beginning.
     - ``uncertain = False``: the spread is that of a search, not an uncertainty.
     - ``searches = True``: it looks for optima of a likelihood: takes ``StateSpace``, ``restarts`` and ``candidates``.
-    - ``amortised = True``: what one fit learned serves another; ``default_budget``: rollouts.
+    - ``amortised = True``: what one fit learned serves another; ``goes_on = True``: a larger budget goes on where a
+      smaller one ended; ``default_budget``: rollouts.
     """
 
     name: ClassVar[str]
@@ -126,6 +124,7 @@ class Estimator(ABC, Generic[S]):
     uses_prior: ClassVar[bool] = True
     uncertain: ClassVar[bool] = True
     default_budget: ClassVar[int] = 1000
+    goes_on: ClassVar[bool] = False
     checkpoint_seconds: float = 1.0
     options_type: ClassVar[type[Options]] = Options
     state_type: ClassVar[type[SearchState]]  # the frozen dataclass of a method's state
@@ -148,6 +147,7 @@ class Estimator(ABC, Generic[S]):
         self.simulator, self.space = simulator, simulator.space
         self.prior = stated_prior(prior, self.space)
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
+        self._own_budget = budget is None
         if not isinstance(likelihood, Segments | StateSpace | None):
             raise ValueError(
                 f"likelihood: expected sipe.Segments(...), got {likelihood!r}; or give sipe.StateSpace(...)"
@@ -174,7 +174,7 @@ class Estimator(ABC, Generic[S]):
         self.prepare()
 
     def prepare(self) -> None:
-        """For a subclass: what it checks or makes once, after the common arguments."""
+        """For a subclass: what it makes once."""
         self.check_options()
 
     def check_options(self) -> None:
@@ -225,25 +225,29 @@ class Estimator(ABC, Generic[S]):
             CheckpointError: for a checkpoint that is damaged or of another run.
         """
         batch = self._given.stack(self._recorded(trajectories), anew=True)
+        self.budget = self.budget_for(batch) if self._own_budget else self.budget
         fingerprint = self._fingerprint(batch)
         self.findings, self.diagnostics, self.rollouts, self._bound = Findings(), {}, 0, None
         last = None if flag("retrain", retrain) else self._resumed(batch, fingerprint)
         self._last, self._run = None, fingerprint
         if last is not None:
             self.go_on_from(last)
-        saved, last = time.monotonic(), last or self._started(batch)
+        last = last or self._started(batch)
+        stored = Stored(self.checkpoint, fingerprint, last, self.checkpoint_seconds)
         try:
             while not last.state.done:
                 last = self._keep(self.step(last.state, batch))
-                late = time.monotonic() - saved > self.checkpoint_seconds
-                if self.checkpoint is not None and (last.state.done or late):
-                    save_state(self.checkpoint, last, fingerprint)
-                    saved = time.monotonic()
+                stored.offer(last, last.state.done, self._bound is not None and self._bound[1].short)
                 if self.progress is not None:
                     self.progress(self.describe(last.state), self.rollouts, self.budget)
         except BudgetExhausted:
+            stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
         return self._finished(last.state, batch)
+
+    def budget_for(self, trajectories: Trajectories) -> int:
+        """Where the user names none."""
+        return self.default_budget
 
     def update_parameter_estimate(self, trajectories: Recorded) -> None:
         """One step of the method, as the paper's interface names it.
@@ -253,8 +257,7 @@ class Estimator(ABC, Generic[S]):
         """
         batch, last = self._given.stack(self._recorded(trajectories)), self._last
         if last is None:
-            self._run = self._fingerprint(batch)
-            last = self._started(batch)
+            self._run, last = self._fingerprint(batch), self._started(batch)
         if not last.state.done:
             self.go_on_from(last)
             try:
@@ -288,11 +291,9 @@ class Estimator(ABC, Generic[S]):
     def _finished(self, state: S, trajectories: Trajectories) -> Posterior:
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
         posterior = self.posterior(state, trajectories)
-        middle = posterior.quantile(torch.tensor([0.5], dtype=torch.float64))[0].numpy()
-        narrow = posterior.stddev.numpy() <= (1 - THRESHOLDS.not_determined) * self.prior.stddev.numpy()
-        near = np.minimum(middle, 1 - middle) < THRESHOLDS.at_bound
-        if (narrow & near).any():
-            self.find(Code.AT_BOUND, parameters=np.array(self.space.names)[narrow & near].tolist())
+        at_bound = at_bounds(posterior, self.prior)
+        if at_bound:
+            self.find(Code.AT_BOUND, parameters=at_bound)
         return posterior
 
     def _recorded(self, given: Recorded) -> Any:
@@ -386,7 +387,7 @@ class Estimator(ABC, Generic[S]):
         return {
             "estimator": self.name,
             "seed": self.seed,
-            "budget": self.budget,
+            **({} if self.goes_on else {"budget": self.budget}),
             "likelihood": repr(self.likelihood),
             "space": self.space.to_dict(),
             "prior": [x.tolist() for x in self.prior.gaussian_moments()],

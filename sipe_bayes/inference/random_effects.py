@@ -38,6 +38,7 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.truncated_normal import interval_quantile
 
+_FARTHEST = 40.0  # times the prior's scale: a spread beyond
 _MIDDLE = 3.0  # precision around the cube's middle, by which mu is drawn and which the draws' weights take away again
 
 
@@ -140,12 +141,13 @@ class _Model:
 
     def log_density(self, log_tau: FloatArray) -> FloatArray:
         """Of log tau (W, N), up to a constant (W,)."""
-        tau = np.exp(log_tau)
+        far = (log_tau > np.log(_FARTHEST * self.scale)).any(1)  # next to no prior, and no numbers for it
+        tau = np.exp(np.where(far[:, None], 0.0, log_tau))
         level, precision, pull = self.shared(tau)
         mean = np.linalg.solve(precision, pull[..., None])[..., 0]
         level = level + 0.5 * (pull * mean).sum(1) - 0.5 * np.linalg.slogdet(precision)[1]
         density: FloatArray = level + (log_tau - 0.5 * (tau / self.scale) ** 2).sum(1)
-        return density
+        return np.where(far, -np.inf, density)
 
     def sampled(self, options: RandomEffectsOptions, random: np.random.Generator) -> FloatArray:
         """Draws of tau (M, N)."""

@@ -7,10 +7,13 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 import numpy as np
+import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.task import Task
+from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
 Progress = Callable[[str, int, int], None]
@@ -38,3 +41,11 @@ def digest(trajectories: Trajectories) -> str:
     for array in (trajectories.observations, trajectories.actions, trajectories.dt, trajectories.length, states):
         hashed.update(np.ascontiguousarray(array).tobytes())
     return hashed.hexdigest()
+
+
+def at_bounds(posterior: Posterior, prior: Posterior) -> list[str]:
+    """Names of parameters that are known and lie at a bound."""
+    middle = posterior.quantile(torch.tensor([0.5], dtype=torch.float64))[0].numpy()
+    narrow = posterior.stddev.numpy() <= (1 - THRESHOLDS.not_determined) * prior.stddev.numpy()
+    near = np.minimum(middle, 1 - middle) < THRESHOLDS.at_bound
+    return list(np.array(posterior.space.names)[narrow & near].tolist())

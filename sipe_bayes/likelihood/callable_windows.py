@@ -20,7 +20,7 @@ class CallableWindows(Windows):
     def __init__(self, settings: Segments, simulator: CallableSimulator, trajectories: Trajectories) -> None:
         self.simulator = simulator  # type: ignore[assignment]
         self.trajectories, self.settings = trajectories, settings
-        self.rollouts, self.budget, self._subset = 0, math.inf, None
+        self.rollouts, self.budget, self.short, self._subset = 0, math.inf, False, None
         size = len(simulator.environment.channels)
         if trajectories.observations.shape[2] != size or trajectories.actions.shape[1:] != (1, 0):
             raise ValueError(

@@ -111,7 +111,7 @@ class Windows:
 
     def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
-        self.rollouts, self.budget = 0, math.inf
+        self.rollouts, self.budget, self.short = 0, math.inf, False
         self._subset: Windows | None = None
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
         self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
@@ -301,6 +301,11 @@ class Windows:
         if self.rollouts + cost > self.budget:
             raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost}")
         self.rollouts += cost
+
+    def has_room(self, batch: int) -> bool:
+        """Whether the budget leaves room for ``batch`` thetas; ``short`` tells that it once did not."""
+        self.short |= (full := self.rollouts + batch * len(self.trajectories) > self.budget)
+        return not full
 
     def residuals(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Measured minus predicted (B, W, L, C), zero where nothing was measured, and which of the B are valid."""

@@ -22,12 +22,12 @@ from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing, improvement
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report.drawing import inside_page, png
 from sipe_bayes.report.templates import html_templates
-from sipe_bayes.report.verdicts import improvement, parameter_verdict, verdicts
+from sipe_bayes.report.verdicts import parameter_verdict, verdicts
 from sipe_bayes.report.words import error_text, number, significant, times, unit_text
 
 _GAPS = 4  # that a row of the logs lists

@@ -6,10 +6,8 @@ Verdicts are decided by the codes and severities of findings and by numbers; wor
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from sipe_bayes.core.finding_texts import TEXTS
 from sipe_bayes.core.findings import Code, Findings
@@ -67,19 +65,17 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
 
 
-def improvement(scores: Iterable[ChannelScore]) -> float:
-    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares."""
-    ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
-    ratios = [r for r in ratios if math.isfinite(r)]
-    return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
+def headline(parameters: Sequence[ParameterSummary], findings: Findings, brief: bool = False) -> Verdict:
+    """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks.
 
-
-def headline(parameters: Sequence[ParameterSummary], findings: Findings) -> Verdict:
-    """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks."""
+    brief: without the doubts, where they are told beside it.
+    """
     wanted = [p for p in parameters if not p.nuisance]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
     doubts = findings.doubts
+    if doubts and brief:
+        return Verdict("bad", "No value may be trusted within its interval yet; the first warning says why.")
     if doubts:
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
         first = "; ".join(doubts[:_DOUBTS])
@@ -116,6 +112,8 @@ def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) ->
         share = f"{100 * comparison.starts:.3g} %"
         error += f"; from starts that each model fits, since those measured make {share} of the error"
     error += ")"
+    if 1 / THRESHOLDS.same < comparison.ratio < THRESHOLDS.same:
+        return Verdict("fair", "On held-out logs the calibrated model and the model you had have the same error.")
     if comparison.verdict == "worse":
         return Verdict(
             "bad", f"On held-out logs the calibrated model is WORSE than the model you had: its error is {error}."

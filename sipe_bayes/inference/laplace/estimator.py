@@ -31,6 +31,9 @@ from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.simulation.simulator import Simulator
+
+_STEPS, _TRIALS = 200, 12  # of a default budget: steps, and what one takes beside its differences: two long searches
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,7 @@ class Laplace(Estimator[LaplaceState]):
     name: ClassVar[str] = "laplace"
     searches: ClassVar[bool] = True
     default_budget: ClassVar[int] = 5000
+    goes_on: ClassVar[bool] = True
     options_type = LaplaceOptions
     state_type = LaplaceState
     options: LaplaceOptions
@@ -74,6 +78,17 @@ class Laplace(Estimator[LaplaceState]):
         if initial is not None:
             inside = np.clip(np.atleast_2d(self.space.check_shape(initial)), 0, 1)
             self.options = replace(self.options, initial=inside)
+
+    def budget_for(self, trajectories: Trajectories) -> int:
+        """So many that each starting point may be followed to the end: it grows with logs and unknowns."""
+        return max(self.default_budget, _STEPS * (len(self.space) + self._num_start + _TRIALS) * len(trajectories))
+
+    @property
+    def _num_start(self) -> int:
+        """D, unknowns of a start."""
+        if not isinstance(self.simulator, Simulator) or self.likelihood.starts == "recorded":
+            return 0
+        return len(self.simulator.environment.start_sd(self.simulator.model))
 
     @property
     def problem(self) -> SearchProblem:
@@ -125,11 +140,13 @@ class Laplace(Estimator[LaplaceState]):
             return ended
         kept = distinct(state.search.optima)
         batches = tuning.hopeless_after * importance.batch_size(n, tuning)
-        least = (importance.probe_size(n) + batches) * len(windows.trajectories)
+        least = importance.probe_size(n) + batches
         if len(kept) != 1 or not isinstance(kept[0], WindowOptimum) or kept[0].guessed:
             return ended
-        if windows.rollouts + least > windows.budget or np.sqrt(np.diag(kept[0].covariance)).min() < 10 * SHORTEST:
+        if np.sqrt(np.diag(kept[0].covariance)).min() < 10 * SHORTEST:
             return ended  # an sd that the look around the optimum may have set
+        if not windows.has_room(least):
+            return ended
         target = self._target(windows, kept[0])
         if target.silent or importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
             return ended
@@ -159,8 +176,8 @@ class Laplace(Estimator[LaplaceState]):
         draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
         effective = importance.effective(importance.weights(draws, self.prior))
         hopeless = draws.batches >= tuning.hopeless_after and effective < draws.batches
-        room = windows.rollouts + importance.batch_size(n, tuning) * len(windows.trajectories) <= windows.budget
-        done = effective >= tuning.enough or draws.batches >= tuning.most_batches or hopeless or not room
+        done = effective >= tuning.enough or draws.batches >= tuning.most_batches or hopeless
+        done = done or not windows.has_room(importance.batch_size(n, tuning))
         return replace(state, draws=draws, done=done)
 
     def _target(self, windows: Windows, optimum: Optimum) -> WindowTarget:
@@ -225,6 +242,13 @@ class Laplace(Estimator[LaplaceState]):
         ends = np.cumsum(length + 1)
         sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
         return np.asarray(kept[0].states[(ends - length - 1)[:, None] + sample])
+
+    def fitted_starts(self, theta: FloatArray) -> FloatArray | None:
+        """Starts (W, D) of the windows of ``fit`` as the best optimum has them at theta (N,); of a chain None."""
+        kept = [] if self.state is None else distinct(self.state.search.optima)
+        if not kept or not isinstance(kept[0], WindowOptimum):
+            return None
+        return np.asarray(kept[0].starts - kept[0].slope @ (theta - kept[0].theta))
 
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""

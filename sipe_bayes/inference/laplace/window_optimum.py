@@ -115,7 +115,7 @@ def surroundings(
     tuning = problem.options.tuning.pattern
     if windows.num_start:
         return None
-    if windows.rollouts + pattern_size(len(theta), tuning) * len(windows.trajectories) >= windows.budget:
+    if not windows.has_room(pattern_size(len(theta), tuning)):
         return None
     starts = windows.no_starts()
 
@@ -148,7 +148,7 @@ def middle_of_ridge(problem: SearchProblem, windows: Windows, optimum: WindowOpt
     if not len(move) or np.abs(move).max() < tuning.off_centre:
         return None
     trials = np.clip(theta + np.array([[0.0], [1.0], [0.5], [0.25]]) * move, 0, 1)  # first the optimum itself
-    if windows.rollouts + len(trials) * len(windows.trajectories) > windows.budget:
+    if not windows.has_room(len(trials)):
         return None
     residual, valid = windows.residuals(trials, np.tile(starts, (len(trials), 1, 1)))
     values = WindowEnergy(windows, noise, problem.quadratic_prior).each(trials, starts, residual)

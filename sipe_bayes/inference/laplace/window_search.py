@@ -277,6 +277,7 @@ class WindowSearch:
         except BudgetExhausted:
             if not self._unrecorded(state):
                 raise
+            windows.short = True
             fit, cut_short = Descent(None, linearised.energy, here.damping), True
         point, drift = fit.point or point, drift + abs(fit.gained - fit.expected)
         converged = fit.converged and drift < tuning.most_drift
@@ -368,11 +369,10 @@ class WindowSearch:
     def _leaves_no_room(self) -> bool:
         """Whether the budget has no room for another step, and where it takes less than half of it, a look around."""
         windows, tuning = self.windows, self._tuning
-        each = len(windows.trajectories)
-        step = (windows.num_theta + tuning.windows.trials) * each
-        look = pattern_size(windows.num_theta, tuning.pattern) * each
-        left = windows.budget - windows.rollouts
-        return left < step or (2 * look < windows.budget and left < step + look)
+        step = windows.num_theta + tuning.windows.trials
+        look = pattern_size(windows.num_theta, tuning.pattern)
+        looks = 2 * look * len(windows.trajectories) < windows.budget
+        return not windows.has_room(step + look if looks else step)
 
     @property
     def _tuning(self) -> LaplaceTuning:

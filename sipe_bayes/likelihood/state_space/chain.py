@@ -60,7 +60,7 @@ class Chain:
 
     def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
-        self.rollouts, self.uncounted, self.budget = 0, 0.0, math.inf
+        self.rollouts, self.uncounted, self.budget, self.short = 0, 0.0, math.inf, False
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
         self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
         self.scales = noise_scales(len(self.channels), self.rotations)

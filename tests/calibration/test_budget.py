@@ -1,0 +1,48 @@
+"""The budget belongs to the problem: it grows with it, its end blocks, and a larger one goes on in the same folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sipe_bayes.calibration.gathered import most_probable
+from sipe_bayes.calibration.run import run
+from sipe_bayes.core.findings import Code, Findings, finding
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.posterior import GaussianMixture
+from tests.problems.swings import swing, write_case
+
+
+def test_a_larger_budget_goes_on_in_the_same_folder(tmp_path: Path) -> None:
+    config = write_case(tmp_path, swing())
+    whole = run(config, budget=4000, out=tmp_path / "whole")
+    short = run(config, budget=whole.rollouts - 3, out=tmp_path / "out")
+    blocking = {item.code for item in Findings(short.findings).blocking}
+    assert blocking & {Code.BUDGET_SPENT, Code.SEARCH_CUT_SHORT, Code.NOT_LOOKED_AROUND}, blocking
+    on = run(config, budget=4000, out=tmp_path / "out")
+    assert not {item.code for item in on.findings} & {Code.BUDGET_SPENT, Code.SEARCH_CUT_SHORT}
+    assert on.rollouts == whole.rollouts
+    assert [p.mode for p in on.parameters] == [p.mode for p in whole.parameters]
+
+
+def test_the_value_lies_within_every_interval() -> None:
+    """Of a ridge that two bounds cut off the mode is a corner of the cube."""
+    space = ParameterSpace([Parameter("a", low=0.0, high=1.0), Parameter("b", low=0.0, high=1.0)])
+    axis = np.array([1.0, 1.0]) / np.sqrt(2)
+    covariance = 25.0 * np.outer(axis, axis) + 1e-4 * np.eye(2)
+    posterior = GaussianMixture(np.zeros(1), np.array([[3.0, 3.0]]), covariance[None], space)
+    low, high = posterior.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy()
+    assert not ((posterior.mode.numpy() >= low) & (posterior.mode.numpy() <= high)).all()
+    theta = most_probable(posterior)
+    assert ((theta >= low) & (theta <= high)).all()
+    assert abs(theta[0] - theta[1]) < 0.03
+
+
+def test_findings_of_one_kind_about_many_logs_are_one_line() -> None:
+    many = [finding(Code.AGREEMENT_UNKNOWN, log=f"run{k}") for k in range(12)]
+    kinds = Findings([*many, finding(Code.BUDGET_SPENT, budget=5)]).kinds
+    assert len(kinds) == 2
+    assert kinds[0].startswith("the budget of 5 rollouts")
+    assert kinds[1].endswith("(and so 11 more)")
