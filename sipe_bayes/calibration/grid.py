@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 
 _REGULAR = 0.1  # of a period: a clock whose samples are as near to the grid as this is regular
+_JITTER = 0.45  # of a period: so far a time stamp may be off while it is certain which sample is meant
+_SMOOTHER = 0.8  # of what a cubic misses: so much better, and the stamps are right that the samples jitter
 _GAP_PERIODS = 5.0  # default max_gap, in a column's own median sample periods
 
 
@@ -66,24 +69,67 @@ class Grid:
         return replace(self, rows=rows if near else time / self.dt, regular=bool(near))
 
 
-def control_grid(time: FloatArray, rate: float | None) -> Grid:
+def control_grid(time: FloatArray, rate: float | None, measured: Sequence[FloatArray] = ()) -> Grid:
     """The control grid of a log.
 
     Args:
         time: (n,) s from zero.
         rate: Hz; default the log's own.
+        measured: (n,) each: signals that say whether the samples jitter or only their time stamps do.
     """
     periods = np.diff(time)
     dt = float(np.median(periods)) if rate is None else 1.0 / rate
     if rate is None:
-        rows = np.append(0.0, np.cumsum(np.maximum(1.0, np.round(periods / dt))))
+        rows = _counted(time, dt)
         mean = float(time[-1] / rows[-1])
         if np.abs(time - rows * mean).max() <= _REGULAR * mean:
             return Grid(mean, int(rows[-1]) + 1, rows, True)
+        slope, start = np.polyfit(rows, time, 1)
+        if np.abs(time - start - rows * slope).max() <= _JITTER * slope:
+            dt = float(slope)
+            if _as_smooth(rows * dt, time, measured):
+                return Grid(dt, int(rows[-1]) + 1, rows, True)
     rows = np.round(time / dt)
     if (np.diff(rows) > 0).all() and np.abs(time - rows * dt).max() <= _REGULAR * dt:
         return Grid(dt, int(rows[-1]) + 1, rows, True)
     return Grid(dt, int(time[-1] / dt + 1e-6) + 1, time / dt, False)
+
+
+def _counted(time: FloatArray, dt: float) -> FloatArray:
+    """Numbers (n,) of the samples with those that were dropped; dt: about the period, in s."""
+    rows = np.append(0.0, np.cumsum(np.maximum(1.0, np.round(np.diff(time) / dt))))
+    for _ in range(3):  # a first guess that is a little off loses count in a long log
+        slope, start = np.polyfit(rows, time, 1)
+        again = np.round((time - start) / slope)
+        if (np.diff(again) <= 0).any() or np.array_equal(again - again[0], rows):
+            break
+        rows = again - again[0]
+    return rows
+
+
+def _as_smooth(regular: FloatArray, stamped: FloatArray, measured: Sequence[FloatArray]) -> bool:
+    """Whether signals (n,) pass about as smoothly through regular times as through their stamps.
+
+    Each sample is held against the cubic through its four neighbours.
+    """
+    sizes = [[np.median(np.abs(_off_cubic(times, y))) for times in (regular, stamped)] for y in measured]
+    return bool(sizes) and all(not by_stamp < _SMOOTHER * plain for plain, by_stamp in sizes)
+
+
+def _off_cubic(time: FloatArray, values: FloatArray) -> FloatArray:
+    """How far finite samples (n,) are from the cubics through their four neighbours."""
+    known = np.isfinite(values)
+    t, x = time[known], values[known]
+    if len(t) < 5:
+        return np.full(1, np.nan)
+    places, middle = [0, 1, 3, 4], slice(2, -2)
+    near = np.stack([t[k : len(t) - 4 + k] for k in places])
+    foretold = np.zeros(len(t) - 4)
+    for k, place in enumerate(places):
+        others = np.delete(near, k, axis=0)
+        weight = np.prod((t[middle] - others) / (near[k] - others), axis=0)
+        foretold += weight * x[place : len(t) - 4 + place]
+    return np.asarray(x[middle] - foretold)
 
 
 def held(values: FloatArray, grid: Grid) -> FloatArray:

@@ -5,7 +5,9 @@ otherwise. What happens to the samples, in two cases:
 
 * *Passed through.* When every sample lies within a tenth of a period of a grid time of its own, grid sample k
   is that log sample, untouched: interpolation would smooth the noise whose size is to be estimated. At the
-  log's own rate dt is the mean period. Dropped rows and blank cells are NaN.
+  log's own rate dt is the mean period. Dropped rows and blank cells are NaN. The same holds up to .45 periods where
+  the signals run about as smoothly through regular times as through their stamps: then the stamps jitter, not the
+  samples.
 * *Resampled* otherwise. A measurement is interpolated linearly between its two neighbouring finite samples,
   but only at grid times that are the nearest one to some real sample, and where the two are within
   ``max_gap`` of each other. So no column has more grid samples than real ones: a slow column, or a grid
@@ -112,7 +114,8 @@ def _loaded(config: Config, log: LogEntry, opened: _Opened) -> tuple[Trajectory,
         table = episode(table, opened.episodes, log.episodes[0])
         sha256 = combined([sha256, str(log.episodes[0])])
     raw = _read_log(config, log, table)
-    grid = control_grid(raw.time, config.resample.rate)
+    leading = [y.values for y in raw.measurements if y.time is raw.time]
+    grid = control_grid(raw.time, config.resample.rate, leading)
     _check_length(config, log, grid, raw.time)
     observed = [sampled(y.time, y.values, _placed(grid, raw, y), config.resample.max_gap) for y in raw.measurements]
     for (_, column), before, after in zip(config.sources, raw.measurements, observed, strict=True):

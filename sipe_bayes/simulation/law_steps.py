@@ -64,7 +64,8 @@ class LawSteps:
         numbers = np.stack([model.numeric_data for model in models])
         friction = [model.dof_frictionloss for model in models]
         dry = np.stack(friction)
-        gears = {b.actuator: np.array([m.actuator_gear[b.actuator, 0] for m in models]) for b in self.pushing}
+        driven = {b.actuator for b in self.pushing if b.law.kind == "actuator"}
+        gears = {actuator: np.array([m.actuator_gear[actuator, 0] for m in models]) for actuator in driven}
         inputs, here, states, sensors = np.zeros((batch, 1, width + self.num_dofs)), start, [], []
         for t in range(horizon):
             command = controls[:, t]
