@@ -342,7 +342,8 @@ class _Residuals:
 def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
     """Moments of some columns [theta | x_w | x_{w-1} | r] of others; the first ``num_theta`` are theta's."""
     chosen, width = copy.copy(moments), moments.num_theta + 2 * moments.num_start + 1
-    products = moments.products.reshape(-1, moments.windows, width, width)[..., columns[:, None], columns]
+    products = moments.products.reshape(-1, moments.windows, width, width)
+    products = products.take(columns, axis=-1).take(columns, axis=-2)
     chosen.products, chosen.num_theta = products.reshape(len(products), -1), num_theta
     return chosen
 

@@ -10,6 +10,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
 _BLOCK, _LEAST_WINDOWS = 4, 2  # windows that stay together where not all are kept; of a log
+_SAME_RATE = 1e-3  # relative: logs of one machine whose clocks differ by less have gaps of one length
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
         dt: (W,), seconds per sample.
     """
     _, length, channels = observed.shape
-    by_channel = []
+    by_channel, dt = [], _rates(dt)
     for c in range(channels):
         index = np.flatnonzero(observed[:, :, c].ravel())
         window, number = index // length, sample.ravel()[index]
@@ -76,3 +77,12 @@ def spread_blocks(log: IntArray, share: float) -> IntArray:
             first = (len(block) - size) // 2
             kept.append(block[first : first + size])
     return np.concatenate(kept)
+
+
+def _rates(dt: FloatArray) -> FloatArray:
+    """Seconds per sample (W,), those alike as the shortest of them: each length of a gap costs products of its own."""
+    alike = dt.copy()
+    while (left := alike > 0).any():
+        shortest = alike[left].min()
+        alike[left & (alike <= shortest * (1 + _SAME_RATE))] = -shortest
+    return -alike
