@@ -57,7 +57,7 @@ def main() -> None:
     t, force, x = np.array(rows).T
     given.out.mkdir(parents=True, exist_ok=True)
     columns = {"t": np.round(1e6 * (t - t[0])).astype("i4"), "force": np.round(100 * force).astype("i2")}
-    np.savez_compressed(given.out / "log.npz", **columns, x=x.astype("i2"))
+    np.savez_compressed(given.out / "log.npz", **columns, x=x.astype("i4"))
     (given.out / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
 
 
