@@ -6,11 +6,12 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -28,7 +29,16 @@ class Saturation(Options):
     quanta: float = option(2.5, "from as far it was cut off, from nearer it turned round", "smallest steps", above=0)
 
 
-_SATURATION = Saturation()
+@dataclass(frozen=True)
+class Jumps(Options):
+    """When a position between two samples counts as one that nothing moves through."""
+
+    neighbours: int = option(4, "steps on each side that a step is compared with", least=1)
+    times: float = option(20.0, "of the middle one of these", above=1)
+    share: float = option(0.1, "of the log's range: quanta and noise jump as well", above=0)
+
+
+_SATURATION, _JUMPS = Saturation(), Jumps()
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
@@ -87,7 +97,7 @@ def report_of(
 
 
 def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
-    """Of clocks beside the grid's, of commands that end early, and of joints that are logged slowly."""
+    """Of clocks beside the grid's, commands that end early, positions that jump, and joints that are logged slowly."""
     noticed = []
     series = [*raw.measurements, *raw.commands]
     apart = sum(y.time is not raw.time for y in series)
@@ -97,6 +107,12 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
         silent = float(raw.time[-1] - y.time[-1])
         if len(y.time) > 1 and silent > _SILENT * float(np.median(np.diff(y.time))):
             noticed.append(finding(Code.LOG_COMMAND_ENDS, log=log.name, channel=command.target, silent=silent))
+    for (m, _), y in zip(config.sources, raw.measurements, strict=True):
+        known = np.flatnonzero(np.isfinite(y.values))
+        places = jumps(y.values[known]) if _of_joint(m) and m.target.endswith(".position") else known[:0]
+        if len(places):
+            when = float(y.time[known[places[0] + 1]] - raw.time[0])
+            noticed.append(finding(Code.LOG_JUMPS, log=log.name, channel=m.name, count=len(places), when=when))
     rates = {m.name: _rate(y) for (m, _), y in zip(config.sources, raw.measurements, strict=True) if _of_joint(m)}
     slow = {name: rate for name, rate in rates.items() if rate < THRESHOLDS.slow_log}
     if slow:
@@ -124,6 +140,21 @@ def _jitter(time: FloatArray) -> float:
     periods = np.diff(time)
     median = np.median(periods)
     return float(np.abs(periods - median * np.maximum(1.0, np.round(periods / median))).max())
+
+
+def jumps(values: FloatArray) -> IntArray:
+    """Numbers k of the samples of a joint's position (n,) from which it jumps to the next, k + 1.
+
+    A step is a jump where it is far longer than those around it, of which most are those of a motion: a counter or an
+    angle that came round, a wild sample (two jumps), samples that were lost.
+    """
+    steps = np.abs(np.diff(values))
+    if len(steps) <= 2 * _JUMPS.neighbours:
+        return np.zeros(0, np.int64)
+    padded = np.pad(steps, _JUMPS.neighbours, mode="reflect")
+    around = np.delete(sliding_window_view(padded, 2 * _JUMPS.neighbours + 1), _JUMPS.neighbours, axis=1)
+    least = np.maximum(_JUMPS.times * np.median(around, axis=1), _JUMPS.share * np.ptp(values))
+    return np.flatnonzero(steps > least)
 
 
 def count_clipped(values: FloatArray) -> int:

@@ -155,6 +155,10 @@ ADVICE: dict[Code, str] = {
     Code.LOG_BLANK_COMMANDS: "See that a blank means 'as before' in your log and not 'off'.",
     Code.LOG_CLOCKS: "See that all clocks count from the same instant: an offset between them looks like a delay.",
     Code.LOG_COMMAND_ENDS: "A held command drives the simulation when the machine's controller may have stopped.",
+    Code.LOG_JUMPS: (
+        "An angle that comes round takes `wraps = true`. Leave wild samples out (an empty cell is a missing sample), "
+        "or cut the log with `span`. A few of them are enough to put every estimate far off."
+    ),
     Code.LOG_SLOW: "Record anew at 100 Hz or more; no method finds in a log what is not there.",
     Code.LOG_CLIPPED: "A saturated sensor lies. Cut those parts out by `span`, or send less.",
     Code.PRIOR_OF_MIXTURE: "Give the logs of both runs to one fit instead, if the modes lie far apart.",

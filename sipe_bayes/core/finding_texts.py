@@ -263,6 +263,10 @@ class Code(Enum):
         "{channel}: no command in the last {silent:.3g} s, the one before is held; cut the log there with `span` if "
         "the controller had stopped"
     )
+    LOG_JUMPS = caution(
+        "{channel} jumps {count} times between two samples, first at {when:.4g} s, where nothing moves so fast: a "
+        "counter or an angle that came round, wild samples or lost ones; they rule a fit: mask them or cut the log"
+    )
     LOG_SLOW = caution(
         "{channels} were recorded at {rate}: too slowly to see what friction and delays do, whose estimates will be "
         "biased; log joints at 100 Hz or more"
