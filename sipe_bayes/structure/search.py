@@ -308,10 +308,12 @@ class StructureSearch:
                 own[1 + here.labels.index(rival.kept)] = rival.theta
                 return self._fitted(state, rival.labels, np.concatenate(own))
         known = [one for rival in close if (one := state.of(rival.labels)) is not None]
-        best = max(known, key=self.total, default=here)
-        if self.better(best, here) and not self._speaks_against(state := self._judged(state, best), best):
-            return replace(state, present=best.labels)
-        return replace(state, phase=Phase.RESIDUAL)
+        best = max((one for one in known if not state.is_refused(one.labels)), key=self.total, default=here)
+        if not self.better(best, here):
+            return replace(state, phase=Phase.RESIDUAL)
+        if self._speaks_against(state := self._judged(state, best), best):
+            return replace(state, refused=(*state.refused, best.labels))
+        return replace(state, present=best.labels)
 
     def _residual(self, state: DiscoverState) -> DiscoverState:
         ranked = self._ranked(state.here, last_resort=True)

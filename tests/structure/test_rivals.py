@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
 
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.rivals import rivals
+from sipe_bayes.structure.search import StructureSearch
+from sipe_bayes.structure.state import DiscoverState, Judgement, Phase
 
 EMPTY = np.zeros(0)
 
@@ -45,3 +52,21 @@ def test_a_piece_whose_round_is_not_known_has_no_rivals() -> None:
     fitted = [structure("", 0), structure("ad", 200), structure("ae", 199), structure("d", 100), structure("e", 20)]
     assert [r.labels for r in rivals(fitted, ("d",), lambda one: one.evidence, 0.1, 2)] == []
     assert [r.labels for r in rivals(fitted, ("d",), lambda one: one.evidence, 0.9, 2)] == [("e",)]
+
+
+@pytest.mark.parametrize(("log_score", "ends_with"), [(50.0, ("b", "d")), (-50.0, ("a", "d"))])
+def test_a_rival_takes_the_place_unless_held_out_logs_speak_against_it(
+    log_score: float, ends_with: tuple[str, ...]
+) -> None:
+    """One that they speak against is refused, so that it does not count among the structures either."""
+    better = replace(structure("bd", 210), held_out=1.0)
+    fitted = (structure("", 0), structure("a", 100), structure("b", 95), structure("ad", 200), better)
+    judged = (Judgement(("a", "d"), 0.0, 1), Judgement(("b", "d"), log_score, 1))
+    fitting: Any = SimpleNamespace(holdout="logs", corrected=lambda columns: fitting)
+    search = StructureSearch(fitting, ())
+    state = DiscoverState(Phase.SWAP, fitted, ("a", "d"), judged=judged)
+    for _ in range(2):
+        state = search._swap(state)
+    assert state.present == ends_with
+    assert state.is_refused(("b", "d")) == (log_score < 0)
+    assert state.phase is Phase.RESIDUAL
