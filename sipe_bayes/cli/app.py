@@ -202,12 +202,12 @@ def print_calibration(calibration: Calibration) -> None:
     console, findings = _console(), Findings(calibration.findings)
     console.print(Text(f"{calibration.name}: posterior by {calibration.estimator}"))
     brief = headline(calibration.parameters, findings, brief=True)
-    said = [brief if v == headline(calibration.parameters, findings) else v for v in verdicts(calibration)]
-    for verdict in said[:_SENTENCES]:
+    sentences = [brief if v == headline(calibration.parameters, findings) else v for v in verdicts(calibration)]
+    for verdict in sentences[:_SENTENCES]:
         console.print(Text(_cut(verdict.text), style=_TONES[verdict.tone]))
     below = [*_pooled(calibration)[:_CHANNELS], *_worst(findings)]
     below.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s" + _report(calibration))
-    _print_parameters(console, calibration, findings, _LINES - 1 - min(len(said), _SENTENCES) - len(below))
+    _print_parameters(console, calibration, findings, _LINES - 1 - min(len(sentences), _SENTENCES) - len(below))
     for line in below:
         console.print(line, highlight=False, markup=False)
 

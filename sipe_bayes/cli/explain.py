@@ -26,5 +26,5 @@ def explain(
     if not codes:
         print("\n".join(f"{name} ({one.value.severity})" for name, one in known.items()))
     for name in codes or ():
-        found = known[name.lower()]
-        print(f"{found} ({found.value.severity})\n  {plain(found)}\n  {ADVICE[found]}")
+        code = known[name.lower()]
+        print(f"{code} ({code.value.severity})\n  {plain(code)}\n  {ADVICE[code]}")

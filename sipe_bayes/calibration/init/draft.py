@@ -143,7 +143,7 @@ class Draft:
         return tuple(unknown for unknown in self.unknowns if not unknown.left_out)
 
     @property
-    def told(self) -> list[str]:
+    def open_doubts(self) -> list[str]:
         """Everything that could not be decided."""
         own = [self.clock.doubt] if self.clock.doubt else []
         return own + [f"{r.match.column!r}: {doubt}" for r in self.readings for doubt in r.doubts] + list(self.doubts)

@@ -88,10 +88,10 @@ def _files(logs: Sequence[Path]) -> list[Path]:
                 raise LogError(f"{log}: a folder without logs; name the files")
             out += within
             continue
-        found = matching(log, Path())
-        if not found:
+        files = matching(log, Path())
+        if not files:
             raise LogError(f"{log}: no file matches; correct the pattern")
-        out += found
+        out += files
     return list(dict.fromkeys(out))
 
 
@@ -154,15 +154,15 @@ def _split(
             kept.append(file)
         else:
             lost.append(file.name)
-    said = [f"left out, for they lack columns: {', '.join(lost[:6])}"] if lost else []
+    notes = [f"left out, for they lack columns: {', '.join(lost[:6])}"] if lost else []
     if opened.episodes is not None:
-        return (*_episodes(kept, opened.episodes, folder), said)
+        return (*_episodes(kept, opened.episodes, folder), notes)
     if len(kept) == 1:
         cut = _HELD * opened.seconds
         name, only = kept[0].stem, _relative(kept[0], folder)
         spans = ((0.0, float(f"{cut:.4g}")), (float(f"{cut:.4g}"), float(f"{opened.seconds:.6g}")))
         train = LogLine(only, "train", f"{name}-begin", spans[0])
-        return (train, LogLine(only, "holdout", f"{name}-end", spans[1])), [Source(kept[0])], said
+        return (train, LogLine(only, "holdout", f"{name}-end", spans[1])), [Source(kept[0])], notes
     held = max(1, len(kept) // 5)
     stems = [file.stem for file in kept]
     names = stems if len(set(stems)) == len(stems) else [f"{s}-{k}" for k, s in enumerate(stems)]
@@ -171,7 +171,7 @@ def _split(
         for k, (f, n) in enumerate(zip(kept, names, strict=True))
     )
     train_files = kept[: len(kept) - held]
-    return lines, [Source(train_files[i]) for i in _spread(len(train_files))], said
+    return lines, [Source(train_files[i]) for i in _spread(len(train_files))], notes
 
 
 def _episodes(files: Sequence[Path], column: str, folder: Path) -> tuple[tuple[LogLine, ...], list[Source]]:

@@ -134,9 +134,9 @@ def _timed(word: str, values: FloatArray, why: str, doubt: bool) -> Clock:
     if named and named != sized and period > 0:
         text = f"its name says {named}, which makes {rate:.3g} Hz; its size speaks for {sized}"
         return Clock(word, named, period, text, text)
-    told = "as its name says" if named else evidence
+    reason = "as its name says" if named else evidence
     text = f"{why} is taken for the clock" if doubt else ""
-    return Clock(word, named or sized, period, why or f"{told}: {evidence}" if named else why or told, text)
+    return Clock(word, named or sized, period, why or f"{reason}: {evidence}" if named else why or reason, text)
 
 
 def _increases(values: FloatArray) -> bool:

@@ -72,11 +72,14 @@ def summary(draft: Draft, path: str) -> list[str]:
     names = [unknown.name for unknown in draft.proposed]
     lines.append(_short(f"{len(names)} unknowns: {', '.join(names)}"))
     lines += [_short(u.note) for u in draft.proposed if u.name == "delay"]
-    told = [f"OPEN: {doubt}" for doubt in draft.told]
+    open_lines = [f"OPEN: {doubt}" for doubt in draft.open_doubts]
     room = _LINES - len(lines) - 2
-    if len(told) > room:
-        told = [*told[: room - 1], f"and {len(told) - room + 1} more that are open, see OPEN in {path}"]
-    return [*lines, *map(_short, told), f"{path} is written; look it through, then: sipe calibrate {path}"]
+    if len(open_lines) > room:
+        open_lines = [
+            *open_lines[: room - 1],
+            f"and {len(open_lines) - room + 1} more that are open, see OPEN in {path}",
+        ]
+    return [*lines, *map(_short, open_lines), f"{path} is written; look it through, then: sipe calibrate {path}"]
 
 
 def _said(reading: Reading) -> str:

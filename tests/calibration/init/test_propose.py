@@ -35,7 +35,7 @@ def wrong(draft: Draft, truth: Truth) -> list[str]:
         signs.append(reading.sign * sign)
     if len(set(signs)) > 1:
         out.append(f"signs {signs} of {list(truth.columns)}")
-    elif signs[0] < 0 and not any("turned round together" in doubt for doubt in draft.told):
+    elif signs[0] < 0 and not any("turned round together" in doubt for doubt in draft.open_doubts):
         out.append("a mirror image, and nothing is told")
     if (draft.clock.column, draft.clock.unit) != truth.clock:
         out.append(f"clock {draft.clock}")
