@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import Formatter, LogLocator, MaxNLocator, NullFormatter
+from PIL import Image
 
 from sipe_bayes.report.colours import STYLE
 
@@ -65,8 +66,11 @@ def png(figure: Figure) -> bytes:
 
 
 def inside_page(image: bytes) -> str:
-    """A PNG file as the source of an image that the page itself holds."""
-    return "data:image/png;base64," + base64.b64encode(image).decode("ascii")
+    """A PNG file as the source of an image that the page itself holds, in 256 colours: a third of the size."""
+    buffer = io.BytesIO()
+    colours = Image.open(io.BytesIO(image)).convert("RGB")
+    colours.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(buffer, "PNG")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 class _Plain(Formatter):

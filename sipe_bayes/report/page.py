@@ -1,8 +1,8 @@
 """One self-contained page about a calibration, which first of all answers: which of these values can I trust?
 
 ``write_report`` draws the figures, puts the result into words (``report.verdicts``, ``report.words``) and writes
-``report.html`` with every image inside: no script, no reference to anything outside the file. The template only lays
-out.
+``report.html`` with every image inside, and the signals as charts (``report.interactive``): no reference to anything
+outside the file. The template only lays out. Where no script runs, and in print, figures stand in the charts' place.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report.drawing import inside_page, png
+from sipe_bayes.report.interactive.charts import charts
+from sipe_bayes.report.interactive.clips import Clip
 from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.verdicts import parameter_verdict, verdicts
 from sipe_bayes.report.words import error_text, number, significant, times, unit_text
@@ -150,9 +152,14 @@ class Picture:
 
 
 def _logs(calibration: Calibration) -> list[tuple[str, str]]:
-    """(log, use) of the logs with signals: held out first, else in the order given."""
+    """(log, use) of the logs whose signals are drawn: held out first, else in the order given.
+
+    Of many logs some stand for all; the tables have each.
+    """
     seen = {s.log: s.use for s in calibration.signals}
-    return sorted(seen.items(), key=lambda item: item[1] != "holdout")
+    by_use = [[item for item in seen.items() if item[1] == use] for use in ("holdout", "train")]
+    each = _DRAWN // 2 if len(seen) > _DRAWN else len(seen)
+    return [item for items in by_use for item in items[:each]]
 
 
 def pictures(calibration: Calibration) -> list[Picture]:
@@ -160,9 +167,6 @@ def pictures(calibration: Calibration) -> list[Picture]:
     drawn = [("marginals", "marginals", "Marginal of each parameter", plots.marginals(calibration))]
     drawn.append(("pairs", "pairs", "Pairs of parameters", plots.pairs(calibration)))
     logs = _logs(calibration)
-    if len(logs) > _DRAWN:  # of many logs some stand for all; the tables have each
-        by_use = [[item for item in logs if item[1] == use] for use in ("holdout", "train")]
-        logs = [item for items in by_use for item in items[: _DRAWN // 2]]
     shown = {log for log, _ in logs}
     for i, (log, use) in enumerate(logs):
         slug = re.sub(r"[^A-Za-z0-9]+", "_", log).strip("_")[:40]
@@ -181,7 +185,7 @@ def pictures(calibration: Calibration) -> list[Picture]:
 # The page
 
 
-def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, object]:
+def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | None) -> dict[str, object]:
     space = calibration.posterior.space
     rows = [(p, _parameter_row(p, space[space.index(p.name)], calibration)) for p in calibration.parameters]
     sentences = verdicts(calibration)
@@ -209,6 +213,8 @@ def _context(calibration: Calibration, images: Sequence[Picture]) -> dict[str, o
         "ridges": [ridge.text for ridge in calibration.ridges],
         "left_out": calibration.left_out,
         "sections": sections,
+        "charts": charts(calibration.signals, [log for log, _ in _logs(calibration)], "calibrated", "model as given"),
+        "clip": clip,
         "noise": [_noise_row(channel, noise) for channel, noise in calibration.noise.items()],
         "mixing": _mixing_rows(calibration.mixing, space.names) if calibration.mixing else None,
         "logs": [_log_row(log, uses.get(log.name, "")) for log in calibration.logs],
@@ -226,10 +232,10 @@ def noticed(findings: Sequence[Finding]) -> list[dict[str, object]]:
     return [{"texts": texts, "advice": ADVICE[code].split("`")} for code, texts in groups.items()]
 
 
-def render(calibration: Calibration, images: Sequence[Picture]) -> str:
+def render(calibration: Calibration, images: Sequence[Picture], clip: Clip | None = None) -> str:
     """The page as HTML."""
     template = html_templates("sipe_bayes.report").get_template("report.html.j2")
-    return template.render(**_context(calibration, images))
+    return template.render(**_context(calibration, images, clip))
 
 
 def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) -> None:
@@ -240,14 +246,19 @@ def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) ->
         write_bytes(figures / image.file, image.content)
 
 
-def write_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
+def write_report(calibration: Calibration, folder: str | os.PathLike[str], clip: Clip | None = None) -> Path:
     """Write ``figures/*.png`` and ``report.html``; everything is drawn and rendered before the first file is written.
+
+    Args:
+        calibration: the result.
+        folder: where to.
+        clip: the machine as measured and as simulated, or why there is none.
 
     Returns:
         The report's path.
     """
     images = pictures(calibration)
-    return write_page(render(calibration, images), images, folder)
+    return write_page(render(calibration, images, clip), images, folder)
 
 
 def write_page(page: str, images: Sequence[Picture], folder: str | os.PathLike[str]) -> Path:

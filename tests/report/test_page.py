@@ -21,6 +21,7 @@ from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Dirac, prior
 from sipe_bayes.report import page as report
 from sipe_bayes.report import verdicts as judged
+from sipe_bayes.report.drawing import new_figure, png
 from sipe_bayes.report.words import significant
 from tests.problems.calibrations import (
     EVIL,
@@ -107,8 +108,8 @@ def test_page_names_every_parameter_and_section(page: str, calibration: Calibrat
 
 def test_page_stands_alone(page: str, images: list[report.Picture]) -> None:
     found = Page(page)
-    assert not {"script", "link", "iframe", "object"} & set(found.tags)
-    assert not re.search(r"https?://|url\(|@import", page)
+    assert not {"link", "iframe", "object"} & set(found.tags)
+    assert not re.search(r"https?://|url\(|@import", page.replace("/*! https://github.com/leeoniya/uPlot", ""))
     sources = [value for _, key, value in found.attributes if key == "src"]
     assert len(sources) == len(images) == 5
     assert all((value or "").startswith("data:image/png;base64,") for value in sources)
@@ -125,9 +126,9 @@ def test_page_escapes_every_word_from_outside() -> None:
     found.holdout[0] = dataclasses.replace(found.holdout[0], log=EVIL, channel=EVIL)
     findings = (*found.findings, noticed(Code.NOT_EXPORTED, text=EVIL))
     found = dataclasses.replace(found, name=EVIL, findings=findings, run={"config": {"name": EVIL}})
-    image = report.Picture("marginals", "marginals.png", b"", f'"{EVIL}')
+    image = report.Picture("marginals", "marginals.png", png(new_figure(1)), f'"{EVIL}')
     page = Page(report.render(found, [image]))
-    assert "script" not in page.tags
+    assert page.tags.count("script") == 2  # the numbers, and what draws them
     assert page.text.count(EVIL) >= 9
     assert ("img", "alt", f'"{EVIL}') in page.attributes
 

@@ -23,6 +23,7 @@ from sipe_bayes.report.discovery.words import (
     warnings,
 )
 from sipe_bayes.report.drawing import png
+from sipe_bayes.report.interactive.charts import charts
 from sipe_bayes.report.page import Picture, run_details, write_page
 from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.words import error_text, number, times, unit_text
@@ -103,6 +104,7 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
         ],
         "residual_lines": residual_lines(discovery),
         "sections": sections,
+        "charts": charts(discovery.signals, dict.fromkeys(s.log for s in discovery.signals), plots.AFTER, plots.BEFORE),
         "details": run_details(discovery.run),
         "out": discovery.out,
         "next": next_steps(discovery),

@@ -18,7 +18,7 @@ from sipe_bayes.report.legends import legend_above, line_handle
 from sipe_bayes.report.signal_panels import two_errors_panel
 from sipe_bayes.report.words import error_text, shortened, unit_text, with_unit
 
-_BEFORE, _AFTER = "calibrated as it was", "with what was found"
+BEFORE, AFTER = "calibrated as it was", "with what was found"
 
 # Signals
 
@@ -32,8 +32,8 @@ def before_and_after(discovery: Discovery, log: str) -> list[Figure]:
     rows = [s for s in discovery.signals if s.log == log]
     titles = {row.channel: _errors_text(row) for row in discovery.errors if row.log == log}
     mark = line_handle(PRIOR, "a window starts", "none", marker="|", ms=8, mew=1.2)
-    lines = [line_handle(MEASURED, "measured", lw=1), line_handle(DEFAULT, _BEFORE, "--", lw=1)]
-    handles = [*lines, line_handle(POSTERIOR, _AFTER, lw=1.5), mark]
+    lines = [line_handle(MEASURED, "measured", lw=1), line_handle(DEFAULT, BEFORE, "--", lw=1)]
+    handles = [*lines, line_handle(POSTERIOR, AFTER, lw=1.5), mark]
     parts = equal_parts(rows, SIZES.channels)
     return [log_figure(part, two_errors_panel, titles, handles, heights=(1.6, 1.0)) for part in parts]
 
@@ -70,7 +70,7 @@ def _residual_figure(rows: Sequence[tuple[Residual, Residual]]) -> Figure:
         ticks(left.yaxis, 4)
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("lag [s]")
-    legend_above(figure, [line_handle(DEFAULT, _BEFORE), line_handle(POSTERIOR, _AFTER)], 2)
+    legend_above(figure, [line_handle(DEFAULT, BEFORE), line_handle(POSTERIOR, AFTER)], 2)
     figure.align_ylabels()
     return figure
 
@@ -108,6 +108,6 @@ def _value_figure(rows: Sequence[tuple[ParameterSummary, ParameterSummary]]) -> 
         ax.set_title(with_unit(shortened(pair[0].name, 30), pair[0].unit), loc="left")
         ticks(ax.xaxis, 4)
     legend_above(
-        figure, [line_handle(DEFAULT, _BEFORE, lw=2.5), line_handle(POSTERIOR, "averaged over structures", lw=2.5)], 2
+        figure, [line_handle(DEFAULT, BEFORE, lw=2.5), line_handle(POSTERIOR, "averaged over structures", lw=2.5)], 2
     )
     return figure
