@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+
+os.environ["MUJOCO_GL"] = "disabled"  # nothing is rendered but where a test asks for it
 
 
 @pytest.fixture

@@ -19,12 +19,17 @@ from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.randomization_code import write_randomization
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.report.interactive.clips import Clip, make_clip
+from sipe_bayes.report.interactive.motion import motion
 from sipe_bayes.report.page import write_report
+from sipe_bayes.report.words import with_unit
+from sipe_bayes.simulation.rendering import with_sky
 
 CHECKPOINT = "checkpoint.safetensors"
 RANDOMIZATION = "randomization"
 _RANDOMIZATION_DRAWS = 100  # in the generated code
 _COVARIANCE_DRAWS = 4000  # behind the written covariance
+_CLIP_WINDOW = 2.0  # s after which a clip's simulations start anew at the least: in less little is to be seen
 _PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
 
 
@@ -109,10 +114,26 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
     write_randomization(problem.environment, draws, folder / RANDOMIZATION)
     randomization = domain_randomization(calibration, problem)
     write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
-    write_report(calibration, folder)
+    write_report(calibration, folder, _clip(calibration, problem))
     write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
     write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
     return calibration
+
+
+def _clip(calibration: Calibration, problem: Problem) -> Clip:
+    """The first held-out log, or the first, beside the model as given and as calibrated, or why there is none."""
+    log = next(iter(problem.holdout or problem.train))
+    environment = problem.environment
+    theta = {"model as given": environment.space.default_theta, "calibrated": calibration.posterior.mode.numpy()}
+    label = with_unit(environment.channels[0], environment.channel_units[0])
+    settings = problem.segments
+    if settings.window is not None:
+        settings = replace(settings, window=max(settings.window, _CLIP_WINDOW), windows=())
+    try:
+        shown = motion(problem.simulator, settings, log, theta, 0, label)
+    except ValueError as error:
+        return Clip(f"No moving picture: {error}")
+    return make_clip(with_sky(environment.spec()), shown, log.name)
 
 
 def save_posterior(posterior: Posterior, folder: Path) -> None:

@@ -44,6 +44,7 @@ def video(
         from sipe_bayes.calibration.run import run_name
         from sipe_bayes.posterior import load_posterior
         from sipe_bayes.report import video as drawing
+        from sipe_bayes.report.interactive.motion import motion
         from sipe_bayes.simulation.rendering import Stage, with_sky
 
         whole("--width", width, 16)
@@ -71,7 +72,7 @@ def video(
         theta = {"model as given": problem.environment.space.default_theta, "calibrated": known.mode.numpy()}
         at = 0 if channel is None else channels.index(channel)
         label = f"{channels[at]} ({problem.environment.channel_units[at]})"
-        shown = drawing.motion(problem.simulator, settings, chosen, theta, at, label)
+        shown = motion(problem.simulator, settings, chosen, theta, at, label)
         stage = Stage(with_sky(problem.environment.spec()), width, width, camera)
         try:
             drawing.save(drawing.pictures(stage, shown, fps, speed), out, fps)

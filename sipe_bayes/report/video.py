@@ -1,13 +1,13 @@
 """A moving picture of a log beside its simulations: the machine as measured, the model as given, the calibrated model.
 
-What MuJoCo needs to render it: `simulation.rendering`.
+What moves in it: `interactive.motion`. What MuJoCo needs to render it: `simulation.rendering`.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.evaluate import measured_starts
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts import estimate_states
-from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR
 from sipe_bayes.simulation.rendering import Pose, Stage
-from sipe_bayes.simulation.simulator import Simulator
 
 SUFFIXES = (".gif", ".webp", ".mp4")
 _GHOST = 0.45  # opacity of the machine as measured
@@ -47,42 +41,6 @@ class Motion:
     measured: FloatArray
     signal: FloatArray
     simulated: dict[str, tuple[FloatArray, FloatArray]]
-
-
-def motion(
-    simulator: Simulator, settings: Segments, log: Trajectory, theta: dict[str, FloatArray], channel: int, label: str
-) -> Motion:
-    """Simulate a log from measured starts, a new one with every window.
-
-    Args:
-        simulator: of the model.
-        settings: which windows.
-        log: the log.
-        theta: (N,) by label.
-        channel: the one whose signal is drawn.
-        label: what stands beside it.
-    """
-    windows = Windows(replace(settings, fit=None), simulator, Trajectories.stack(log))
-    starts = measured_starts(windows, np.stack(list(theta.values())))
-    simulated = {}
-    for name, one, start in zip(theta, theta.values(), starts, strict=True):
-        result = simulator.rollout(one[None], windows.actions, windows.states(start), windows.dt, windows.names)
-        own = windows.owned
-        simulated[name] = (_stitched(result.states, own), _stitched(result.observations, own)[:, channel])
-    return Motion(
-        log.dt * np.arange(len(log) + 1, dtype=np.float64),
-        label,
-        estimate_states(simulator, log),
-        log.observations[:, channel],
-        simulated,
-    )
-
-
-def _stitched(values: FloatArray | None, owned: NDArray[np.bool_]) -> FloatArray:
-    """Samples (T+1, K) of windows (W, L, K), each from the window that owns it."""
-    if values is None:
-        raise ValueError("video: the simulation recorded no states")
-    return values[owned]
 
 
 def pictures(stage: Stage, shown: Motion, frames_per_second: float, speed: float) -> Iterator[Image.Image]:

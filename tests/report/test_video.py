@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 from PIL import Image
+
+from sipe_bayes.report.interactive import clips
+from sipe_bayes.report.page import render
+from sipe_bayes.report.video import Motion
+from tests.problems.calibrations import Page, make_calibration
 
 ROOT = Path(__file__).parents[2]
 TRY = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8)"
@@ -118,6 +126,41 @@ def test_the_log_and_both_models_are_seen(tmp_path: Path) -> None:
     assert sum(r > b + 60 for r, _, b in pixels) > 100  # orange, the model as given
     assert sum(b > r + 60 for r, _, b in pixels) > 100  # blue, the calibrated one
     assert sum(max(p) < 120 for p in pixels) > 100  # the log's ghost
+
+
+def shown(labels: tuple[str, ...] = ("model as given", "calibrated")) -> Motion:
+    """A swing of 20 s; both simulations lag behind."""
+    time = np.arange(0, 20, 0.02)
+    states = {lag: np.stack([time, np.sin(time - lag), np.cos(time - lag)], 1) for lag in (0.0, 0.5, 0.2)}
+    simulated = {label: (states[lag], states[lag][:, 1]) for label, lag in zip(labels, (0.5, 0.2), strict=True)}
+    return Motion(time, "angle [rad]", states[0.0], states[0.0][:, 1], simulated)
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_clip_for_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr(clips, "_SECONDS", 1.0)
+    clip = clips.make_clip(mujoco.MjModel.from_xml_string(XML), shown(), "<log>")
+    assert "first 1 s of <log>" in clip.text
+    with Image.open(io.BytesIO(clip.content)) as film:
+        assert (film.format, film.n_frames) == ("WEBP", 12)
+        film.seek(11)
+        pixels = np.asarray(film.convert("RGB"), int)[:260]
+    red, _, blue = np.moveaxis(pixels, -1, 0)
+    assert (red[:, :260] > blue[:, :260] + 60).sum() > 100  # orange left, blue right
+    assert (blue[:, 260:] > red[:, 260:] + 60).sum() > 100
+    assert len(clip.content) < 500_000
+
+
+@pytest.mark.parametrize(("backend", "words"), [("off", "MUJOCO_GL=off"), ("nonsense", "OpenGL cannot be used here")])
+def test_without_opengl_the_report_says_so(monkeypatch: pytest.MonkeyPatch, backend: str, words: str) -> None:
+    monkeypatch.setenv("MUJOCO_GL", backend)
+    clip = clips.make_clip(mujoco.MjModel.from_xml_string(XML), shown(), "log")
+    assert not clip.content
+    assert words in clip.text
+    page = render(make_calibration(), [], clip)
+    assert words in Page(page).text
+    assert 'class="clip"' not in page
 
 
 @pytest.mark.usefixtures("opengl")
