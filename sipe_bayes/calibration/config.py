@@ -88,6 +88,12 @@ class Config(Table):
         return tuple(name for m in self.measurements for _, name in m.channels)
 
     @property
+    def drives(self) -> tuple[Command, ...]:
+        """What the columns of a trajectory's actions are: the commands, and supplies of sampled controllers."""
+        supplies = {c.fed.actuator: c.fed for c in self.commands if c.fed is not None and c.rate is not None}
+        return (*self.commands, *supplies.values())
+
+    @property
     def sources(self) -> tuple[tuple[Measurement, str], ...]:
         """Every measured column of a log, with its measurement."""
         return tuple((m, column) for m in self.measurements for column in m.sources)

@@ -182,6 +182,7 @@ Pair = tuple[Number, Number]
 Location = Annotated[Path, BeforeValidator(_resolved)]
 UnitWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word).word)]
 TimeWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word, "time").word)]
+VoltageWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word, "voltage").word)]
 Sign = Annotated[int, BeforeValidator(_checked_sign)]
 EstimatorName = Annotated[str, Strict(), AfterValidator(_estimator)]
 TargetWord = Annotated[str, Strict(), _read_by(_target)]
@@ -208,6 +209,11 @@ class Table(BaseModel):
             if key not in legal:
                 raise problem(f"unknown key; {nearest(str(key), legal)}", str(key))
         return data
+
+
+def overlap(a: Pair | None, b: Pair | None) -> bool:
+    """Whether two spans in seconds share samples; None is the whole log."""
+    return a is None or b is None or (a[0] < b[1] and b[0] < a[1])
 
 
 def check_ordered(pair: tuple[float, float], key: str, expected: str) -> None:

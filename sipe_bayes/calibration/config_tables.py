@@ -20,8 +20,10 @@ from sipe_bayes.calibration.config_fields import (
     Text,
     TimeWord,
     UnitWord,
+    VoltageWord,
     Window,
     check_ordered,
+    overlap,
     parse_measurement_target,
     problem,
 )
@@ -58,8 +60,19 @@ class Resample(Table):
     """seconds; wider holes are masked; default five sample periods"""
 
 
+class Supply(Table):
+    """The voltage that a motor's driver is fed with."""
+
+    column: Text
+    """column with the voltage that the driver is fed with; a duty times it is what the motor gets"""
+    unit: VoltageWord = "V"
+    """its unit"""
+    nominal: Positive | None = None
+    """V at which the controller of the model is as strong as the MJCF says; with `rate`"""
+
+
 class Command(Table):
-    """The column that drives one actuator; ``sign`` * ``factor`` * column in ``unit``."""
+    """The column that drives one actuator; ``sign`` * ``factor`` * column in ``unit``, times the supply of a duty."""
 
     actuator: Text
     """name of the driven actuator in the MJCF; a `[[commands]]` for each"""
@@ -71,11 +84,35 @@ class Command(Table):
     """1 or -1"""
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
+    rate: Positive | None = None
+    """Hz at which firmware evaluates the controller that the actuator stands for, and holds its output between; see
+    [firmware](../firmware.md). Default: at every physics step"""
+    supply: Supply | None = None
+    """`{ column = "battery" }`: its voltage scales a duty, or with `rate` and `nominal` what the controller puts out"""
 
     @property
     def target(self) -> str:
         """``actuator:NAME``."""
         return f"actuator:{self.actuator}"
+
+    @property
+    def fed(self) -> Command | None:
+        """The supply as a column that drives a control of its own: V of a duty, share of nominal of a controller."""
+        if self.supply is None:
+            return None
+        nominal, column = self.supply.nominal or 1.0, self.supply.column
+        name = f"supply:{column}/{nominal:g}"
+        return Command(actuator=name, column=column, unit=self.supply.unit, factor=1 / nominal)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.supply is None:
+            return self
+        if (self.rate is None) != (self.supply.nominal is None):
+            raise problem("a controller with `rate` needs it, a duty needs neither; give both", "supply.nominal")
+        if self.rate is None and find_unit(self.unit).dimension != "dimensionless":
+            raise problem(f"got {self.unit!r}; a supply scales a duty, '1' or '%', or a controller with `rate`", "unit")
+        return self
 
 
 class Measurement(Table):
@@ -359,8 +396,3 @@ class Structure(Table):
         if self.only is not None and not (left or self.extra):
             raise problem("expected at least one name beside `without`, got none; add one or drop the key", "only")
         return self
-
-
-def overlap(a: Pair | None, b: Pair | None) -> bool:
-    """Whether two spans in seconds share samples; None is the whole log."""
-    return a is None or b is None or (a[0] < b[1] and b[0] < a[1])

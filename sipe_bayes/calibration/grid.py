@@ -34,14 +34,16 @@ class Recording:
 
     Args:
         time: (n,) s from zero, of the clock that gives the grid.
-        commands: of each actuator.
+        commands: of each control.
         measurements: of each channel.
+        supplies: voltages by which commands are multiplied, by their number.
         late: s that were left out before the first command of a clock of its own.
     """
 
     time: FloatArray
     commands: list[Series]
     measurements: list[Series]
+    supplies: dict[int, Series]
     late: float = 0.0
 
 

@@ -56,12 +56,12 @@ def report_of(
         trajectory: what came out.
     """
     finite = np.isfinite(trajectory.observations)
-    names = [*_column_names(config), *(c.target for c in config.commands)]
+    names = [*_column_names(config), *(c.target for c in config.drives)]
     signals = [y.values for y in (*raw.measurements, *raw.commands)]
     missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
     clipped = {name: count_clipped(values) for name, values in zip(names, signals, strict=True)}
     saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
-    commands = zip(config.commands, raw.commands, strict=True)
+    commands = zip(config.drives, raw.commands, strict=True)
     blank = {c.target: int((~np.isfinite(y.values[:-1])).sum()) for c, y in commands}
     holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
     jitter = _jitter(raw.time)
@@ -103,7 +103,7 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
     apart = sum(y.time is not raw.time for y in series)
     if apart:
         noticed.append(finding(Code.LOG_CLOCKS, log=log.name, count=apart, of=len(series), late=raw.late))
-    for command, y in zip(config.commands, raw.commands, strict=True):
+    for command, y in zip(config.drives, raw.commands, strict=True):
         silent = float(raw.time[-1] - y.time[-1])
         if len(y.time) > 1 and silent > _SILENT * float(np.median(np.diff(y.time))):
             noticed.append(finding(Code.LOG_COMMAND_ENDS, log=log.name, channel=command.target, silent=silent))

@@ -71,7 +71,8 @@ def load_logs(
         ConfigError: for a unit of the wrong kind.
     """
     check_dimensions(config, dimensions or {})
-    wanted = [column for _, column in config.sources] + [c.column for c in config.commands]
+    wanted = [column for _, column in config.sources] + [c.column for c in config.drives]
+    wanted += [c.supply.column for c in config.commands if c.supply is not None]
     wanted += [config.columns.episode] if config.columns.episode else []
     loaded = []
     for file, parts in groupby(logs, key=lambda log: log.file):
@@ -121,6 +122,8 @@ def _loaded(config: Config, log: LogEntry, opened: _Opened) -> tuple[Trajectory,
     for (_, column), before, after in zip(config.sources, raw.measurements, observed, strict=True):
         _check_any(column, before.values, after)
     commands = [held(y.values, _placed(grid, raw, y)) for y in raw.commands]
+    for k, y in raw.supplies.items():
+        commands[k] = commands[k] * held(y.values, _placed(grid, raw, y))
     actions = np.stack(commands, -1) if commands else np.zeros((grid.samples - 1, 0))
     trajectory = Trajectory(_observations(config, observed), actions, grid.dt, name=log.name, channels=config.channels)
     return trajectory, report_of(config, log, sha256, raw, grid, trajectory)
@@ -152,10 +155,13 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         return Series(time, entry.sign * entry.factor * values)
 
     measurements = [y for m in config.measurements for y in _aligned(m, [signal(m, column) for column in m.sources])]
-    commands = [signal(c, c.column) for c in config.commands]
+    commands = [signal(c, c.column) for c in config.drives]
+    scaled = {k: c.fed for k, c in enumerate(config.commands) if c.fed is not None and c.rate is None}
+    supplies = [signal(fed, fed.column) for fed in scaled.values()]
+    driving, driven = (*config.drives, *scaled.values()), [*commands, *supplies]
     lead = max((y.time for y, (m, _) in zip(measurements, config.sources, strict=True) if m.fit), key=len)
     span = _span(log, lead - lead[0])
-    part = _after_commands(config, lead, span, commands)
+    part = _after_commands(driving, lead, span, driven)
     time = (lead - lead[0])[part]
     late, time = float(time[0] - (lead[span.start] - lead[0])), time - time[0]
 
@@ -168,13 +174,14 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         rows = slice(max(first, 0), int(np.searchsorted(own, time[-1], side="right")))
         return Series(own[rows], series.values[rows])
 
-    for command, series in zip(config.commands, commands, strict=True):
+    for command, series in zip(driving, driven, strict=True):
         if series.time is lead:
             _check_first_command(command.column, time, series.values[part])
     for (_, column), series in zip(config.sources, measurements, strict=True):
         if not cut(series, False).time.size:
             raise _apart(column, series.time, lead[part])
-    return Recording(time, [cut(y, True) for y in commands], [cut(y, False) for y in measurements], late)
+    feeding = {k: cut(y, True) for k, y in zip(scaled, supplies, strict=True)}
+    return Recording(time, [cut(y, True) for y in commands], [cut(y, False) for y in measurements], feeding, late)
 
 
 def _aligned(entry: Measurement, columns: list[Series]) -> list[Series]:
@@ -221,10 +228,10 @@ def _seconds(config: Config, log: LogEntry, table: Columns, name: str) -> FloatA
     return time
 
 
-def _after_commands(config: Config, lead: FloatArray, span: slice, commands: list[Series]) -> slice:
+def _after_commands(driving: Sequence[Command], lead: FloatArray, span: slice, commands: list[Series]) -> slice:
     """The rows of the span from where all commands of other clocks have begun."""
     first = span.start
-    for command, series in zip(config.commands, commands, strict=True):
+    for command, series in zip(driving, commands, strict=True):
         known = series.time[np.isfinite(series.values)]
         if not known.size:
             raise LogError(f"command column {command.column!r} holds no number; choose another column")

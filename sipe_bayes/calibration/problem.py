@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from sipe_bayes.calibration.config import Config, check_dimensions, load_config
-from sipe_bayes.calibration.config_fields import ConfigError
-from sipe_bayes.calibration.config_tables import LogEntry, overlap
+from sipe_bayes.calibration.config_fields import ConfigError, overlap
+from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
@@ -22,6 +22,7 @@ from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.laws.firmware import Firmware
 from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
 from sipe_bayes.envs.target import TargetError
 from sipe_bayes.inference import get_estimator
@@ -166,8 +167,10 @@ def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
         logs = [log.name for log in train] if entry.per_log else []
         parameters += [replace(one, name=f"{one.name}[{log}]", log=log) for log in logs] or [one]
     channels = [Channel(*channel) for m in config.measurements for channel in m.channels]
+    edits = [Firmware(c.actuator, c.rate, c.fed.actuator if c.fed else "") for c in config.commands if c.rate]
+    actuators = [c.actuator for c in config.commands]
     try:
-        environment = MjcfEnvironment.build(config.model, parameters, [c.actuator for c in config.commands], channels)
+        environment = MjcfEnvironment.build(config.model, parameters, actuators, channels, edits)
     except (TargetError, ModelError):
         raise
     except ValueError as error:

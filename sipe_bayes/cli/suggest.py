@@ -118,7 +118,7 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
     from sipe_bayes.core.units import to_si
     from sipe_bayes.diagnostics.expected import Plan
 
-    clock, commands, model = problem.config.columns.time, problem.config.commands, problem.simulator.model
+    clock, commands, model = problem.config.columns.time, problem.config.drives, problem.simulator.model
     table, names = read_table(file), [clock.column, *(c.column for c in commands)]
     for name in names:
         if name not in table:
@@ -161,6 +161,6 @@ def _write(problem: Problem, plan: Plan, out: Path) -> None:
 
     clock = problem.config.columns.time
     columns: dict[str, Any] = {clock.column: np.arange(len(plan.actions)) * plan.dt / to_si(clock.unit)[0]}
-    for command, column in zip(problem.config.commands, plan.actions.T, strict=True):
+    for command, column in zip(problem.config.drives, plan.actions.T, strict=True):
         columns[command.column] = command.sign * column / to_si(command.unit)[0]
     write_text(out, pd.DataFrame(columns).to_csv(index=False, float_format="%.9g"))

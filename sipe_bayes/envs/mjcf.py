@@ -35,6 +35,7 @@ from sipe_bayes.envs.inertia import check_inertia, restore_inertia
 from sipe_bayes.envs.internal.states import filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of, moving_on
+from sipe_bayes.envs.laws.firmware import firmware_of, supplies_of
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.poses import PoseReading, pose_columns, pose_readings
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
@@ -127,10 +128,10 @@ class MjcfEnvironment(Environment):
         try:
             model = compile_spec(_prepared(str(source), parameters, edits, channels), str(source))
             laws_of(model)
+            firmware_of(model)
         except LawError as error:
             raise TargetError(str(error)) from None
-        for actuator in actuators:
-            _single_control(model, actuator)
+        _controls_of(model, actuators)
         channels = tuple(part for c in channels for part in expanded(model, c))
         channels = tuple(replace(c, name=c.label, unit=reader_of(model, c).unit) for c in channels)
         twice = sorted({c.label for c in channels if [d.label for d in channels].count(c.label) > 1})
@@ -159,8 +160,8 @@ class MjcfEnvironment(Environment):
 
     @property
     def num_actions(self) -> int:  # type: ignore[override]
-        """A: how many actuators the log drives."""
-        return len(self.actuators)
+        """A: how many actuators the log drives, and supplies whose voltage it holds."""
+        return len(self.actuators) + len(supplies_of(self.edits))
 
     @property
     def needs_derived(self) -> bool:  # type: ignore[override]
@@ -297,7 +298,7 @@ class MjcfEnvironment(Environment):
 
     @cached_property
     def _controls(self) -> list[int]:
-        return [_single_control(self._model, a) for a in self.actuators]
+        return _controls_of(self._model, (*self.actuators, *supplies_of(self.edits)))
 
     def control(self, model: mujoco.MjModel, states: FloatArray, actions: FloatArray) -> FloatArray:
         """The actions at the actuators that the log drives, zero at the others."""
@@ -389,8 +390,9 @@ def _mean(values: FloatArray, members: list[int]) -> float:
     return float(values[members[0]] if len(members) == 1 else np.mean(values[members]))
 
 
-def _single_control(model: mujoco.MjModel, actuator: str) -> int:
-    index = named(model, "actuator", actuator, f"command for actuator {actuator!r}")
-    if int(model.actuator_ctrlnum[index]) != 1:
-        raise TargetError(f"command for actuator {actuator!r}: only actuators with one control are supported")
-    return int(model.actuator_ctrladr[index])
+def _controls_of(model: mujoco.MjModel, actuators: Sequence[str]) -> list[int]:
+    indices = [named(model, "actuator", a, f"command for actuator {a!r}") for a in actuators]
+    for actuator, index in zip(actuators, indices, strict=True):
+        if int(model.actuator_ctrlnum[index]) != 1:
+            raise TargetError(f"command for actuator {actuator!r}: only actuators with one control are supported")
+    return [int(model.actuator_ctrladr[index]) for index in indices]

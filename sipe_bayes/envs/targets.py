@@ -22,10 +22,11 @@ from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.laws.base import SINGLE, Number
 from sipe_bayes.envs.laws.registry import LAW_OF
-from sipe_bayes.envs.target import Maker, Target, TargetError, entry, named
+from sipe_bayes.envs.target import Check, Maker, Target, TargetError, entry, named
 
 _PATTERN = re.compile(r"^(?:(body|joint|actuator|geom|pair):(.+)|(option))\.([a-z0-9_]+)$")
 _AXES = ("x", "y", "z")
+_DC_MOTOR, _PID = mujoco.mjtGain.mjGAIN_DCMOTOR, mujoco.mjtGain.mjGAIN_PID
 
 
 def split(spec: str, parameter: str = "") -> tuple[str, str, str]:
@@ -111,6 +112,32 @@ def _actuator_bias(slot: int, unit: str) -> Maker:
             other.actuator_biasprm[actuator, slot] = value
 
         return Target(spec, unit, float(model.actuator_biasprm[actuator, slot]), write)
+
+    return make
+
+
+def _kind(kind: mujoco.mjtGain) -> Check:
+    """The check that an actuator is a ``dcmotor`` or a ``pid``."""
+
+    def check(model: mujoco.MjModel, spec: str, actuator: int) -> None:
+        if int(model.actuator_gaintype[actuator]) != int(kind):
+            raise TargetError(f"target {spec!r}: needs a {kind.name.removeprefix('mjGAIN_').lower()} actuator")
+
+    return check
+
+
+def _of_kind(motor: Maker, pid: Maker, other: Maker) -> Maker:
+    """What a ``dcmotor``, a ``pid`` and any other actuator keep in places of their own."""
+    makers = {int(_DC_MOTOR): motor, int(_PID): pid}
+    return lambda model, spec, index: makers.get(int(model.actuator_gaintype[index]), other)(model, spec, index)
+
+
+def _minus_bias(slot: int, unit: str) -> Maker:
+    def make(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
+        def write(other: mujoco.MjModel, value: float) -> None:
+            other.actuator_biasprm[actuator, slot] = -value
+
+        return Target(spec, unit, -float(model.actuator_biasprm[actuator, slot]), write, minimum=0.0)
 
     return make
 
@@ -245,8 +272,9 @@ def _limit(field: str, unit: str, at: str = "") -> Maker:
 
 
 def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
-    if int(model.actuator_dyntype[actuator]) != int(mujoco.mjtDyn.mjDYN_FILTEREXACT):
-        raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact"')
+    kind, tau = int(model.actuator_dyntype[actuator]), float(model.actuator_dynprm[actuator, 0])
+    if kind != int(mujoco.mjtDyn.mjDYN_FILTEREXACT) and not (kind == int(mujoco.mjtDyn.mjDYN_DCMOTOR) and tau > 0):
+        raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact", or a dcmotor\'s inductance')
     target = entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
     return replace(target, step=2 * float(model.opt.timestep))  # shorter ones than a physics step act alike
 
@@ -286,6 +314,13 @@ def _laws(kind: str) -> dict[str, Maker]:
     return {attribute: _numeric(law.numbers[slot], law.name, slot) for attribute, law, slot in rows}
 
 
+def _motor(slot: int, unit: str) -> Maker:
+    return entry("actuator_gainprm", unit, slot, _kind(_DC_MOTOR), minimum=0.0)
+
+
+_pid_ki = entry("actuator_gainprm", "force/(position s)", 0, _kind(_PID), minimum=0.0)
+
+
 ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds it
     "body": {
         "mass": _body_mass,
@@ -308,8 +343,12 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
     "actuator": {
         "gear": entry("actuator_gear", "1", 0, constants=True),
         "gain": entry("actuator_gainprm", "force/command", 0, _fixed_gain),
-        "kp": _actuator_kp,
-        "kv": _actuator_kv,
+        "kp": _of_kind(_motor(4, "N m/rad"), _minus_bias(1, "force/position"), _actuator_kp),
+        "kv": _of_kind(_motor(6, "N m s/rad"), _minus_bias(2, "force/velocity"), _actuator_kv),
+        "ki": _of_kind(_motor(5, "N m/(rad s)"), _pid_ki, _pid_ki),
+        "resistance": _motor(0, "Ohm"),
+        "motor_constant": _motor(1, "N m/A"),
+        "voltage_limit": _motor(7, "V"),
         "bias_force": _actuator_bias(0, "force"),
         "bias_position": _actuator_bias(1, "force/position"),
         "bias_velocity": _actuator_bias(2, "force/velocity"),

@@ -245,8 +245,13 @@ def past_commands(
     return past
 
 
-def with_history(simulator: Simulator, states: FloatArray, past: list[FloatArray], dt: FloatArray) -> FloatArray:
-    """States (W, S) at time zero, with the ``past_commands`` that delayed actuators remember; dt (W,) in seconds."""
-    states[:, 0] = 0.0
+def with_history(
+    simulator: Simulator, states: FloatArray, past: list[FloatArray], dt: FloatArray, steps: IntArray | int = 0
+) -> FloatArray:
+    """States (W, S) with the ``past_commands`` that delayed actuators remember; dt (W,) in seconds.
+
+    They are at time zero, or, where firmware has a clock, ``steps`` (W,) control steps after its start.
+    """
+    states[:, 0] = steps * dt if simulator.engine.firmware else 0.0
     timestep = np.array([simulator.physics_steps(float(seconds))[1] for seconds in dt])
     return simulator.environment.history(simulator.model, states, past, timestep)

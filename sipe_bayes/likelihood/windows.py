@@ -138,8 +138,8 @@ class Windows:
                     f"log {trajectory.name!r}: lasts {len(trajectory) * trajectory.dt:.3g} s, shorter than one window "
                     f"of {window:g} s; use a shorter window"
                 )
-            for start in range(0, len(trajectory), steps):
-                pieces.append((k, start, min(steps, len(trajectory) - start)))
+            steps = self.simulator.engine.firmware.whole(steps, trajectory.dt)
+            pieces += [(k, s, min(steps, len(trajectory) - s)) for s in range(0, len(trajectory), steps)]
         self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
         if self.settings.seconds is not None:
             lasting = float((self.steps * trajectories.dt[self.log]).sum())
@@ -170,7 +170,7 @@ class Windows:
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
-        self.reference = with_history(simulator, reference, past, self.dt)
+        self.reference = with_history(simulator, reference, past, self.dt, self.start)
         free = environment.start_sd(simulator.model) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
 

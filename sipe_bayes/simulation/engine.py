@@ -17,6 +17,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.simulation.firmware_steps import FirmwareSteps
 from sipe_bayes.simulation.law_steps import LawSteps
 from sipe_bayes.simulation.mjdata import Fields
 
@@ -97,6 +98,7 @@ class Engine:
         self._threads = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
         self.laws = LawSteps(model, environment.control_spec)
+        self.firmware = FirmwareSteps(model)
         self._fields = Fields(environment.data_fields, self._datas) if environment.data_fields else None
 
     @property
@@ -191,10 +193,23 @@ class Engine:
         self, models: Sequence[mujoco.MjModel], start: FloatArray, controls: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """States (B, P, S) and sensordata (B, P, D) of P physics steps, with controls (B, P, U)."""
-        reads = self.reads_sensors
+        spec, reads = self.environment.control_spec, self.reads_sensors
+        if self.firmware:
+            return self.firmware.advance(self._lawful, models, start, controls, spec, reads)
+        return self._lawful(models, start, controls, spec, reads)
+
+    def _lawful(
+        self,
+        models: Sequence[mujoco.MjModel],
+        start: FloatArray,
+        controls: FloatArray,
+        control_spec: int,
+        reads_sensors: bool,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``_native``, without firmware."""
         if self.laws:
-            return self.laws.advance(self._steps, models, start, controls, reads)
-        return self._steps(models, start, controls, self.environment.control_spec, reads)
+            return self.laws.advance(self._steps, models, start, controls, reads_sensors)
+        return self._steps(models, start, controls, control_spec, reads_sensors)
 
     def _steps(
         self,
@@ -204,7 +219,7 @@ class Engine:
         control_spec: int,
         reads_sensors: bool,
     ) -> tuple[FloatArray, FloatArray]:
-        """As ``_native``, by ``mujoco.rollout`` alone."""
+        """As ``_native``, by ``mujoco.rollout`` alone, without laws."""
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
         sensors = np.empty((batch, steps, self.model.nsensordata)) if reads_sensors else None

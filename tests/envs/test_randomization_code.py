@@ -101,7 +101,8 @@ BODIES = """
     <body name="tip" pos="0 0 -0.5"><joint name="slide" type="slide" axis="1 0 0"/><joint name="twist" axis="1 1 1"/>
     <geom size="0.03" mass="0.2"/></body></body>
   </worldbody><actuator>
-  <motor name="motor" joint="hinge"/><position name="servo" joint="twist" kp="2"/></actuator></mujoco>"""
+  <motor name="motor" joint="hinge"/><position name="servo" joint="twist" kp="2"/>
+  <dcmotor name="drive" joint="hinge" resistance="2" motorconst=".3"/></actuator></mujoco>"""
 
 
 class Bodies(Robot):
@@ -125,6 +126,7 @@ def accelerations(model: Any) -> np.ndarray:
         *(("actuator:motor.gear", 0.5, 2), ("actuator:motor.gain", 0.5, 2), ("actuator:servo.kp", 1, 4)),
         *(("actuator:motor.kv", 0, 2), ("actuator:motor.bias_force", 0, 1), ("actuator:motor.bias_position", -2, 0)),
         *(("actuator:motor.bias_velocity", -2, 0), ("actuator:motor.offset", 0, 1), ("option.gravity_x", -2, 2)),
+        *(("actuator:drive.resistance", 1, 3), ("actuator:drive.motor_constant", 0.1, 0.5)),
         *(("option.density", 0, 300), ("option.viscosity", 0, 3)),
     ],
 )

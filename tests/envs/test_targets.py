@@ -21,8 +21,9 @@ from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.target import TargetError
 from sipe_bayes.envs.targets import bind
+from tests.problems import motors
 
-XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worldbody>
+XML = f"""<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worldbody>
   <geom name="floor" type="plane" size="3 3 .1"/>
   <body name="rod" pos="0 0 1">
     <joint name="hinge" axis="0 1 0" damping="0.1" frictionloss="0.01" springref="10"/>
@@ -44,7 +45,8 @@ XML = """<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><world
   <motor name="late" joint="hinge2" nsample="10" delay=".004"/>
   <motor name="weak" joint="hinge2" forcerange="-3 3"/>
   <position name="wary" joint="hinge2" kp="1" ctrlrange="-.7 .7"/>
-  <general name="slow" joint="hinge2" dyntype="filterexact" dynprm=".02" actearly="true"/></actuator></mujoco>"""
+  <general name="slow" joint="hinge2" dyntype="filterexact" dynprm=".02" actearly="true"/>
+  {motors.MOTORS}</actuator></mujoco>"""
 
 Edit = Callable[[Any, float], None]
 
@@ -190,11 +192,12 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("actuator:general.bias_position", -2.0, "force/position", actuator(1)),
     ("actuator:motor.bias_velocity", -0.1, "force/velocity", actuator(2)),
     ("actuator:motor.offset", 0.2, "command", offset),
-    ("actuator:general.offset", -0.2, "command", offset),
     ("actuator:late.delay", 0.01, "s", scalar("delay")),
     ("actuator:weak.force_limit", 2.0, "force", limit),
     ("actuator:wary.command_limit", 0.4, "command", command_limit),
     ("actuator:slow.lag", 0.05, "s", vector("dynprm", 0)),
+    ("actuator:pid.kp", 4.0, "force/position", actuator(1, -1)),
+    *((target, value, unit, vector(field, slot)) for target, value, unit, field, slot in motors.CASES),
     ("geom:box.friction", 0.3, "1", vector("friction", 0)),
     ("geom:box.friction_torsional", 0.01, "m", vector("friction", 1)),
     ("geom:floor.friction_rolling", 0.002, "m", vector("friction", 2)),

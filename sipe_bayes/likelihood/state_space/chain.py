@@ -84,7 +84,7 @@ class Chain:
         if known:
             reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt)
-        self.reference = with_history(simulator, reference, past, self.dt)
+        self.reference = with_history(simulator, reference, past, self.dt, self.sample)
         self.sizes = (model.nv, model.nv, model.na)
         start_sd = np.repeat(KNOWN_SD, self.sizes) if known else environment.start_sd(model)
         self.prior_precision = np.where(self.first[:, None], start_sd**-2.0, 0.0)
