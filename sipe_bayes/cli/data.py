@@ -63,7 +63,7 @@ def verify(
     """Check every file against the manifest's size and checksum; exit code 1 where one differs."""
     from sipe_bayes.datasets import trajectory_sets
 
-    chosen = folder or trajectory_sets.SHIPPED
+    chosen = folder or trajectory_sets.shipped()
     with exit_on_error():
         wrong = trajectory_sets.verify(chosen)
         sizes = [entry.bytes for entry in trajectory_sets.manifest(chosen).values()]
@@ -72,6 +72,33 @@ def verify(
     if wrong:
         raise typer.Exit(1)
     print(f"{len(sizes)} files, {sum(sizes) / 1e6:.1f} MB: as the manifest says")
+
+
+@app.command()
+def install(
+    archive: Annotated[Path, typer.Argument(help="sipe_bayes-trajectories-VERSION.zip, from beside the release.")],
+) -> None:
+    """Store the trajectory sets of the release, each compared with its checksum, in SIPE_BAYES_DATA or the cache."""
+    from sipe_bayes.datasets.archive import install as stored
+
+    with exit_on_error():
+        folder = stored(archive)
+    print(f"{folder}: as the manifest says")
+
+
+@app.command()
+def pack(
+    out: Annotated[Path | None, typer.Option(help="Default sipe_bayes-trajectories-VERSION.zip.")] = None,
+    folder: Annotated[Path | None, typer.Option(help="Of the sets; default those that are installed.")] = None,
+) -> None:
+    """Write trajectory sets as the archive that `sipe data install` takes, and print its SHA-256."""
+    from sipe_bayes.core import __version__
+    from sipe_bayes.datasets import archive
+
+    path = out or Path(f"sipe_bayes-trajectories-{__version__}.zip")
+    with exit_on_error():
+        digest = archive.pack(path, folder)
+    print(f"{digest}  {path}")
 
 
 @app.command()

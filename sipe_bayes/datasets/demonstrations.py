@@ -27,7 +27,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import one_of, whole
 from sipe_bayes.datasets import acting, trajectory_sets
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Behaviour, Recording, Split
-from sipe_bayes.datasets.trajectory_sets import COUNT, SHIPPED, SetName, TrajectorySetError
+from sipe_bayes.datasets.trajectory_sets import COUNT, SetName, TrajectorySetError
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import VARIANTS, Task, Variant
 from sipe_bayes.simulation.simulator import Simulator
@@ -97,7 +97,7 @@ def demonstrations(
     task = simulator.task
     horizon = default_steps(task) if steps is None else whole("steps", steps)
     asked = Recording(split, whole("count", count), seed, horizon)
-    recorded = _stored(simulator, theta, type, asked, SHIPPED if folder is None else Path(folder))
+    recorded = _stored(simulator, theta, type, asked, trajectory_sets.shipped() if folder is None else Path(folder))
     if recorded is None and folder is not None:
         raise TrajectorySetError(
             f"folder {folder}: holds no {type} {split} set of {task.name} with these parameters, seed {seed}, and at "

@@ -26,6 +26,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import platform
 import zipfile
 import zlib
@@ -46,7 +47,10 @@ from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
 from sipe_bayes.envs.task import VARIANTS, Variant
 from sipe_bayes.simulation.simulator import Simulator
 
-SHIPPED = Path(__file__).parent / "trajectories"
+IN_PACKAGE = Path(__file__).parent / "trajectories"
+"""The manifest of the sets that are released, and, in a source tree, their files."""
+DATA = "SIPE_BAYES_DATA"
+"""Names the folder in which ``trajectories`` is looked for."""
 FORMAT = "sipe_bayes.trajectories/1"
 MANIFEST = "manifest.json"
 TASKS = (  # the benchmark's
@@ -59,7 +63,10 @@ _SHARED = {
     "HalfCheetahJoints": "HalfCheetahLinks",
     "HalfCheetahAllJoints": "HalfCheetahLinks",  # in the default variant
 }
-_REMEDY = "reinstall the package, or remake it with `sipe data generate`"
+_REMEDY = (
+    "`sipe data install ARCHIVE` stores the release's, `sipe data generate --out DIR/trajectories` simulates anew for "
+    f"{DATA}=DIR"
+)
 
 
 class TrajectorySetError(ValueError):
@@ -119,6 +126,22 @@ class Entry:
     agent_sha256: str = ""
     command: str = ""
     versions: dict[str, str] | None = None
+
+
+def data_folder() -> Path:
+    """Where data outside the package is kept: what SIPE_BAYES_DATA names, else the user's cache."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get(DATA) or Path(cache) / "sipe_bayes")
+
+
+def shipped() -> Path:
+    """The folder of the released sets: below SIPE_BAYES_DATA, where it is set, else of the source tree or the cache.
+
+    Without any of their files it is the package's own, whose manifest says what is missing.
+    """
+    kept = data_folder() / "trajectories"
+    in_tree = next(IN_PACKAGE.glob("*/*.npz"), None) is not None
+    return kept if os.environ.get(DATA) or (not in_tree and (kept / MANIFEST).is_file()) else IN_PACKAGE
 
 
 def names(

@@ -119,7 +119,7 @@ def test_the_excitation_is_smooth() -> None:
 def agents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder in place of that of the agents, and no stored sets."""
     monkeypatch.setattr(demonstration, "AGENT_FILES", tmp_path)
-    monkeypatch.setattr(demonstration, "SHIPPED", tmp_path / "none")
+    monkeypatch.setenv("SIPE_BAYES_DATA", str(tmp_path / "none"))
     return tmp_path
 
 

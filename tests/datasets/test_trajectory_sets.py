@@ -23,7 +23,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting, trajectory_sets
 from sipe_bayes.datasets import demonstrations as demonstration
 from sipe_bayes.datasets.generation import generate
-from sipe_bayes.datasets.trajectory_sets import MANIFEST, SHIPPED, SetName, TrajectorySetError
+from sipe_bayes.datasets.trajectory_sets import IN_PACKAGE, MANIFEST, SetName, TrajectorySetError
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.policies import agent
 
@@ -148,8 +148,8 @@ def test_tasks_that_share_files_are_one_model(task: str, owner: str) -> None:
 
 def test_a_stored_set_is_taken_where_it_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is stored tells itself by its rounded states."""
-    monkeypatch.setattr(demonstration, "SHIPPED", tmp_path)
-    one_set(tmp_path, "HalfCheetahJoints", variant="default")
+    monkeypatch.setenv("SIPE_BAYES_DATA", str(tmp_path))
+    one_set(tmp_path / "trajectories", "HalfCheetahJoints", variant="default")
     env = sipe.make("HalfCheetahJoints")
 
     def stored(*args: Any, **settings: Any) -> bool:
@@ -221,9 +221,7 @@ def test_a_damaged_file_is_named_and_refused(damage: Callable[[Path], None], wor
     path = tmp_path / one_set(tmp_path).file
     assert trajectory_sets.verify(tmp_path) == []
     damage(path)
-    with pytest.raises(
-        TrajectorySetError, match=f"reference-random.npz: .*{words}.*; reinstall the package, or remake"
-    ):
+    with pytest.raises(TrajectorySetError, match=f"reference-random.npz: .*{words}.*; `sipe data install ARCHIVE`"):
         sipe.demonstrations("Pendulum", "random", variant="in_distribution", steps=STEPS, folder=tmp_path)
     (wrong,) = trajectory_sets.verify(tmp_path)
     assert str(path) in wrong
@@ -248,8 +246,8 @@ def test_a_file_that_nobody_lists_is_named(tmp_path: Path) -> None:
 
 
 def test_what_is_shipped_is_whole_and_of_today_s_parameters() -> None:
-    assert trajectory_sets.verify(SHIPPED) == []
-    entries = trajectory_sets.manifest(SHIPPED)
+    assert trajectory_sets.verify(IN_PACKAGE) == []
+    entries = trajectory_sets.manifest(IN_PACKAGE)
     assert sum(e.bytes for e in entries.values()) <= 60e6
     known = {name.file: name for name in trajectory_sets.names()}
     assert entries.keys() == known.keys()

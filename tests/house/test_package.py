@@ -6,8 +6,10 @@ import os
 import re
 import subprocess
 import sys
+import tarfile
 import time
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +17,7 @@ import pytest
 
 import sipe_bayes
 from sipe_bayes.inference import ESTIMATORS, estimator_class
+from tests.house import distributions
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sipe_bayes"
@@ -128,3 +131,28 @@ def test_gymnasium_knows_the_environments(imports: str) -> None:
     check = "print('sipe/Pendulum-v0' in gymnasium.registry)"
     done = subprocess.run([sys.executable, "-c", f"{imports}; {check}"], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "True"
+
+
+def test_a_wheel_and_an_sdist_that_are_wrong_are_refused(tmp_path: Path) -> None:
+    wanted = {"sipe_bayes/a.py", "sipe_bayes/py.typed"}
+    assert "sipe_bayes/py.typed" in distributions.package()
+    assert not [name for name in distributions.package() if name.endswith(".npz")]
+
+    def wheel(*names: str) -> list[str]:
+        with zipfile.ZipFile(tmp_path / "x.whl", "w") as archive:
+            for name in (*names, "x.dist-info/METADATA"):
+                archive.writestr(name, "")
+        return distributions.faults(tmp_path / "x.whl", wanted)
+
+    assert wheel(*wanted) == []
+    assert wheel("sipe_bayes/a.py") == ["sipe_bayes/py.typed: missing"]
+    assert wheel(*wanted, "sipe_bayes/b.py") == ["sipe_bayes/b.py: not of this tree"]
+    assert wheel(*wanted, "tests/a.py") == ["tests/a.py: does not belong there"]
+    with tarfile.open(tmp_path / "x.tar.gz", "w:gz") as archive:
+        for name in (*wanted, "README.md", "notes.txt"):
+            archive.addfile(tarfile.TarInfo(f"x-1/{name}"))
+        link = tarfile.TarInfo("x-1/LICENSE")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        archive.addfile(link)
+    found = distributions.faults(tmp_path / "x.tar.gz", wanted)
+    assert found == ["notes.txt: does not belong there", "LICENSE: a link"]
