@@ -38,13 +38,15 @@ class Recording:
         measurements: of each channel.
         supplies: voltages by which commands are multiplied, by their number.
         late: s that were left out before the first command of a clock of its own.
+        wild: of each measurement, samples that were masked because no motion passes through them.
     """
 
     time: FloatArray
     commands: list[Series]
     measurements: list[Series]
     supplies: dict[int, Series]
-    late: float = 0.0
+    late: float
+    wild: list[int]
 
 
 @dataclass(frozen=True)

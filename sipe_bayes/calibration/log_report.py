@@ -6,17 +6,17 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
+from sipe_bayes.likelihood.wild_samples import jumps
 
 
 @dataclass(frozen=True)
@@ -29,16 +29,7 @@ class Saturation(Options):
     quanta: float = option(2.5, "from as far it was cut off, from nearer it turned round", "smallest steps", above=0)
 
 
-@dataclass(frozen=True)
-class Jumps(Options):
-    """When a position between two samples counts as one that nothing moves through."""
-
-    neighbours: int = option(4, "steps on each side that a step is compared with", least=1)
-    times: float = option(20.0, "of the middle one of these", above=1)
-    share: float = option(0.1, "of the log's range: quanta and noise jump as well", above=0)
-
-
-_SATURATION, _JUMPS = Saturation(), Jumps()
+_SATURATION = Saturation()
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
@@ -66,6 +57,7 @@ def report_of(
     holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
     jitter = _jitter(raw.time)
     note = functools.partial(finding, log=log.name)
+    wild = zip(config.measurements, raw.wild, strict=True)
     own = [y for y in raw.measurements if y.time is not raw.time]
     return LogReport(
         name=log.name,
@@ -88,6 +80,7 @@ def report_of(
                 jitter_ms=1e3 * jitter,
             ),
             *_of_clocks(config, log, raw),
+            *(note(Code.LOG_WILD, channel=m.name, count=n) for m, n in wild if n),
             *(note(Code.LOG_GAP, start=start, stop=stop) for start, stop in holes),
             *(note(Code.LOG_MISSING, channel=c, missing=n, samples=grid.samples) for c, n in missing.items() if n),
             *(note(Code.LOG_BLANK_COMMANDS, channel=c, blank=n) for c, n in blank.items() if n),
@@ -140,21 +133,6 @@ def _jitter(time: FloatArray) -> float:
     periods = np.diff(time)
     median = np.median(periods)
     return float(np.abs(periods - median * np.maximum(1.0, np.round(periods / median))).max())
-
-
-def jumps(values: FloatArray) -> IntArray:
-    """Numbers k of the samples of a joint's position (n,) from which it jumps to the next, k + 1.
-
-    A step is a jump where it is far longer than those around it, of which most are those of a motion: a counter or an
-    angle that came round, a wild sample (two jumps), samples that were lost.
-    """
-    steps = np.abs(np.diff(values))
-    if len(steps) <= 2 * _JUMPS.neighbours:
-        return np.zeros(0, np.int64)
-    padded = np.pad(steps, _JUMPS.neighbours, mode="reflect")
-    around = np.delete(sliding_window_view(padded, 2 * _JUMPS.neighbours + 1), _JUMPS.neighbours, axis=1)
-    least = np.maximum(_JUMPS.times * np.median(around, axis=1), _JUMPS.share * np.ptp(values))
-    return np.flatnonzero(steps > least)
 
 
 def count_clipped(values: FloatArray) -> int:

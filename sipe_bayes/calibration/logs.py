@@ -43,6 +43,7 @@ from sipe_bayes.core.rotations import aligned, continued, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert
 from sipe_bayes.diagnostics.records import LogReport
+from sipe_bayes.likelihood.wild_samples import wild_positions
 
 _SLOW = 0.25  # s from row to row: no robot is logged so slowly without its being meant
 _SHORTEST, _LONGEST = 1e-9, 1e9  # s, of a step and of a log: beyond, a clock holds no times
@@ -180,8 +181,26 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
     for (_, column), series in zip(config.sources, measurements, strict=True):
         if not cut(series, False).time.size:
             raise _apart(column, series.time, lead[part])
+    tame, wild = _tame(config, [cut(y, False) for y in measurements])
     feeding = {k: cut(y, True) for k, y in zip(scaled, supplies, strict=True)}
-    return Recording(time, [cut(y, True) for y in commands], [cut(y, False) for y in measurements], feeding, late)
+    return Recording(time, [cut(y, True) for y in commands], tame, feeding, late, wild)
+
+
+def _tame(config: Config, columns: list[Series]) -> tuple[list[Series], list[int]]:
+    """The measured columns without samples of positions that no motion passes through, and how many of each had."""
+    rest, tame, counts = iter(columns), [], []
+    for entry in config.measurements:
+        own = [next(rest) for _ in entry.sources]
+        wild = np.zeros(len(own[0].time), bool)
+        if (entry.quaternion or entry.target.endswith(".position")) and len({id(y.time) for y in own}) == 1:
+            wild = wild_positions(np.stack([y.values for y in own], axis=-1))
+        if wild.any():
+            rows = np.where(wild[:, None], np.nan, np.stack([y.values for y in own], axis=-1))
+            rows = aligned(rows) if entry.quaternion else rows
+            own = [Series(y.time, values) for y, values in zip(own, rows.T, strict=True)]
+        tame += own
+        counts.append(int(wild.sum()))
+    return tame, counts
 
 
 def _aligned(entry: Measurement, columns: list[Series]) -> list[Series]:

@@ -52,6 +52,7 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.replicas import observation_noise
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
+from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.posterior import Posterior
 
@@ -80,8 +81,10 @@ def calibrate(
     tell = functools.partial(_tell, method, progress)
     tell("checking what each parameter changes")
     theta, space = most_probable(posterior), problem.environment.space
-    logs, problem = problem.train, _from_fitted_states(problem, method)
+    logs = _tamed(problem.train, method)
+    problem = _from_fitted_states(problem, method)
     fit = _Fit.of(problem, method, theta)
+    problem = replace(problem, train=_tamed(problem.train, method))
     dead = dead_ranges(fit.windows, theta)
     alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
     # what the model lacks
@@ -140,6 +143,15 @@ def _from_fitted_states(problem: Problem, method: Estimator) -> Problem:
     return problem if states is None else replace(problem, train=replace(problem.train, states=states))
 
 
+def _tamed(logs: Trajectories, method: Estimator) -> Trajectories:
+    """The logs without the samples that the fit left out."""
+    if not isinstance(method, Laplace) or not len(method.wild):
+        return logs
+    observations = logs.observations.copy()
+    observations[tuple(method.wild.T)] = np.nan
+    return replace(logs, observations=observations)
+
+
 @dataclass(frozen=True)
 class _Fit:
     """The windows of the training logs at theta (N,): noise, best starts (W, D), and what changes them to first order.
@@ -156,6 +168,8 @@ class _Fit:
     @classmethod
     def of(cls, problem: Problem, method: Estimator, theta: FloatArray) -> _Fit:
         windows = bind(problem.segments, problem.simulator, problem.train)
+        if isinstance(method, Laplace):
+            windows.mask(method.wild)
         noise = _noise_of(method, windows, theta)
         if isinstance(problem.likelihood, StateSpace):
             return cls(windows, theta, noise, windows.no_starts(), None)
@@ -181,6 +195,8 @@ class _Predictions:
         logs = {"train": problem.train} | ({} if problem.holdout is None else {"holdout": problem.holdout})
         windows = {use: _every_channel(problem, own) for use, own in logs.items()}
         predicted = {use: both_predicted(one, theta) for use, one in windows.items()}
+        for use, one in windows.items():
+            one.mask(wild_residuals(one, np.where(one.observed, one.measured - predicted[use][0], 0.0)))
         scores = {use: channel_scores(one, theta, predicted[use]) for use, one in windows.items()}
         compared = None
         if "holdout" in windows:

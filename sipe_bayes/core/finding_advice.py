@@ -75,6 +75,7 @@ ADVICE: dict[Code, str] = {
         "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "
         f"{_COMPARE}"
     ),
+    Code.WILD_SAMPLES: "Nothing to do for a few. For many look at the sensor, its cable and its driver.",
     Code.NOT_SMOOTH: f"{_COMPARE} {_SMOOTHER}",
     Code.STARTS_AT_REST: (
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
@@ -159,6 +160,7 @@ ADVICE: dict[Code, str] = {
         "An angle that comes round takes `wraps = true`. Leave wild samples out (an empty cell is a missing sample), "
         "or cut the log with `span`. A few of them are enough to put every estimate far off."
     ),
+    Code.LOG_WILD: "Nothing to do for a few. For many look at the sensor, its cable and its driver.",
     Code.LOG_SLOW: "Record anew at 100 Hz or more; no method finds in a log what is not there.",
     Code.LOG_CLIPPED: "A saturated sensor lies. Cut those parts out by `span`, or send less.",
     Code.PRIOR_OF_MIXTURE: "Give the logs of both runs to one fit instead, if the modes lie far apart.",

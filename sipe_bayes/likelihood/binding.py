@@ -6,10 +6,10 @@ from typing import overload
 
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.callable_windows import CallableWindows
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.settings import Segments, StateSpace, check_seen
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.indirect_positions import indirect_positions
-from sipe_bayes.likelihood.windows import Windows, check_seen
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 

@@ -9,8 +9,8 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import sequences
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows, fitted_channels
+from sipe_bayes.likelihood.settings import Segments, fitted_channels
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 

@@ -1,4 +1,4 @@
-"""Noise of the residuals of windows: white or coloured, and how residuals are whitened.
+"""Noise of the residuals of windows: white or coloured, and how residuals are whitened; how noisy samples are.
 
 Residual model, per channel c and along each log: e_j = a_j e_{j-1} + sqrt(1 - a_j^2) sigma_c z_j, z_j ~ N(0, 1), with
 a_j = exp(-gap_j / tau_c) for the time since the previous sample there is (first-order autoregression, which carries
@@ -13,7 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
+from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood.starts import smoothed
+
+NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
 
 
 def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
@@ -64,3 +69,34 @@ def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> F
     a = coefficients(sequence.gaps, tau)[sequence.gap]
     before = np.where(sequence.previous >= 0, residual[..., sequence.previous], 0.0)
     return (residual[..., sequence.index] - a * before) / (sd * np.sqrt(1 - a**2))
+
+
+def noise_level(trajectories: Trajectories, likelihood: Segments | StateSpace) -> FloatArray:
+    """Sd (O,) of each channel's noise in its unit.
+
+    As ``likelihood.noise_sd`` states it; else zero for trajectories with recorded states; else the robust sd of what
+    local quadratics over 60 ms leave of the recorded samples.
+
+    Raises:
+        ValueError: where the settings state another number of sds than there are channels.
+    """
+    count = trajectories.observations.shape[2]
+    stated = likelihood.noise_sd or (None,) * count
+    if len(stated) != count:
+        raise ValueError(f"noise_sd: expected {count} values, one for each channel, got {len(stated)}")
+    estimated = np.zeros(count) if trajectories.states is not None else _residual_sd(trajectories)
+    return np.array([estimated[c] if sd is None else sd for c, sd in enumerate(stated)])
+
+
+def _residual_sd(trajectories: Trajectories) -> FloatArray:
+    """Robust sd (O,) of what smoothing leaves."""
+    left = []
+    for trajectory in trajectories:
+        series = trajectory.observations
+        finite, filled = np.isfinite(series), np.zeros(series.shape)
+        for c, seen in enumerate(finite.T):
+            if seen.any():
+                filled[:, c] = np.interp(np.arange(len(series)), np.flatnonzero(seen), series[seen, c])
+        left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan))
+    # five points of a local quadratic take away about half of white noise's variance
+    return np.nan_to_num(NORMAL_MAD * np.nanmedian(np.abs(np.concatenate(left)), axis=0) * np.sqrt(2))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import ClassVar
 
 import numpy as np
+
+from sipe_bayes.core.arrays import BoolArray
 
 
 class BudgetExhausted(RuntimeError):
@@ -100,3 +103,32 @@ class StateSpace:
 
 
 Likelihood = Segments | StateSpace
+
+
+def fitted_channels(names: Sequence[str], fit: tuple[str, ...] | None) -> list[int]:
+    """Places among ``names`` of those in ``fit``, default all; raises ValueError for unknown ones."""
+    fit = fit or tuple(names)
+    unknown = [n for n in fit if n not in names]
+    if unknown:
+        raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
+    return [list(names).index(n) for n in fit]
+
+
+def fitted_rotations(
+    rotations: Sequence[tuple[int, int, int]], channels: list[int]
+) -> tuple[tuple[int, int, int], ...]:
+    """Places among the fitted ``channels`` of rotation vectors; raises ValueError where one is fitted in part."""
+    groups = []
+    for triple in rotations:
+        fitted = [channels.index(c) for c in triple if c in channels]
+        if len(fitted) not in (0, 3):
+            raise ValueError("fit: an orientation's three numbers are fitted together or not at all; name all three")
+        if fitted:
+            groups.append((fitted[0], fitted[1], fitted[2]))
+    return tuple(groups)
+
+
+def check_seen(names: Sequence[str], seen: BoolArray) -> None:
+    """Raise ValueError for a fitted channel without any sample; seen (C,)."""
+    for name in np.array(names)[~seen]:
+        raise ValueError(f"trajectories: the fitted channel {str(name)!r} has no sample at all; leave it out of `fit`")

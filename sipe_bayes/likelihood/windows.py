@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,7 +27,7 @@ from sipe_bayes.envs.internal.states import activations_at_rest
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences, spread_blocks
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, fitted_channels, fitted_rotations
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
     are_states,
@@ -59,35 +58,6 @@ def chosen_channels(
     return fitted_channels(environment.channels, fit)
 
 
-def fitted_channels(names: SequenceOf[str], fit: tuple[str, ...] | None) -> list[int]:
-    """Places among ``names`` of those in ``fit``, default all; raises ValueError for unknown ones."""
-    fit = fit or tuple(names)
-    unknown = [n for n in fit if n not in names]
-    if unknown:
-        raise ValueError(f"fit: unknown channels {unknown}; measured are {list(names)}")
-    return [list(names).index(n) for n in fit]
-
-
-def fitted_rotations(
-    rotations: SequenceOf[tuple[int, int, int]], channels: list[int]
-) -> tuple[tuple[int, int, int], ...]:
-    """Places among the fitted ``channels`` of rotation vectors; raises ValueError where one is fitted in part."""
-    groups = []
-    for triple in rotations:
-        fitted = [channels.index(c) for c in triple if c in channels]
-        if len(fitted) not in (0, 3):
-            raise ValueError("fit: an orientation's three numbers are fitted together or not at all; name all three")
-        if fitted:
-            groups.append((fitted[0], fitted[1], fitted[2]))
-    return tuple(groups)
-
-
-def check_seen(names: SequenceOf[str], seen: BoolArray) -> None:
-    """Raise ValueError for a fitted channel without any sample; seen (C,)."""
-    for name in np.array(names)[~seen]:
-        raise ValueError(f"trajectories: the fitted channel {str(name)!r} has no sample at all; leave it out of `fit`")
-
-
 @dataclass(frozen=True)
 class Linearisation:
     """residual (W, L, C) = measured - predicted; jacobian (W, L, C, N + D) of the prediction; valid: all simulated."""
@@ -108,6 +78,8 @@ class Windows:
     Raises:
         ValueError: for logs that do not fit the simulator or the settings.
     """
+
+    _masked = 0
 
     def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
@@ -186,6 +158,23 @@ class Windows:
             self._subset = self.part(np.flatnonzero(within % 2 == 0))
         self._subset.rollouts, self._subset.budget = self.rollouts, self.budget
         return self._subset
+
+    def mask(self, samples: IntArray) -> None:
+        """Leave out samples (k, 3), each by log, number in it and channel of the model, with all left out before.
+
+        Starts stay where they are, and parts that were taken of the windows before as they are.
+        """
+        length, fresh = self.observed.shape[1], samples[self._masked :]
+        if not len(fresh):
+            return
+        for log, sample, channel in fresh.tolist():
+            place = sample - self.start
+            own = np.flatnonzero((self.log == log) & (place >= 0) & (place < length))
+            self.observed[own, place[own], self.channels.index(channel)] = False
+        for name in ("spread", "rounding"):
+            vars(self).pop(name, None)
+        self._subset, self._masked = None, len(samples)
+        self.sequences = sequences(self.observed, self.start[:, None] + np.arange(length), self.log, self.dt)
 
     def beginnings(self, steps: int) -> Windows:
         """The first control ``steps`` of every window; the windows themselves where none is longer.

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
@@ -107,9 +107,12 @@ class Laplace(Estimator[LaplaceState]):
 
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
         """A step of the search, or, where it has ended, one more batch of draws."""
-        if state.draws is not None:
-            return self._drawn(self.windows(trajectories), state, state.draws)
         windows = self.bound(trajectories)
+        if state.draws is not None:
+            assert isinstance(windows, Windows)
+            assert isinstance(state.search, WindowState)
+            windows.mask(state.search.wild)
+            return self._drawn(windows, state, state.draws)
         strategy = self._strategy(windows)
         if state.search.done:
             assert isinstance(strategy, StateSpaceSearch)
@@ -224,6 +227,10 @@ class Laplace(Estimator[LaplaceState]):
                     self.find(Code.NOT_THE_NORMAL, k=one.pareto_k, effective=one.effective, draws=one.draws)
             if state.done and len(state.judgements) < len(kept):
                 self.find(Code.NOT_JUDGED)
+        if isinstance(state.search, WindowState) and len(state.search.wild):
+            wild = state.search.wild
+            channels = ", ".join(self.simulator.environment.channels[c] for c in np.unique(wild[:, 2]))
+            self.find(Code.WILD_SAMPLES, count=len(wild), channels=channels, logs=len(np.unique(wild[:, 0])))
         for optimum in kept:
             if isinstance(optimum, WindowOptimum) and optimum.finding is not None:
                 self.findings.add(optimum.finding)
@@ -242,6 +249,12 @@ class Laplace(Estimator[LaplaceState]):
         ends = np.cumsum(length + 1)
         sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
         return np.asarray(kept[0].states[(ends - length - 1)[:, None] + sample])
+
+    @property
+    def wild(self) -> IntArray:
+        """Samples (k, 3) that ``fit`` left out, by log, number in it and channel; see ``likelihood.wild_samples``."""
+        search = None if self.state is None else self.state.search
+        return search.wild if isinstance(search, WindowState) else np.zeros((0, 3), np.int64)
 
     def fitted_starts(self, theta: FloatArray) -> FloatArray | None:
         """Starts (W, D) of the windows of ``fit`` as the best optimum has them at theta (N,); of a chain None."""

@@ -74,6 +74,7 @@ from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, Win
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 _ROUGH = (Phase.WHOLE, Phase.ROUGH)
@@ -121,6 +122,7 @@ class WindowSearch:
 
     def step(self, state: WindowState) -> WindowState:
         """One linearisation and one accepted step; what it does is the phase's."""
+        self.windows.mask(state.wild)
         phases: dict[Phase, Callable[[WindowState], WindowState]] = {
             Phase.GROW: self._grow,
             Phase.SUBSET: self._subset,
@@ -219,6 +221,11 @@ class WindowSearch:
         return self._with_present_noise(state, *self._linearise(state.here))
 
     def _with_present_noise(self, state: WindowState, lin: Linearisation, stale: bool, drift: float) -> WindowState:
+        if not state.optima and len(wild := wild_residuals(self.windows, lin.residual)):
+            state = replace(state, wild=np.concatenate([state.wild, wild]))
+            self.windows.mask(state.wild)
+            seen = self.windows.observed
+            lin = replace(lin, residual=lin.residual * seen, jacobian=lin.jacobian * seen[..., None])
         noise, moments = present_noise(self.windows, lin.residual), self.windows.moments(lin, white=True)
         step, converged = self._stepped(state, lin, moments, noise, stale, drift)
         last = step.after.iteration >= self._tuning.windows.most_steps // 2

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.strategy import Optimum, StrategyState
@@ -135,12 +135,14 @@ class WindowState(StrategyState[Position]):
     Args:
         estimates: (N,) each, of groups of windows that were fitted apart.
         aside: the optima as they were recorded, while these are.
+        wild: (k, 3), samples that are left out; see ``likelihood.wild_samples``.
     """
 
     here: Position
     optima: tuple[WindowOptimum, ...] = ()
     estimates: tuple[FloatArray, ...] = ()
     aside: tuple[WindowOptimum, ...] = ()
+    wild: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
     @property
     def known(self) -> bool:

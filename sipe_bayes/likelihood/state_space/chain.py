@@ -34,9 +34,9 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
-from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
+from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace, check_seen, fitted_rotations
 from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, with_history
-from sipe_bayes.likelihood.windows import check_seen, chosen_channels, fitted_rotations
+from sipe_bayes.likelihood.windows import chosen_channels
 from sipe_bayes.simulation.simulator import Simulator
 
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known, beyond rounding: position, velocity, activation

@@ -25,7 +25,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.inference.laplace.state_space.options import NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import border
 from sipe_bayes.likelihood.minimise import damped_box_step
-from sipe_bayes.likelihood.noise_level import NORMAL_MAD
+from sipe_bayes.likelihood.noise import NORMAL_MAD
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted

@@ -1,0 +1,107 @@
+"""Wild samples are left out, of a log and of a fit, which is then as good as without; motions and noise lose none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code
+from sipe_bayes.core.rotations import aligned, product, quaternions
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.wild_samples import jumps, wild_positions, wild_residuals
+from sipe_bayes.likelihood.windows import Windows
+from tests.problems import pendulums
+
+TIME = np.arange(0, 5, 0.005)
+SWING = 0.2 * np.sin(3 * TIME) + 0.05 * np.sin(11 * TIME)
+
+
+def test_what_came_round_and_wild_samples_are_found() -> None:
+    counts = np.round(SWING / 5e-6)
+    wrapped = (counts + 2**15) % 2**16 - 2**15  # sixteen bits
+    beyond = np.flatnonzero(np.diff(wrapped - counts) != 0)
+    assert len(beyond) > 1
+    assert jumps(wrapped).tolist() == beyond.tolist()
+    wild = SWING.copy()
+    wild[300] += 1.0
+    assert jumps(wild).tolist() == [299, 300]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        SWING,
+        SWING + np.random.default_rng(0).normal(0, 0.01, len(SWING)),
+        np.round(SWING / 0.01) * 0.01,  # a coarse encoder
+        np.where(TIME < 4, 0.0, np.sin(40 * (TIME - 4))),  # at rest, then fast
+        np.abs(np.sin(7 * TIME)),  # bounces
+        np.zeros(1000),
+        np.zeros(3),
+    ],
+)
+def test_motions_are_none(values: FloatArray) -> None:
+    assert not len(jumps(values))
+    assert not wild_positions(values).any()
+
+
+@pytest.mark.parametrize("length", [1, 2, 15])
+def test_what_jumps_away_and_comes_back_is_wild(length: int) -> None:
+    values, planted = SWING + np.random.default_rng(1).normal(0, 1e-3, len(SWING)), np.zeros(len(SWING), bool)
+    for start, size in ((0, 0.3), (100, 5.0), (300, -0.3), (640, 0.4), (len(SWING) - length, -0.3)):
+        planted[start : start + length] = length < 4 or 0 < start < 640  # long ones at an end have no way home
+        values[start : start + length] += size * planted[start]
+    values[50] = np.nan
+    np.testing.assert_array_equal(wild_positions(values), planted)
+
+
+def test_flips_of_a_body_are_wild_and_signs_are_not() -> None:
+    rng, turn = np.random.default_rng(2), np.stack([SWING, 2 * SWING, 5 * TIME], axis=1)
+    seen = quaternions(turn + rng.normal(0, 0.01, turn.shape)) * rng.choice([-1.0, 1.0], (len(turn), 1))
+    assert not wild_positions(aligned(seen)).any()
+    seen[200:210] = product(seen[200:210], quaternions(np.array([[2.0, 0.0, 0.0]])))
+    assert np.flatnonzero(wild_positions(aligned(seen))).tolist() == list(range(200, 210))
+
+
+def test_so_many_are_no_accidents() -> None:
+    values = SWING.copy()
+    values[::10] += 5.0
+    assert not wild_positions(values).any()
+
+
+def test_noise_loses_no_sample() -> None:
+    """White, coloured and of an encoder that is mostly at rest: 4 x 10^5 samples, each lost once in 10^8."""
+    simulator, rng = pendulums.pendulum(), np.random.default_rng(3)
+    windows = Windows(Segments(), simulator, Trajectories.stack(pendulums.log(simulator, [0.6, 0.08], 0, steps=20000)))
+    shape = windows.observed.shape
+    for _ in range(5):
+        white = rng.normal(0, 0.01, shape)
+        assert not len(wild_residuals(windows, white))
+        assert not len(wild_residuals(windows, np.round(white / 0.02) * 0.02))
+        coloured = pendulums.coloured(rng, white.size, 0.01, 0.9).reshape(shape)
+        assert not len(wild_residuals(windows, coloured + 0.05 * np.sin(0.3 * np.arange(shape[1]))[:, None]))
+
+
+@pytest.mark.parametrize(("share", "size"), [(0.005, 0.15), (0.003, 20.0)])
+def test_a_fit_is_as_good_without_wild_samples(share: float, size: float) -> None:
+    """Intervals as wide to 5 %, and where they were to .3 sd: what half a percent of the samples says."""
+    simulator = pendulums.pendulum()
+    clean = pendulums.log(simulator, [0.6, 0.08], 4, steps=2000)
+    rng, wild = np.random.default_rng(5), clean.observations.copy()
+    rows = np.sort(rng.choice(len(wild), round(share * len(wild)), replace=False))
+    wild[rows, 0] += size * rng.choice([-1, 1], len(rows)) * rng.uniform(1, 2, len(rows))
+    fits = {}
+    for name, seen in (("clean", clean.observations), ("wild", wild)):
+        method = Laplace(simulator, restarts=1)
+        fits[name] = method, method.fit(replace(clean, observations=seen))
+    (plain, before), (robust, after) = fits["clean"], fits["wild"]
+    assert not len(plain.wild)
+    assert Code.WILD_SAMPLES not in [item.code for item in plain.findings]
+    assert robust.wild[:, 1].tolist() == rows.tolist()
+    assert [item.code for item in robust.findings] == [Code.WILD_SAMPLES]
+    np.testing.assert_allclose(after.stddev, before.stddev, rtol=0.05)
+    assert ((after.mean - before.mean).abs() < 0.3 * before.stddev).all()
