@@ -21,11 +21,11 @@ from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.run import run
 from sipe_bayes.cli.app import print_calibration
 from sipe_bayes.cli.discover import print_discovery
-from sipe_bayes.cli.progress import Progress
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.diagnostics.result import Calibration
+from sipe_bayes.inference.progress_bar import ProgressBar
 from sipe_bayes.likelihood.windows import Windows
 
 FOLDER = Path(__file__).parent / "simple_pendulum"
@@ -92,13 +92,13 @@ def fresh(run_into: Callable[[Path], Run], name: str) -> Run:
 
 
 def calibrate(folder: Path) -> Calibration:
-    with Progress() as progress:
-        return run(CONFIG, out=folder, progress=progress.update)
+    with ProgressBar() as progress:
+        return run(CONFIG, out=folder, progress=progress)
 
 
 def discover(folder: Path) -> Discovery:
-    with Progress() as progress:
-        return run_discovery(LACKING, out=folder, progress=progress.update)
+    with ProgressBar() as progress:
+        return run_discovery(LACKING, out=folder, progress=progress)
 
 
 def save_picture(found: Discovery) -> Path:

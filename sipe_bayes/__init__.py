@@ -9,7 +9,10 @@ import sys
 from functools import cache
 from typing import TYPE_CHECKING
 
+from sipe_bayes.core import VIEWS
 from sipe_bayes.core import __version__ as __version__
+
+VIEWS.update(posterior="sipe_bayes.report.posterior_plots", calibration="sipe_bayes.report.page")
 
 if TYPE_CHECKING:
     from sipe_bayes.calibration.config import load_config as load_config
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from sipe_bayes.envs.mjcf import MjcfEnvironment as MjcfEnvironment
     from sipe_bayes.envs.registry import make_task as make_task
     from sipe_bayes.inference import get_estimator as get_estimator
+    from sipe_bayes.inference.progress_bar import ProgressBar as ProgressBar
     from sipe_bayes.inference.recalibrated import Recalibrated as Recalibrated
     from sipe_bayes.likelihood.settings import Segments as Segments
     from sipe_bayes.likelihood.settings import StateSpace as StateSpace

@@ -1,19 +1,23 @@
-"""What it took: ``runs.json``, each run in a folder of results, and what its records and runs come to."""
+"""What it took: ``runs.json``, each run in a folder of results, and what its records and runs come to.
+
+How each estimate went, look by look, stands in ``looks.csv`` and in a TensorBoard log.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from sipe_bayes.benchmark.records import Record
+from sipe_bayes.benchmark.records import Look, Record
 from sipe_bayes.core.files import OutputError, to_json, write_text
+from sipe_bayes.rl.train import write_table
 
-RUNS = "runs.json"
+RUNS, LOOKS = "runs.json", "looks.csv"
 _OTHER_COMMANDS = {"simulate": "sipe simulate", "transfer": "sipe transfer"}
 
 
@@ -117,6 +121,31 @@ def read_runs(folder: Path) -> list[Run]:
 def write_runs(folder: Path, runs: Sequence[Run]) -> None:
     """Keep what each run took."""
     write_text(folder / RUNS, to_json({"runs": [asdict(run) for run in runs]}, indent=0) + "\n")
+
+
+def write_looks(folder: Path) -> tuple[Path, Path]:
+    """Write how each estimate of a folder of results went, over its rollouts.
+
+    Returns:
+        looks.csv, a row for each look of each cell, and the folder of the TensorBoard logs, one for each cell.
+    """
+    from torch.utils.tensorboard import SummaryWriter
+
+    table, logs = folder / LOOKS, folder / "tensorboard"
+    of_cell = ("id", "task", "estimator", "setting", "variant", "seed")
+    of_look = [field.name for field in fields(Look)]
+    records = [record for record in Record.every(folder) if record.done]
+    rows = [[getattr(r, name) for name in of_cell] + list(astuple(look)) for r in records for look in r.history]
+    write_table(table, [*of_cell, *of_look], rows)
+    for record in records:
+        own = logs / record.id.replace("/", "__")
+        if not own.is_dir():
+            with SummaryWriter(own) as writer:
+                for look in record.history:
+                    for name in of_look[1:]:
+                        if (value := getattr(look, name)) is not None:
+                            writer.add_scalar(f"{record.task} {record.variant}/{name}", value, look.rollouts)
+    return table, logs
 
 
 def by_suite(runs: Iterable[Run]) -> dict[str, Usage]:

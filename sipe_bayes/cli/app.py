@@ -22,8 +22,8 @@ from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.errors import check_least, exit_on_error
 from sipe_bayes.cli.examples import give_examples
-from sipe_bayes.cli.progress import Progress
 from sipe_bayes.core import __version__
+from sipe_bayes.inference.progress_bar import ProgressBar
 from sipe_bayes.inference.registry import ESTIMATORS
 
 if TYPE_CHECKING:
@@ -100,14 +100,14 @@ def calibrate(
     from sipe_bayes.calibration.run import run
     from sipe_bayes.core.files import to_json
 
-    with exit_on_error("; the same command goes on"), Progress(quiet=as_json) as progress:
+    with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        calibration = run(config, estimator, seed, budget, out, threads, progress.update)
+        calibration = run(config, estimator, seed, budget, out, threads, progress)
         discovery = None
         if discover:
             folder = Path(calibration.out) / "discover"
-            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=progress.update)
+            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=progress)
     if as_json:
         print(to_json(calibration.to_dict() | ({} if discovery is None else {"discovery": discovery.to_dict()})))
         return

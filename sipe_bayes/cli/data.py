@@ -147,7 +147,7 @@ def demonstrate(
 
     A plan (Door, Relocate) is searched for minutes. It is kept beside OUT, and the same command goes on with it.
     """
-    from sipe_bayes.cli.progress import Progress
+    from sipe_bayes.inference.progress_bar import ProgressBar
     from sipe_bayes.rl.demonstrate import make
 
     with exit_on_error():
@@ -155,8 +155,8 @@ def demonstrate(
         check_least(0, seed=seed)
         if out.suffix != ".npz":
             raise ValueError(f"--out {out}: expected a name that ends in .npz; call it {out.stem}.npz")
-        with Progress(unit="iterations") as progress:
-            facts = make(task, count, seed, out, command_line(), threads, progress.update)
+        with ProgressBar(unit="iterations") as progress:
+            facts = make(task, count, seed, out, command_line(), threads, progress)
     print(f"{count} of {facts.attempts} attempts kept, mean return {facts.return_mean:.1f}: {out}")
 
 

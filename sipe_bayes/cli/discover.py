@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sipe_bayes.cli.errors import check_least, exit_on_error
-from sipe_bayes.cli.progress import Progress
+from sipe_bayes.inference.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
     from sipe_bayes.diagnostics.discovery import Discovery
@@ -33,10 +33,10 @@ def discover(
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.core.files import to_json
 
-    with exit_on_error("; the same command goes on"), Progress(quiet=as_json) as progress:
+    with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, progress.update)
+        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, progress)
     if as_json:
         print(to_json(discovery.to_dict()))
     else:

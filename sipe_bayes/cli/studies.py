@@ -73,8 +73,11 @@ def chosen(
 def measure(study: Study, cells: Sequence[Cell], out: Path, start: Callable[[], Executor], retry_failed: bool) -> None:
     """Measure a study's cells by the executor that ``start`` makes; exit code 1 where cells failed."""
     from sipe_bayes.benchmark.run import Order, run
+    from sipe_bayes.benchmark.run_log import write_looks
 
     failed = run(cells, Order(out, start, command_line(), retry_failed, say), study.kind)
+    table, logs = write_looks(out)
+    say(f"how the estimates went: {table}; tensorboard --logdir {logs}")
     if failed:
         print(
             f"sipe: {failed} {study.unit}{'s' * (failed > 1)} failed; `sipe {study.name} status {out}` shows why; "

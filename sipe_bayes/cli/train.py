@@ -73,8 +73,8 @@ def train(
     with exit_on_error():
         import torch
 
-        from sipe_bayes.cli.progress import Progress
         from sipe_bayes.core.trajectory import Trajectories
+        from sipe_bayes.inference.progress_bar import ProgressBar
         from sipe_bayes.rl.randomization import load_randomization
         from sipe_bayes.rl.train import train as run
 
@@ -84,7 +84,8 @@ def train(
         chosen = Settings.of({**settings, "hidden": _sizes(settings["hidden"])}, "train")
         shown = None if demonstrations is None else Trajectories.load(demonstrations)
         drawn = None if randomization is None else load_randomization(randomization)
-        with Progress(unit="steps") as progress:
+        print(f"how it goes: {folder / 'curve.csv'}; tensorboard --logdir {folder / 'tensorboard'}", flush=True)
+        with ProgressBar(unit="steps") as progress:
             run(
                 *(task, steps, seed, folder, chosen),
                 resume=resume,
@@ -95,7 +96,7 @@ def train(
                 checkpoint_every=checkpoint_every,
                 threads=threads,
                 device=device or ("cuda" if torch.cuda.is_available() else "cpu"),
-                report=progress.update,
+                report=progress,
             )
         for name, card in _write_cards(folder, task, seed, steps, chosen, episodes, demonstrations).items():
             print(f"{name}: {_earned(card)}, {folder / name}.safetensors")

@@ -1,11 +1,34 @@
-"""A table as HTML: how posteriors, spaces, logs, simulators and calibrations show themselves in a notebook."""
+"""Tables and pages as HTML: how posteriors, spaces, logs, simulators and calibrations show themselves in a notebook."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
+from pathlib import Path
+
+from sipe_bayes.core.files import write_text
 
 _SHOWN = 50  # rows, after which the others are counted
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole HTML page, which a notebook shows in a frame.
+
+    Args:
+        html: its text.
+    """
+
+    html: str
+
+    def _repr_html_(self) -> str:
+        return f'<iframe srcdoc="{escape(self.html)}" style="width: 100%; height: 800px; border: 0"></iframe>'
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it, whole or not at all."""
+        write_text(Path(path), self.html)
 
 
 def html_table(

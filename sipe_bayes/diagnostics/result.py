@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
+from sipe_bayes.core import view
 from sipe_bayes.core.findings import Code, Finding, Findings
-from sipe_bayes.core.html import html_table
+from sipe_bayes.core.html import Page, html_table
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
     ChannelNoise,
@@ -135,6 +136,11 @@ class Calibration:
         ]
         headings = ("parameter", "value", "90 % interval", "unit", "flags")
         return html_table(f"{self.name}, {self.estimator}", headings, rows, [*errors, *self.warnings])
+
+    def report(self) -> Page:
+        """The page that `sipe calibrate` writes as report.html, without its moving picture; a notebook shows it."""
+        page: Page = view("calibration").page(self)
+        return page
 
     @property
     def warnings(self) -> list[str]:

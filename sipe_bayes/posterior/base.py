@@ -19,6 +19,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.html import html_table
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import at_least, whole
+from sipe_bayes.posterior.drawn import Drawn
 from sipe_bayes.posterior.storage import Header, draws_by_name, write_pair
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ class DrawsFamily(Protocol):
         ...
 
 
-class Posterior(TorchDistribution):
+class Posterior(Drawn, TorchDistribution):
     """A distribution over theta (N,) in the unit cube, with the ``space`` of its N parameters.
 
     Everything is float64. ``mean``, ``stddev``, ``variance`` (N,), ``covariance`` (N, N) and ``mode`` (N,)

@@ -128,14 +128,21 @@ def equal_parts(rows: Sequence[T], size: int) -> list[Sequence[T]]:
     return [rows[len(rows) * k // count : len(rows) * (k + 1) // count] for k in range(count)]
 
 
-def new_figure(height: float, width: float = STYLE.width) -> Figure:
+class Drawing(Figure):
+    """A figure that a notebook shows, without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        return png(self)
+
+
+def new_figure(height: float, width: float = STYLE.width) -> Drawing:
     """An empty figure on white, laid out by constraints.
 
     Args:
         height: inches.
         width: inches.
     """
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    return Drawing(figsize=(width, height), layout="constrained", facecolor="white")
 
 
 def panel_grid(count: int, row: float, margin: float) -> tuple[Figure, list[Axes], int]:

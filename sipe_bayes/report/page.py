@@ -20,6 +20,7 @@ import numpy as np
 from sipe_bayes.core.files import write_bytes
 from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
+from sipe_bayes.core.html import Page
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing, improvement
@@ -238,6 +239,11 @@ def render(calibration: Calibration, images: Sequence[Picture], clip: Clip | Non
     return template.render(**_context(calibration, images, clip))
 
 
+def page(calibration: Calibration) -> Page:
+    """The page, with its figures inside."""
+    return Page(render(calibration, pictures(calibration)))
+
+
 def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) -> None:
     """Write them into ``figures``."""
     figures = Path(folder) / "figures"
@@ -261,7 +267,7 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], clip:
     return write_page(render(calibration, images, clip), images, folder)
 
 
-def write_page(page: str, images: Sequence[Picture], folder: str | os.PathLike[str]) -> Path:
+def write_page(text: str, images: Sequence[Picture], folder: str | os.PathLike[str]) -> Path:
     """Write the pictures of a page, then the page as ``report.html``.
 
     Returns:
@@ -269,5 +275,5 @@ def write_page(page: str, images: Sequence[Picture], folder: str | os.PathLike[s
     """
     write_pictures(images, folder)
     path = Path(folder) / "report.html"
-    write_bytes(path, page.encode())
+    write_bytes(path, text.encode())
     return path

@@ -50,6 +50,26 @@ def test_searches_have_a_history(tmp_path: Path) -> None:
     assert looked_at.files[0] == alone.files[0]
 
 
+def test_looks_are_written_as_csv_and_for_tensorboard(undisturbed: Path, tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    looks = (Look(10, 0.5, 0.25), Look(20, 0.75, None))
+    records = [replace(record, history=list(looks[: k + 1])) for k, record in enumerate(Record.all_in(undisturbed)[:2])]
+    for record in records:
+        record.write(tmp_path)
+    for _ in range(2):
+        table, logs = run_log.write_looks(tmp_path)
+    head, *rows = (line.split(",") for line in table.read_text().splitlines())
+    assert head[-3:] == ["rollouts", "mean_accuracy", "mean_crps"]
+    assert [row[0] for row in rows] == [records[0].id, records[1].id, records[1].id]
+    assert [row[-3:] for row in rows] == [["10", "0.5", "0.25"], ["10", "0.5", "0.25"], ["20", "0.75", ""]]
+    (second,) = (path for path in logs.iterdir() if path.name == records[1].id.replace("/", "__"))
+    events = EventAccumulator(str(second))
+    events.Reload()
+    named = [tag for tag in events.Tags()["scalars"] if tag.endswith("/mean_accuracy")]
+    assert [(e.step, e.value) for e in events.Scalars(named[0])] == [(10, 0.5), (20, 0.75)]
+
+
 def _without_looks(cell: Cell, folder: Path) -> Any:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(measure, "SHARES", measure.Shares(looks=()))
@@ -70,7 +90,12 @@ def test_estimate_is_that_of_fit(undisturbed: Path) -> None:
 def test_finished_cells_never_run_again(undisturbed: Path) -> None:
     before = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in (undisturbed / "records").iterdir()}
     found = measured(undisturbed, *PENDULUM)
-    assert found.output == "6 cells, 6 of them there already\n"
+    there, looks = found.output.splitlines()
+    assert there == "6 cells, 6 of them there already"
+    assert (
+        looks
+        == f"how the estimates went: {undisturbed / 'looks.csv'}; tensorboard --logdir {undisturbed / 'tensorboard'}"
+    )
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in (undisturbed / "records").iterdir()} == before
 
 
@@ -200,7 +225,7 @@ def test_new_estimator_takes_one_line_and_failures_are_recorded(tmp_path: Path) 
         "failed: Pendulum/middle/direct/in_distribution/seed1: ArithmeticError: no middle" in summary(tmp_path).lines()
     )
     before = measured(tmp_path, *chosen)
-    assert (before.exit_code, before.stdout) == (1, "3 cells, 3 of them there already, 1 failed\n")
+    assert (before.exit_code, before.stdout.splitlines()[0]) == (1, "3 cells, 3 of them there already, 1 failed")
     again = measured(tmp_path, *chosen, "--retry-failed")
     assert (again.exit_code, again.stdout.splitlines()[0]) == (1, "3 cells, 2 of them there already")
     assert "--retry-failed" in again.stderr

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from sipe_bayes.core.html import html_table
@@ -56,3 +58,14 @@ def test_calibration() -> None:
     assert [row[0] for row in cells(html)] == ["mass", HOSTILE, "drag"]
     assert "<script" not in html
     np.testing.assert_allclose([float(row[1]) for row in cells(html)], [p.mode for p in calibration.parameters], 1e-3)
+
+
+def test_a_calibration_gives_its_report(tmp_path: Path) -> None:
+    calibration = make_calibration(names=(HOSTILE, "drag"))
+    page = calibration.report()
+    page.save(tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == page.html
+    frame = page._repr_html_()
+    assert frame.startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+    assert frame.count("<") == 2
+    assert "drag" in frame

@@ -42,6 +42,15 @@ def test_shows_its_medians_in_a_notebook(posterior: Posterior) -> None:
     np.testing.assert_allclose([float(row[1]) for row in rows], medians, rtol=1e-3, atol=1e-12)
 
 
+def test_draws_its_own_figure() -> None:
+    posterior = example("GaussianMixture", 2)
+    for figure, panels in ((posterior.plot(), 2), (posterior.plot(truth=[0.2, 0.5], pairs=True), 4)):
+        assert len([ax for ax in figure.axes if ax.lines or ax.collections]) >= panels
+        assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="expected 2 parameters"):
+        posterior.plot(truth=[0.2])
+
+
 def test_density_integrates_to_one(posterior: Posterior) -> None:
     if not posterior.has_density:
         with pytest.raises(NoDensityError, match="smoothed"):

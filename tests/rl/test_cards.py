@@ -84,6 +84,8 @@ def test_commands_train_write_cards_and_check_them(tmp_path: Path) -> None:
     arguments = ["train", "FetchPush", "--steps", "100", "--episodes", "3", "--out", str(out), "--clip-targets", *short]
     done = runner.invoke(app, arguments)
     assert done.exit_code == 0, done.output
+    assert f"how it goes: {out / 'curve.csv'}; tensorboard --logdir {out / 'tensorboard'}" in done.output
+    assert (out / "curve.csv").read_text().startswith("step,return_mean,")
     assert "expert: return" in done.output
     card = json.loads((out / "suboptimal.json").read_text())
     assert card["deviations"] == {"batch": 8, "start_steps": 60, "clip_targets": True}
