@@ -1,12 +1,13 @@
-"""Do the intervals of four simulated machines hold the truth, and does every fit end? Truths and logs by seed.
+"""Do the intervals of five simulated machines hold the truth, and does every fit end? Truths and logs by seed.
 
     python examples/studies/shapes.py                           # 40 seeds of each machine: hours
     python examples/studies/shapes.py --machine drive --seeds 5
 
-A servo with its own controller, a linear drive, a two-link arm and a free double pendulum (`examples/servo`, `drive`,
-`arm`, `double_pendulum`): each seed draws another truth within the bounds and simulates other logs, which are fitted as
-the configuration says, with the default budget. Fits are kept one by one in runs/, so that an interrupted study goes
-on; the summary goes to results/. Coverage is that of the 90 % intervals, pooled over parameters.
+A servo with its own controller, a linear drive, a two-link arm, a free double pendulum and a four-legged machine with
+an inertial unit (`examples/servo`, `drive`, `arm`, `double_pendulum`, `quadruped`): each seed draws another truth
+within the bounds and simulates other logs, which are fitted as the configuration says, with the default budget. Fits
+are kept one by one in runs/, so that an interrupted study goes on; the summaries go to results/. Coverage is that of
+the 90 % intervals, pooled over parameters.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from sipe_bayes.calibration.problem import method_of, prepare
 from sipe_bayes.core.files import write_text
 
 HERE = Path(__file__).parent
-MACHINES = ("servo", "drive", "arm", "double_pendulum")
+MACHINES = ("servo", "drive", "arm", "double_pendulum", "quadruped")
 
 
 def one_fit(machine: str, seed: int) -> dict[str, Any]:
@@ -94,7 +95,8 @@ def main() -> None:
                 print(json.dumps(rows[-1]), flush=True)
     results = summary(rows)
     print(json.dumps(results, indent=2))
-    write_text(HERE / "results" / "shapes.json", json.dumps(results, indent=2) + "\n")
+    for machine, result in results.items():
+        write_text(HERE / "results" / "shapes" / f"{machine}.json", json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

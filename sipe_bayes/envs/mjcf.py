@@ -37,7 +37,7 @@ from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of, moving_on
 from sipe_bayes.envs.laws.firmware import firmware_of, supplies_of
 from sipe_bayes.envs.laws.registry import LAW_OF
-from sipe_bayes.envs.poses import PoseReading, pose_columns, pose_readings
+from sipe_bayes.envs.poses import PoseReading, felt_sd, pose_columns, pose_readings
 from sipe_bayes.envs.sensing import Sensing, sensed_channels
 from sipe_bayes.envs.target import Target, TargetError, named
 from sipe_bayes.envs.targets import bind, split
@@ -259,7 +259,7 @@ class MjcfEnvironment(Environment):
 
     def start_sd(self, model: mujoco.MjModel) -> FloatArray:
         """What the model says of its internal states, and else any state's."""
-        return start_sd(model, super().start_sd(model))
+        return start_sd(model, felt_sd(model, self.poses, super().start_sd(model)))
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Two physics steps of a delay, as far as they lie in the cube."""

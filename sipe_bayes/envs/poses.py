@@ -13,7 +13,7 @@ from sipe_bayes.core import rotations
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.envs.channels import Reader
 
-Quantity = Literal["position", "orientation", "linear_velocity", "angular_velocity"]
+Quantity = Literal["position", "orientation", "linear_velocity", "angular_velocity", "acceleration"]
 
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _QUANTITIES: dict[int, Quantity] = {
@@ -25,8 +25,15 @@ _QUANTITIES: dict[int, Quantity] = {
     int(mujoco.mjtSensor.mjSENS_FRAMEANGVEL): "angular_velocity",
     int(mujoco.mjtSensor.mjSENS_GYRO): "angular_velocity",
     int(mujoco.mjtSensor.mjSENS_BALLANGVEL): "angular_velocity",
+    int(mujoco.mjtSensor.mjSENS_ACCELEROMETER): "acceleration",
 }
-_OWN_AXES = (int(mujoco.mjtSensor.mjSENS_VELOCIMETER), int(mujoco.mjtSensor.mjSENS_GYRO))
+_OWN_AXES = (
+    int(mujoco.mjtSensor.mjSENS_VELOCIMETER),
+    int(mujoco.mjtSensor.mjSENS_GYRO),
+    int(mujoco.mjtSensor.mjSENS_ACCELEROMETER),
+)
+_FELT_POSE_SD = 0.1  # m and rad, what gravity and resting on the ground leave of a pose's error
+_FELT_VELOCITY_SD = 1.0  # m/s and rad/s
 _OF_BALLS = (int(mujoco.mjtSensor.mjSENS_BALLQUAT), int(mujoco.mjtSensor.mjSENS_BALLANGVEL))
 
 
@@ -61,6 +68,27 @@ class PoseReading:
 def has_pose(model: mujoco.MjModel, joint: int) -> bool:
     """Whether a joint is free or a ball, so that it has an orientation."""
     return int(model.jnt_type[joint]) in (_FREE, _BALL)
+
+
+def inertial_joints(model: mujoco.MjModel, readings: Sequence[PoseReading]) -> tuple[int, ...]:
+    """Free joints whose body has an accelerometer, and no measured orientation or position."""
+    told = {(r.joint, r.quantity) for r in readings}
+    joints = dict.fromkeys(r.joint for r in readings if r.quantity == "acceleration")
+    placed = {joint for joint, quantity in told if quantity in ("position", "orientation")}
+    return tuple(j for j in joints if j not in placed and int(model.jnt_type[j]) == _FREE)
+
+
+def felt_sd(model: mujoco.MjModel, readings: Sequence[PoseReading], wide: FloatArray) -> FloatArray:
+    """Prior sds (2 nv + na,) of a start: ``wide``, but closer of free joints that only inertial sensors tell of.
+
+    Their yaw and place in the plane nothing tells; a prior that leaves them open would leave the equations singular.
+    """
+    sd = wide.copy()
+    for joint in inertial_joints(model, readings):
+        first = int(model.jnt_dofadr[joint])
+        sd[first : first + 6] = _FELT_POSE_SD
+        sd[model.nv + first : model.nv + first + 6] = _FELT_VELOCITY_SD
+    return sd
 
 
 def pose_readings(model: mujoco.MjModel, readers: Sequence[Reader]) -> tuple[PoseReading, ...]:

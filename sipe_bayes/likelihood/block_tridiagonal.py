@@ -150,7 +150,8 @@ class Border:
 
 def inverse(precision: FloatArray) -> tuple[FloatArray, float]:
     """Covariance (N, N), positive definite also where rounding leaves a precision that is not, and log|precision|."""
-    sd = 1 / np.sqrt(np.diag(precision))
+    diagonal = np.diag(precision)
+    sd = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * np.abs(diagonal).max()))
     eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)
     kept = np.maximum(eigenvalues, 1e-12)  # what rounding leaves of an open direction
     return sd[:, None] * ((axes / kept) @ axes.T) * sd, float(np.log(kept).sum() - 2 * np.log(sd).sum())

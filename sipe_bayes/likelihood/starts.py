@@ -15,7 +15,8 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.states import joints_at_rest
-from sipe_bayes.envs.poses import PoseReading, has_pose
+from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints
+from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -55,6 +56,8 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
     for joint in dict.fromkeys(reading.joint for reading in readings):
         readings_of = [r for r in readings if r.joint == joint and _seen(trajectory, r)]
         _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
+    for joint in inertial_joints(model, readings):
+        _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
     return states
 
 
@@ -114,6 +117,21 @@ def _put_pose(
         states[:, motion : motion + 3] = velocity - turned(turn, arm)
 
 
+def _put_felt(
+    simulator: Simulator, readings: dict[str, PoseReading], trajectory: Trajectory, states: FloatArray
+) -> None:
+    """Write where an accelerometer, and perhaps a gyro, say that a free body is into states (T+1, S)."""
+    model, joint = simulator.model, readings["acceleration"].joint
+    strength = float(np.linalg.norm(model.opt.gravity))
+    if not strength or not all(_seen(trajectory, reading) for reading in readings.values()):
+        return
+    felt = {name: turned(r.turn, _values(trajectory, r, raw=True)) for name, r in readings.items() if r.own_axes}
+    spin, place = felt.get("angular_velocity"), 1 + int(model.jnt_qposadr[joint])
+    up = -model.opt.gravity / strength
+    states[:, place + 3 : place + 7] = orientations(felt["acceleration"], spin, trajectory.dt, up)
+    states[:] = carried(simulator, joint, trajectory, states, None if spin is None else smoothed(spin, trajectory.dt))
+
+
 def _values(trajectory: Trajectory, reading: PoseReading, raw: bool) -> FloatArray:
     """The three channels (T+1, 3), missing samples bridged, smoothed unless ``raw``."""
     columns = []
@@ -154,7 +172,7 @@ def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[
     seen = np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
     columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
     known_poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
-    missing, resting = [], joints_at_rest(model)
+    missing, resting = [], {*joints_at_rest(model), *inertial_joints(model, environment.poses)}
     for joint in (joint for joint in range(model.njnt) if joint not in resting):
         if has_pose(model, joint):
             known = (joint, "orientation") in known_poses

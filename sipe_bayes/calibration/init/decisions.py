@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sipe_bayes.calibration.init.draft import Draft, Reading
+from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
 from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.machine import Drive, Machine
 from sipe_bayes.calibration.init.names import Kind
@@ -29,20 +29,23 @@ _FITTED = 4  # combinations that are fitted where the nominal model does not dec
 _FIRST_DELAYS = (0, 1, 2, 4)
 
 
+Answer = Scale | int
+
+
 @dataclass(frozen=True)
 class Question:
     """What is open: the unit of some readings, or the sign of one.
 
     Args:
         readings: places in ``Draft.readings``.
-        units: unit words; empty for a sign.
+        units: scales; empty for a sign.
     """
 
     readings: tuple[int, ...]
-    units: tuple[str, ...] = ()
+    units: tuple[Scale, ...] = ()
 
     @property
-    def answers(self) -> tuple[str | int, ...]:
+    def answers(self) -> tuple[Answer, ...]:
         """What may be answered, the likeliest first."""
         return self.units or (1, -1)
 
@@ -111,6 +114,8 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
         return ("rad/s", "deg/s", "rpm") if hinge else ("m/s", "mm/s")
     if kind == Kind.CURRENT:
         return ("A", "mA")
+    if kind == Kind.DUTY:
+        return (reading.unit,)
     if kind == Kind.VOLTAGE or (actuator.drive == Drive.VOLTAGE and kind != Kind.TORQUE):
         return ("V", "mV")
     if kind == Kind.TORQUE or reading.unit != "1":
@@ -120,19 +125,19 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
 
 def questions(draft: Draft, machine: Machine) -> list[Question]:
     """What the names leave open: one unit for alike columns without one, one sign for each scalar."""
-    groups: dict[tuple[str, ...], list[int]] = {}
+    groups: dict[tuple[str, tuple[Scale, ...]], list[int]] = {}
     signs = []
     for k, reading in enumerate(draft.readings):
         scalar = len(reading.match.columns) == 1
         if not _is_tried(draft, reading):
             continue
-        words = unit_words(reading, machine)
-        if not reading.match.label.unit and len(words) > 1 and reading.factor == 1:
+        scales = reading.scales or tuple(Scale(word) for word in unit_words(reading, machine))
+        if not reading.match.label.unit and len(scales) > 1 and (reading.factor == 1 or reading.scales):
             own = "command" if reading.commanded else "measured"
-            groups.setdefault((own, *words), []).append(k)
+            groups.setdefault((own, scales), []).append(k)
         if scalar:
             signs.append(Question((k,)))
-    return [Question(tuple(members), words[1:]) for words, members in groups.items()] + signs
+    return [Question(tuple(members), scales) for (_, scales), members in groups.items()] + signs
 
 
 def _is_tried(draft: Draft, reading: Reading) -> bool:
@@ -150,20 +155,20 @@ def _is_tried(draft: Draft, reading: Reading) -> bool:
 class _Ranking:
     """Answers that were tried (H tuples), the logarithm of what each misses in all channels together (H,)."""
 
-    answers: list[tuple[str | int, ...]]
+    answers: list[tuple[Answer, ...]]
     scores: FloatArray
 
     @property
     def best(self) -> int:
         return int(np.argmin(self.scores))
 
-    def gap(self, question: int, answer: str | int) -> float:
+    def gap(self, question: int, answer: Answer) -> float:
         """By how much the best combination with another answer to a question is worse."""
         other = [s for a, s in zip(self.answers, self.scores, strict=True) if a[question] == answer]
         return float(min(other) - self.scores[self.best]) if other else np.inf
 
 
-def _unlikely(asked: Sequence[Question], answers: Sequence[str | int]) -> float:
+def _unlikely(asked: Sequence[Question], answers: Sequence[Answer]) -> float:
     """A little against turned signs and against units that are not the likeliest: they have to be better by it."""
     return sum(_UNLIKELY for q, a in zip(asked, answers, strict=True) if a != q.answers[0])
 
@@ -198,13 +203,18 @@ def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draf
     )
 
 
+def _turned(sign: Answer) -> int:
+    """The other sign."""
+    return -1 if sign == 1 else 1
+
+
 def _mirrored(asked: Sequence[Question], ranking: _Ranking, readings: Sequence[Reading]) -> list[str]:
     """Signs that may be turned round together."""
     groups: list[frozenset[int]] = []
     for q, question in enumerate(asked):
-        if question.units or ranking.gap(q, -int(ranking.answers[ranking.best][q])) >= _DECIDED:
+        if question.units or ranking.gap(q, _turned(ranking.answers[ranking.best][q])) >= _DECIDED:
             continue
-        other = -int(ranking.answers[ranking.best][q])
+        other = _turned(ranking.answers[ranking.best][q])
         rows = [i for i, a in enumerate(ranking.answers) if a[q] == other]
         nearest = ranking.answers[min(rows, key=lambda i: float(ranking.scores[i]))]
         pairs = zip(nearest, ranking.answers[ranking.best], strict=True)
@@ -217,13 +227,12 @@ def _mirrored(asked: Sequence[Question], ranking: _Ranking, readings: Sequence[R
     return out
 
 
-def _answered(
-    readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[str | int]
-) -> tuple[Reading, ...]:
+def _answered(readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[Answer]) -> tuple[Reading, ...]:
     out = list(readings)
     for question, answer in zip(asked, answers, strict=True):
         for k in question.readings:
-            out[k] = replace(out[k], sign=answer) if isinstance(answer, int) else replace(out[k], unit=answer)
+            now = {"sign": answer} if isinstance(answer, int) else {"unit": answer.unit, "factor": answer.factor}
+            out[k] = replace(out[k], **now)
     return tuple(out)
 
 
@@ -233,8 +242,8 @@ def _ranked(case: Case, asked: Sequence[Question]) -> _Ranking:
     if count <= _MOST:
         combinations = list(itertools.product(*(q.answers for q in asked)))
         return _tried(case, asked, combinations)
-    seen: dict[tuple[str | int, ...], float] = {}
-    now: tuple[str | int, ...] = tuple(q.answers[0] for q in asked)
+    seen: dict[tuple[Answer, ...], float] = {}
+    now: tuple[Answer, ...] = tuple(q.answers[0] for q in asked)
     for _ in range(4):
         around = [now, *_neighbours(now, asked)]
         fresh = [a for a in around if a not in seen]
@@ -246,7 +255,7 @@ def _ranked(case: Case, asked: Sequence[Question]) -> _Ranking:
     return _Ranking(list(seen), np.array(list(seen.values())))
 
 
-def _neighbours(now: tuple[str | int, ...], asked: Sequence[Question]) -> list[tuple[str | int, ...]]:
+def _neighbours(now: tuple[Answer, ...], asked: Sequence[Question]) -> list[tuple[Answer, ...]]:
     """Combinations in which one answer is another, or two signs are turned."""
     out = []
     for q, question in enumerate(asked):
@@ -254,12 +263,12 @@ def _neighbours(now: tuple[str | int, ...], asked: Sequence[Question]) -> list[t
     signs = [q for q, question in enumerate(asked) if not question.units]
     for a, b in itertools.combinations(signs, 2):
         both = list(now)
-        both[a], both[b] = -int(now[a]), -int(now[b])
+        both[a], both[b] = _turned(now[a]), _turned(now[b])
         out.append(tuple(both))
     return out
 
 
-def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[str | int, ...]]) -> _Ranking:
+def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[Answer, ...]]) -> _Ranking:
     sets = [_answered(case.draft.readings, asked, a) for a in answers]
     misses = np.concatenate([case.misses(sets[i : i + 64]) for i in range(0, len(sets), 64)])
     scores = np.log(misses).sum(axis=-1) + np.array([_odd_sizes(case, readings) for readings in sets])
@@ -288,9 +297,9 @@ def _rivals(ranking: _Ranking, channels: int) -> list[int]:
     near = [i for i in order if behind[i] < _CLEAR]
     if all(behind[i] <= _SAME for i in near):
         return []
-    units: dict[tuple[str, ...], int] = {}  # near to rest most machines are linear: every unit gets its chance
+    units: dict[tuple[Scale, ...], int] = {}  # near to rest most machines are linear: every unit gets its chance
     for i in order:
-        units.setdefault(tuple(a for a in ranking.answers[i] if isinstance(a, str)), i)
+        units.setdefault(tuple(a for a in ranking.answers[i] if isinstance(a, Scale)), i)
     return list(dict.fromkeys([*near[:_FITTED], *(i for i in units.values() if behind[i] < _FAR)]))
 
 
@@ -335,11 +344,11 @@ def _with_evidence(
         times = f"{np.exp(ratio.max()):.2g}"
         for k in question.readings:
             note, doubt, instead = "", "", ""
-            if question.units:
+            if isinstance(other, Scale):
                 note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
                 if together < _DECIDED:
                     note, doubt = "", f"{answer} or {other}? simulations follow the log as well with either"
-                    instead = f'unit = "{other}"'
+                    instead = "\n".join(other.keys)
             elif alone < _DECIDED and together < _DECIDED:
                 doubt, instead = "its sign does not show in these logs", f"sign = {other}"
             elif together < _DECIDED:
@@ -353,7 +362,7 @@ def _with_evidence(
                 out[k],
                 notes=(*out[k].notes, *([note] if note else [])),
                 doubts=(*out[k].doubts, *([doubt] if doubt else [])),
-                instead=(*out[k].instead, *([instead] if instead else [])),
+                instead=(*out[k].instead, *instead.splitlines()),
             )
     return out
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import Use
@@ -11,6 +12,21 @@ from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
+
+
+class Scale(NamedTuple):
+    """A unit word, and what a column is multiplied by beside it."""
+
+    unit: str
+    factor: float = 1.0
+
+    def __str__(self) -> str:
+        return self.unit if self.factor == 1 else f"{1 / self.factor:g} counts a {self.unit}"
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its lines in a configuration."""
+        return (f'unit = "{self.unit}"', *([f"factor = {self.factor!r}"] if self.factor != 1 else []))
 
 
 @dataclass(frozen=True)
@@ -24,6 +40,8 @@ class Reading:
         factor: beside the unit.
         wraps: whether jumps by a turn are taken out.
         fit: False for what only starts windows.
+        scales: what it may be besides units of its kind: counts.
+        supply: column of the voltage that a duty is a share of, and its unit.
         notes: the evidence, each a comment.
         doubts: what could not be decided, each a comment and told.
         instead: lines of TOML that are the alternative where something could not be decided.
@@ -35,6 +53,8 @@ class Reading:
     factor: float = 1.0
     wraps: bool = False
     fit: bool = True
+    scales: tuple[Scale, ...] = ()
+    supply: tuple[str, str] | None = None
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     instead: tuple[str, ...] = ()
@@ -59,6 +79,7 @@ class Reading:
         row |= {"sign": self.sign} if self.sign != 1 else {}
         row |= {"factor": self.factor} if self.factor != 1 else {}
         row |= {"wraps": True} if self.wraps else {}
+        row |= {"supply": {"column": self.supply[0], "unit": self.supply[1]}} if self.supply else {}
         return row | ({} if self.fit else {"fit": False})
 
 

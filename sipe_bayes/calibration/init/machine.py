@@ -19,6 +19,13 @@ class Drive(Enum):
     OTHER = "a command"
 
 
+_INPUTS = {
+    int(mujoco.mjtCtrlInput.mjINPUT_POS): Drive.POSITION,
+    int(mujoco.mjtCtrlInput.mjINPUT_VEL): Drive.VELOCITY,
+    int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE): Drive.VOLTAGE,
+}
+
+
 @dataclass(frozen=True)
 class Joint:
     """A hinge or slide and its body; rank: its place among these."""
@@ -72,8 +79,9 @@ class Machine:
 
 
 def _drive(model: mujoco.MjModel, index: int) -> Drive:
-    if int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_DCMOTOR):
-        return Drive.VOLTAGE
+    kind, inputs = int(model.actuator_gaintype[index]), int(model.actuator_ctrlspec[index])
+    if kind in (int(mujoco.mjtGain.mjGAIN_DCMOTOR), int(mujoco.mjtGain.mjGAIN_PID)):
+        return _INPUTS.get(inputs, Drive.OTHER)
     if int(model.actuator_gaintype[index]) != int(mujoco.mjtGain.mjGAIN_FIXED):
         return Drive.OTHER
     if int(model.actuator_biastype[index]) == int(mujoco.mjtBias.mjBIAS_NONE):

@@ -153,12 +153,15 @@ def _by_position(positions: Sequence[Match], velocities: Sequence[Match], table:
     return [replace(velocities[i], target=targets[j]) for j, i in pairs]
 
 
+_FORCE = {Kind.TORQUE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 2.0, Kind.VOLTAGE: 1.8, Kind.DUTY: 1.7, Kind.SETPOINT: 0.3}
+_VOLTS = {Kind.VOLTAGE: 3.0, Kind.DUTY: 2.8, Kind.COMMAND: 2.6, Kind.CURRENT: 0.5, Kind.TORQUE: 0.3, Kind.SETPOINT: 0.2}
+_ANY = {Kind.COMMAND: 3.0, Kind.DUTY: 2.8, Kind.SETPOINT: 2.4, Kind.TORQUE: 2.0, Kind.VOLTAGE: 2.0, Kind.CURRENT: 1.5}
 _FITS: dict[Drive, dict[Kind, float]] = {
-    Drive.FORCE: {Kind.TORQUE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 2.0, Kind.VOLTAGE: 1.8, Kind.SETPOINT: 0.3},
+    Drive.FORCE: _FORCE,
     Drive.POSITION: {Kind.SETPOINT: 3.0, Kind.COMMAND: 2.6},
     Drive.VELOCITY: {Kind.SPEED_SETPOINT: 3.0, Kind.COMMAND: 2.6, Kind.SETPOINT: 0.3},
-    Drive.VOLTAGE: {Kind.VOLTAGE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 0.5, Kind.TORQUE: 0.3, Kind.SETPOINT: 0.2},
-    Drive.OTHER: {Kind.COMMAND: 3.0, Kind.SETPOINT: 2.4, Kind.TORQUE: 2.0, Kind.VOLTAGE: 2.0, Kind.CURRENT: 1.5},
+    Drive.VOLTAGE: _VOLTS,
+    Drive.OTHER: _ANY,
 }
 
 

@@ -22,6 +22,8 @@ class Kind(Enum):
     TORQUE = auto()  # or force
     CURRENT = auto()
     VOLTAGE = auto()
+    DUTY = auto()  # share of the supply
+    SUPPLY = auto()  # the voltage of it
     QUATERNION = auto()
     OTHER = auto()  # which no joint has: temperatures, flags
     UNKNOWN = auto()
@@ -65,8 +67,10 @@ _SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate
 _ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"}
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
-    "input", "drive", "pwm", "duty", "applied", "a",
+    "input", "drive", "applied", "a",
 }  # fmt: skip
+_DUTIES = {"pwm", "duty", "dutycycle", "throttle"}
+_SUPPLIES = {"battery", "batt", "vbat", "vbatt", "supply", "vbus", "vdc", "vcc", "vin"}
 _DESIRED = {"des", "desired", "ref", "reference", "setpoint", "sp", "set", "target", "goal", "demand", "wanted"} | {
     "requested", "dem",
 }  # fmt: skip
@@ -90,7 +94,7 @@ _TIMES = {"time", "t", "timestamp", "timestamps", "stamp", "clock", "elapsed", "
 }  # fmt: skip
 _EPISODES = {"episode", "trial", "rollout", "demo", "toss", "experiment", "ep", "traj", "trajectory"}
 _OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "index", "frame", "id", "reward"} | {
-    "done", "battery", "task", "count", "seq", "step", "contact", "success", "residual", "power", "energy", "noise",
+    "done", "task", "count", "seq", "step", "contact", "success", "residual", "power", "energy", "noise",
 }  # fmt: skip
 _UNITS = {
     "rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degs": "deg", "degree": "deg",
@@ -158,7 +162,8 @@ def _flags(words: list[str]) -> tuple[set[str], list[str]]:
     table = {
         "angle": _ANGLES, "length": _LENGTHS, "place": _PLACES, "speed": _SPEEDS, "acceleration": _ACCELERATIONS,
         "torque": _TORQUES, "command": _COMMANDS, "desired": _DESIRED, "measured": _MEASURED, "current": _CURRENTS,
-        "voltage": _VOLTAGES, "time": _TIMES, "episode": _EPISODES, "other": _OTHERS,
+        "voltage": _VOLTAGES, "duty": _DUTIES, "supply": _SUPPLIES, "time": _TIMES, "episode": _EPISODES,
+        "other": _OTHERS,
     }  # fmt: skip
     flags: set[str] = set()
     rest = []
@@ -191,6 +196,10 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
     drive = _driven(flags, place)
     if words and words[-1] in ("time", "stamp", "timestamp"):
         return Kind.TIME
+    if "supply" in flags and not place and not flags & {"current", "torque", "other"} and unit not in ("A", "mA", "%"):
+        return Kind.SUPPLY
+    if "duty" in flags and not place:
+        return Kind.DUTY
     if drive is not None:
         return drive
     if "episode" in flags and not place and not flags & {"speed", "torque"}:

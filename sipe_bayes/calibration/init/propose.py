@@ -231,11 +231,14 @@ def _unknowns(
 
 
 def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str, str]:
-    """Length of the windows of the fit, a part of the time in which the motion goes to and fro: joints couple soon."""
+    """Length of the windows of the fit, a part of the time in which the motion goes to and fro: joints couple soon.
+
+    At most a fifth of a log, so that its held-out quarter is longer.
+    """
     durations = [len(log) * log.dt for log in logs]
     if max(durations) <= _SHORT:
         return "log", "each log as one: they are short"
     swing = trial.length * logs[0].dt / share_of(machine)
     part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE
-    length = float(np.clip(part * swing, max(0.1, 20 * logs[0].dt), min(2.0, min(durations) / 4)))
+    length = float(np.clip(part * swing, max(0.1, 20 * logs[0].dt), min(2.0, min(durations) / 5)))
     return float(f"{length:.2g}"), f"s; the motion goes to and fro in about {swing:.2g} s"

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sipe_bayes.calibration.init.draft import Reading
+from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
 from sipe_bayes.calibration.init.matching import Match, Matches
-from sipe_bayes.calibration.init.names import Kind
+from sipe_bayes.calibration.init.names import Kind, read_name
 from sipe_bayes.calibration.init.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.core.arrays import FloatArray
@@ -24,6 +24,12 @@ _FILTERED = 0.05  # of white noise in the upper frequencies
 _LATE = 1.0  # samples
 _ALIKE = 0.9  # share of variance from which a command is a set-point
 _UNLIKE = 0.2
+_COUNTS = (4096, 1024, 2048, 8192, 16384, 65536, 4000, 2000, 1000, 400, 10000, 20000, 131072, 360)  # to a turn
+_FEWEST_COUNTS = 30
+_LEAST_TURN, _MOST_TURNS = 0.01, 12.0
+_SHARES = (1.0, 100.0)  # that need not be whole numbers
+_FULL_DUTIES = (1.0, 100.0, 127.0, 255.0, 400.0, 511.0, 1000.0, 1023.0, 2047.0, 4095.0, 32767.0, 65535.0)
+_MILLIVOLTS = 200.0
 _TURNS = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}
 
 
@@ -76,10 +82,23 @@ def _position(machine: Machine, match: Match, table: Table, turns: Mapping[str, 
         label = replace(match.label, unit=unit)
         note = f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out"
         return replace(reading, match=replace(match, label=label), unit=unit, wraps=True, notes=(*reading.notes, note))
+    counts = _counts(table[match.column]) if reading.unit == "rad" and not match.label.unit else ()
+    if counts:
+        return replace(reading, unit=counts[0].unit, factor=counts[0].factor, scales=counts)
     if white_share(table[match.column]) < _FILTERED:
         note = "looks filtered: hardly any noise at its highest frequencies; its lag would count as a delay"
         reading = replace(reading, notes=(*reading.notes, note))
     return reading
+
+
+def _counts(values: FloatArray) -> tuple[Scale, ...]:
+    """What whole numbers may be of a turn, the likeliest first; nothing for others."""
+    known = values[np.isfinite(values)]
+    span = float(np.ptp(known)) if len(known) else 0.0
+    if span < _FEWEST_COUNTS or (np.mod(known, 1) != 0).any():
+        return ()
+    turns = (_LEAST_TURN, _MOST_TURNS)
+    return tuple(Scale("rev", 1 / n) for n in _COUNTS if turns[0] < span / n < turns[1])
 
 
 def _matched(match: Match) -> tuple[str, ...]:
@@ -97,6 +116,11 @@ def _by_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock)
         return reading
     per_second = slope.factor / find_unit(clock.unit).factor  # position's unit, for each unit of the velocity
     wanted = find_unit(partner.label.unit).factor / abs(per_second)
+    for scale in sorted(reading.scales, key=lambda s: abs(np.log(wanted / (s.factor * find_unit(s.unit).factor)))):
+        note = f"{scale}: {partner.column!r} in {partner.label.unit} is its slope"
+        if abs(np.log(wanted / (scale.factor * find_unit(scale.unit).factor))) > _NEAR:
+            break
+        return replace(reading, unit=scale.unit, factor=scale.factor, scales=(), notes=(*reading.notes, note))
     for word in unit_words(find_unit(reading.unit).dimension):
         if abs(np.log(wanted / find_unit(word).factor)) < _NEAR:
             note = f"{word}: {partner.column!r} in {partner.label.unit} is its slope"
@@ -137,6 +161,8 @@ def _command(machine: Machine, match: Match, matches: Matches, table: Table) -> 
         Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(match.label.kind, "V"),
         Drive.OTHER: "1",
     }[actuator.drive]
+    if match.label.kind == Kind.DUTY:
+        return _duty(match, actuator, table)
     named = match.label.unit
     fits = named in (unit_words(find_unit(default).dimension)) or (
         actuator.drive in (Drive.FORCE, Drive.OTHER, Drive.VOLTAGE) and named not in ("", "rad", "deg", "m", "mm")
@@ -151,6 +177,27 @@ def _command(machine: Machine, match: Match, matches: Matches, table: Table) -> 
         instead = tuple(f'column = "{other}"' for other in others[:3])
         reading = replace(reading, doubts=(*reading.doubts, doubt), instead=(*reading.instead, *instead))
     return reading
+
+
+def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
+    """A duty's scale, by its size, and the supply that it is a share of."""
+    values = table[match.column]
+    largest, whole = float(np.nanmax(np.abs(values))), bool((np.mod(values[np.isfinite(values)], 1) == 0).all())
+    full = next((f for f in _FULL_DUTIES if largest <= 1.005 * f and (whole or f in _SHARES)), largest)
+    if match.label.unit == "%" or full == _SHARES[1]:
+        unit, factor = "%", 1.0
+    else:
+        unit, factor = "1", 1.0 if full == 1 else float(f"{1 / full:.6g}")
+    reading = Reading(match, unit, factor=factor, notes=(*_matched(match), f"a duty: at most {largest:g} of {full:g}"))
+    voltages = [name for name in table if read_name(name).kind == Kind.SUPPLY]
+    if voltages:
+        volts = "mV" if float(np.nanmedian(table[voltages[0]])) > _MILLIVOLTS else "V"
+        note = f"what arrives is it times {voltages[0]!r}"
+        return replace(reading, supply=(voltages[0], volts), notes=(*reading.notes, note))
+    if actuator.drive != Drive.VOLTAGE:
+        return reading
+    doubt = f"a share of which voltage? no column tells; multiply `factor` by the supply's volts for {actuator.name}"
+    return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
 
 
 def _looked_through(reading: Reading, actuator: Actuator, matches: Matches, table: Table) -> Reading:

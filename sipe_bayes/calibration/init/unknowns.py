@@ -91,6 +91,12 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
     index = model.actuator(name).id
     gain, (_, _, of_velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
     word = _word(name)
+    if int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_DCMOTOR):
+        constant, kp = float(model.actuator_gainprm[index, 1]), float(model.actuator_gainprm[index, 4])
+        own = [_factor(f"{word}_resistance", f"{at}.resistance", 0.5, 2.0, f"{gain:g} Ohm in the model")]
+        own += [_factor(f"{word}_constant", f"{at}.motor_constant", 0.5, 2.0, f"{constant:g} N m/A in the model")]
+        follows = [_factor(f"{word}_kp", f"{at}.kp", 0.3, 3.0, f"position gain, {kp:g} in the model")]
+        return follows if actuator.drive == Drive.POSITION else own
     if actuator.drive == Drive.POSITION:
         out = [_factor(f"{word}_kp", f"{at}.kp", 0.3, 3.0, f"position gain, {gain:g} in the model")]
         if of_velocity:

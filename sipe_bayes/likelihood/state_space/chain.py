@@ -159,6 +159,8 @@ class Chain:
 
         of_channels = [coordinate(column) for column in columns]
         for reading in environment.poses:
+            if reading.quantity == "acceleration":
+                continue
             turns = reading.quantity in ("orientation", "angular_velocity")
             first = int(model.jnt_dofadr[reading.joint]) + model.nv * ("velocity" in reading.quantity)
             free = int(model.jnt_type[reading.joint]) == int(mujoco.mjtJoint.mjJNT_FREE)

@@ -16,6 +16,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.likelihood.starts import STATE_STEP
 from sipe_bayes.likelihood.state_space.chain import Chain
 
@@ -57,9 +58,12 @@ def indirect_positions(
     size = np.nanstd(np.where(chain.observed, chain.measured, np.nan), axis=0)
     size = np.maximum(size, chain.least[0])
     dependent: dict[int, BoolArray] = {}  # degree of freedom -> channels (C,) that depend on its position
+    felt = inertial_joints(model, chain.simulator.environment.poses)
     for j in map(int, np.flatnonzero(~measured[: model.nv])):
         joint = int(model.dof_jntid[j])
-        if int(model.jnt_type[joint]) in (_HINGE, _SLIDE):
+        if joint in felt:
+            indirect[j] = True
+        elif int(model.jnt_type[joint]) in (_HINGE, _SLIDE):
             dependent[j] = _dependent(chain, states, int(model.jnt_qposadr[joint]), _values(model, joint), size)
             irrelevant[j] = not dependent[j].any()
         else:

@@ -233,7 +233,7 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
 
         The linearisation is that at ``states``; None where the simulation diverges.
         """
-        chain, tuning = self.chain, self.tuning.smoothing
+        chain, tuning, noise = self.chain, self.tuning.smoothing, solvable(linear, noise)
         begin = filtered(chain, linear, noise, theta, states, tuning)
         if begin is None:
             return None

@@ -1,0 +1,75 @@
+"""`sipe init` on encoder counts, duties and logs without a clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sipe_bayes.calibration.config import load_config
+from sipe_bayes.calibration.init.draft import Draft
+from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.write import toml_of
+from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.simulation.simulator import Simulator
+
+DRIVE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">
+  <joint name="shaft" axis="0 1 0" damping=".002"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".01" mass=".2"/></body></worldbody><actuator>
+  <dcmotor name="motor" joint="shaft" resistance="1" motorconst=".1"/></actuator></mujoco>"""
+DT, STEPS = 0.01, 640
+
+
+def swing() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Angles (rad), duties and volts of a swing that nonlinear gravity shapes."""
+    damping = Parameter("damping", 0.0, 0.004, targets=("joint:shaft.damping",))
+    simulator = Simulator(MjcfEnvironment.build(DRIVE, [damping], ["motor"], ["joint:shaft.position"]), 1)
+    time = DT * np.arange(STEPS)
+    duty = np.round(200 * np.sin(2.1 * time) * np.cos(0.7 * time)) / 255
+    volts = 12 - 1.5 * np.sin(0.4 * time)
+    actions = (duty * volts)[None, :, None]
+    seen = simulator.rollout(np.full((1, 1), 0.5), actions, simulator.default_state()[None], DT).observations[0, :, 0]
+    return seen + 5e-4 * np.random.default_rng(0).standard_normal(STEPS + 1), duty, volts
+
+
+def proposed(folder: Path, columns: dict[str, FloatArray], rate: float | None = None) -> Draft:
+    (folder / "model.xml").write_text(DRIVE)
+    pd.DataFrame(columns).to_csv(folder / "log.csv", index=False)
+    draft = propose(folder / "model.xml", [folder / "log.csv"], folder)
+    (folder / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
+    load_config(folder / "calibrate.toml")
+    return draft
+
+
+@pytest.mark.parametrize("counts", [1024, 4096, 16384])
+def test_counts_of_an_encoder_and_a_duty_of_a_battery(tmp_path: Path, counts: int) -> None:
+    """Whole numbers of 255 and of a turn, a battery in mV; the counts next to them (4000) may be told beside them."""
+    angle, duty, volts = swing()
+    draft = proposed(
+        tmp_path,
+        {
+            "time": DT * np.arange(STEPS),
+            "encoder": np.round(angle[:-1] * counts / (2 * np.pi)),
+            "pwm": np.round(255 * duty),
+            "battery_mV": 1000 * volts,
+        },
+    )
+    (command,), (position,) = draft.commands, draft.measurements
+    assert (command.unit, command.supply) == ("1", ("battery_mV", "mV"))
+    assert command.factor == pytest.approx(1 / 255, rel=1e-5)
+    assert (position.unit, round(1 / position.factor)) == ("rev", counts), position
+    problem = prepare(tmp_path / "calibrate.toml", 1)
+    held = np.round(255 * duty) / 255 * volts
+    np.testing.assert_allclose(problem.train.actions[0, :400, 0], held[:400], atol=2e-4)
+    assert {"motor_resistance", "motor_constant"} & {u.name for u in draft.unknowns}
+
+
+def test_a_duty_without_a_supply_stays_open(tmp_path: Path) -> None:
+    angle, duty, _ = swing()
+    draft = proposed(tmp_path, {"time": DT * np.arange(STEPS), "angle_rad": angle[:-1], "duty": duty})
+    assert any("a share of which voltage?" in doubt for doubt in draft.open_doubts), draft.open_doubts
