@@ -40,6 +40,8 @@ class TimeColumn(Table):
     """column with the clock"""
     unit: TimeWord = "s"
     """its unit; to be named where rows are a quarter of a second apart or more"""
+    rate: Positive | None = None
+    """Hz, of logs without a clock: rows come evenly"""
 
 
 class Columns(Table):

@@ -32,11 +32,12 @@ import numpy as np
 
 from sipe_bayes.calibration.config import Config, check_dimensions
 from sipe_bayes.calibration.config_fields import nearest
+from sipe_bayes.calibration.config_tables import Columns as Named
 from sipe_bayes.calibration.config_tables import Command, LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, control_grid, held, sampled
 from sipe_bayes.calibration.log_report import report_of
 from sipe_bayes.calibration.readers.base import Columns, LogError
-from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode, episode_numbers
+from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import aligned, continued, rotation_vectors
@@ -80,7 +81,7 @@ def load_logs(
         opened = None
         for log in parts:
             try:
-                opened = opened or _Opened.of(file, wanted, config.columns.episode)
+                opened = opened or _Opened.of(file, wanted, config.columns)
                 loaded.append(_loaded(config, log, opened))
             except LogError as error:
                 raise LogError(f"log {log.name!r}: {error}") from None
@@ -103,8 +104,9 @@ class _Opened:
     episodes: IntArray | None
 
     @classmethod
-    def of(cls, file: Path, wanted: Sequence[str], episode: str | None) -> _Opened:
-        table = read_table(file, wanted)
+    def of(cls, file: Path, wanted: Sequence[str], named: Named) -> _Opened:
+        episode = named.episode
+        table = with_clock(read_table(file, wanted), named.time.column, named.time.rate)
         return cls(table, digest(file), None if episode is None else episode_numbers(file, table, episode))
 
 
@@ -233,7 +235,8 @@ def _observations(config: Config, columns: list[FloatArray]) -> FloatArray:
 def _seconds(config: Config, log: LogEntry, table: Columns, name: str) -> FloatArray:
     """A clock of the log (n,) in s, which increases."""
     clock = config.columns.time
-    time = _column(log, table, name)
+    remedy = "; a log without a clock needs its Hz, `columns.time.rate`" if name == clock.column else ""
+    time = _column(log, table, name, remedy)
     _check_clock(name, time)
     time = convert(time, clock.unit, "time")
     period, duration = float(np.median(np.diff(time))), float(time[-1]) - float(time[0])
@@ -270,10 +273,10 @@ def _apart(column: str, time: FloatArray, lead: FloatArray) -> LogError:
     )
 
 
-def _column(log: LogEntry, table: Columns, name: str) -> FloatArray:
+def _column(log: LogEntry, table: Columns, name: str, remedy: str = "") -> FloatArray:
     """One column as numbers (n,)."""
     if name not in table:
-        raise LogError(f"no column {name!r} in {log.file.name}; {nearest(name, table)}")
+        raise LogError(f"no column {name!r} in {log.file.name}; {nearest(name, table)}{remedy}")
     values = table[name]
     try:
         if values.dtype.kind not in "cV":  # complex numbers and records would lose a part of themselves

@@ -14,6 +14,7 @@ def init(
     model: Annotated[Path | None, typer.Argument(help="The MJCF.")] = None,
     logs: Annotated[list[Path] | None, typer.Argument(help="Logs: files, folders or patterns.")] = None,
     out: Annotated[Path, typer.Option(help="The configuration to write.")] = Path("calibrate.toml"),
+    rate: Annotated[float | None, typer.Option(min=1e-3, help="Hz of the rows, of logs without a clock.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite it.")] = False,
     check: Annotated[Path | None, typer.Option(help="Say instead what is odd in this configuration.")] = None,
 ) -> None:
@@ -38,7 +39,7 @@ def init(
         from sipe_bayes.calibration.init.write import summary, toml_of
         from sipe_bayes.core.files import write_text
 
-        draft = propose(model, logs, out.parent)
+        draft = propose(model, logs, out.parent, rate)
         write_text(out, toml_of(draft, command_line()))
     for line in summary(draft, str(out)):
         print(line)

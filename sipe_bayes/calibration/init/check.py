@@ -52,7 +52,7 @@ def oddities(path: Path) -> list[str]:
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)
     train = config.logs_for("train")[:_LOGS]
-    opened = open_table(train[0].file, read_table(train[0].file))
+    opened = open_table(train[0].file, read_table(train[0].file), config.columns.time.rate)
     draft = _draft_of(config, opened, folder)
     part = tried_part(draft)
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
@@ -86,7 +86,9 @@ def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
         quaternion = (entry.quaternion or "") if isinstance(entry, Measurement) else ""
         match = Match(columns, entry.target, label, 1.0, quaternion)
         wraps = isinstance(entry, Measurement) and entry.wraps
-        return Reading(match, entry.unit, entry.sign, entry.factor, wraps)
+        feed = entry.supply if isinstance(entry, Command) and entry.rate is None else None
+        supply = None if feed is None else (feed.column, feed.unit)
+        return Reading(match, entry.unit, entry.sign, entry.factor, wraps, supply=supply)
 
     clock = replace(opened.clock, column=config.columns.time.column, unit=config.columns.time.unit)
     return Draft(

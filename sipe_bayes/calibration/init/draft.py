@@ -132,7 +132,7 @@ class Draft:
         commands: columns that drive actuators.
         measurements: columns that measure.
         logs: that train, and that are held out.
-        window: s, or "log".
+        window: s, or "log"; None for unknown states in place of windows.
         window_note: why.
         unknowns: parameters, those that are left out among them.
         doubts: what could not be decided, beside what readings say.
@@ -146,7 +146,7 @@ class Draft:
     commands: tuple[Reading, ...]
     measurements: tuple[Reading, ...]
     logs: tuple[LogLine, ...]
-    window: float | str
+    window: float | str | None
     window_note: str = ""
     unknowns: tuple[Unknown, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -164,6 +164,11 @@ class Draft:
         return tuple(unknown for unknown in self.unknowns if not unknown.left_out)
 
     @property
+    def likelihood(self) -> Row:
+        """Its keys in the configuration."""
+        return {"likelihood": "state_space"} if self.window is None else {"window": self.window}
+
+    @property
     def open_doubts(self) -> list[str]:
         """Everything that could not be decided."""
         own = [self.clock.doubt] if self.clock.doubt else []
@@ -171,11 +176,11 @@ class Draft:
 
     def config(self, folder: Path) -> Config:
         """The configuration that it stands for; paths are relative to the folder."""
-        columns: Row = {"time": {"column": self.clock.column, "unit": self.clock.unit}}
+        columns: Row = {"time": self.clock.row}
         columns |= {"episode": self.episode} if self.episode else {}
         data: Row = {
             "model": self.model,
-            "window": self.window,
+            **self.likelihood,
             "columns": columns,
             "commands": [reading.row() for reading in self.commands],
             "measurements": [reading.row() for reading in self.measurements],

@@ -43,16 +43,18 @@ _LOOKED_AT = 3  # logs that are simulated
 _CHECKED = 60  # logs whose columns are looked at
 _HELD = 0.75  # share of a single log that trains
 _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
+_LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _SHORT = 2.0  # s: logs as short are one window each
 
 
-def propose(model_path: Path, logs: Sequence[Path], folder: Path) -> Draft:
+def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | None = None) -> Draft:
     """A configuration for a model and its logs.
 
     Args:
         model_path: the MJCF.
         logs: files, folders of files, or patterns.
         folder: of the configuration, to which its paths are relative.
+        rate: Hz, of logs without a clock.
 
     Raises:
         ModelError: for a model that does not compile.
@@ -61,10 +63,10 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path) -> Draft:
     model = compile_spec(load_spec(str(model_path)), str(model_path))
     machine = Machine.of(model)
     files = _files(logs)
-    opened = open_table(files[0], read_table(files[0]))
+    opened = open_table(files[0], read_table(files[0]), rate)
     matches = match_columns(machine, opened.columns)
     _check_some(machine, matches, opened, files[0])
-    tables = [opened.columns, *(open_table(f, read_table(f)).columns for f in _others(files))]
+    tables = [opened.columns, *(open_table(f, read_table(f), rate).columns for f in _others(files))]
     table, turns = straightened(tables, matches, machine)
     measurements, commands = first_readings(machine, matches, table, turns, opened.clock)
     lines, sources, dropped = _split(files, opened, measurements, commands, folder)
@@ -74,7 +76,32 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path) -> Draft:
         notes=_unused(matches),
     )  # fmt: skip
     trained = _decided(draft, model, machine, sources, folder)
-    return replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
+    trained = replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
+    return _felt(trained) if _is_felt(machine, matches) else trained
+
+
+def _is_felt(machine: Machine, matches: Matches) -> bool:
+    """Whether an accelerometer tells of a free body whose pose nothing measures."""
+    targets = {match.target for match in matches.vectors}
+    felt = any(kind == "accelerometer" and f"sensor:{name}" in targets for name, kind in machine.sensors)
+    return bool(machine.bodies) and felt and not any(t.startswith("body:") for t in targets)
+
+
+def _felt(draft: Draft) -> Draft:
+    """The draft with inertial sensors fitted, their biases unknown, and states unknown at every sample."""
+    measurements, biases = [], []
+    for reading in draft.measurements:
+        inertial = reading.match.target.startswith("sensor:")
+        measurements.append(replace(reading, fit=True) if inertial else reading)
+        name, acceleration = reading.match.target.removeprefix("sensor:"), reading.unit in ("m/s^2", "g0")
+        largest = _LARGEST_BIAS["accelerometer" if acceleration else "gyro"]
+        for axis in "xyz" if inertial else "":
+            target = (f"sensor:{name}_{axis}.bias",)
+            biases.append(Unknown(f"{name}_bias_{axis}", target, -largest, largest, False, "constant error"))
+    note = "an inertial unit tells the pose: see floating-base.md"
+    return replace(
+        draft, measurements=tuple(measurements), unknowns=(*draft.unknowns, *biases), window=None, window_note=note
+    )
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:
@@ -128,7 +155,8 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
         out.append(f"no column drives {', '.join(still)}: it gets zero; name its column under [[commands]]")
     measured = {m.target.rpartition(".")[0] for m in (*matches.positions, *matches.velocities, *matches.vectors)}
     blind = [joint.name for joint in machine.joints if f"joint:{joint.name}" not in measured]
-    bodies = [body for body in machine.bodies if f"body:{body}" not in measured]
+    felt = _is_felt(machine, matches)
+    bodies = [] if felt else [body for body in machine.bodies if f"body:{body}" not in measured]
     unnamed = sum(not has_pose(model, j) and not model.joint(j).name for j in range(model.njnt))
     if blind or bodies:
         names = ", ".join([*blind, *bodies])

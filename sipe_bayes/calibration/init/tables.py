@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,13 @@ from sipe_bayes.calibration.config_fields import listed
 from sipe_bayes.calibration.init.names import Kind, read_name
 from sipe_bayes.calibration.init.signals import time_unit
 from sipe_bayes.calibration.readers.base import Columns, LogError
-from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers
+from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.numbered import gathered, numbered
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 
 _EPISODES = ("demo", "episode", "ep_", "run", "trial", "toss", "traj", "rollout", "log", "exp", "test", "swing")
+_MADE = "time"  # what a clock is called that a rate makes
 _MOST = 20_000  # rows that are looked at
 _UNLIKE = 0.3  # share of steps that are far from the usual one, beyond which a column is no clock
 
@@ -32,6 +33,7 @@ class Clock:
         period: its usual step, in its own unit.
         why: what tells the unit.
         doubt: what does not; "" for nothing.
+        rate: Hz, of a log without a clock.
     """
 
     column: str
@@ -39,6 +41,12 @@ class Clock:
     period: float
     why: str
     doubt: str = ""
+    rate: float | None = None
+
+    @property
+    def row(self) -> dict[str, object]:
+        """Its table in the configuration."""
+        return {"column": self.column, "unit": self.unit} if self.rate is None else {"rate": self.rate}
 
 
 @dataclass(frozen=True)
@@ -51,8 +59,9 @@ class Opened:
     seconds: float
 
 
-def open_table(path: Path, table: Columns) -> Opened:
-    """Read what a file holds; raises LogError where nothing in it can be a clock."""
+def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
+    """Read what a file holds, whose rows come at ``rate`` Hz; raises LogError where nothing tells the time."""
+    table = with_clock(table, _MADE, rate)
     prefix = numbered(table, _EPISODES)
     table = table if prefix is None else gathered(table, prefix)
     numbers = {name: values for name, column in table.items() if (values := _numbers(column)) is not None}
@@ -62,7 +71,7 @@ def open_table(path: Path, table: Columns) -> Opened:
         values, counts = np.unique(ids, return_counts=True)
         one = episode(table, ids, int(values[np.argmax(counts)]))
         numbers = {name: values for name, column in one.items() if (values := _numbers(column)) is not None}
-    clock = _clock(path, numbers)
+    clock = replace(_clock(path, numbers), rate=rate)
     times = [values for name, values in numbers.items() if leaf(name) == clock.column or name == clock.column]
     longest = max(times, key=len)
     seconds = float(longest[-1] - longest[0]) * find_unit(clock.unit).factor
@@ -117,7 +126,7 @@ def _clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
         steady = [name for name, values in numbers.items() if _increases(values) and _is_steady(values)]
         if not steady:
             has = listed(list(map(repr, numbers)))
-            raise LogError(f"{path}: no column is a clock that increases; it has {has}; add one, `time` in seconds")
+            raise LogError(f"{path}: no column is a clock that increases; it has {has}; give the rows' Hz: --rate 500")
         name = steady[0]
         return _timed(leaf(name), numbers[name], f"the only kind of column that rises steadily: {name}", True)
     word = max(ranked, key=lambda w: ranked[w])

@@ -15,7 +15,7 @@ _INLINE = 6  # logs from which they stand on one line each
 def toml_of(draft: Draft, command: str) -> str:
     """The whole file; command: what wrote it."""
     parts = [_comment(f"Written by: {command}"), *(_comment(note) for note in draft.notes), *map(_open, draft.doubts)]
-    text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, "window": draft.window}).rstrip("\n")
+    text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, **draft.likelihood}).rstrip("\n")
     text += f" # {draft.window_note}\n"
     if len(draft.logs) >= _INLINE:
         rows = [to_toml({"row": [log.row()]}) for log in draft.logs]
@@ -23,7 +23,7 @@ def toml_of(draft: Draft, command: str) -> str:
         text += "logs = [\n" + "".join(f"    {line},\n" for line in lines) + "]\n"
     clock = draft.clock
     text += "\n[columns]\n" + "".join(f"{_open(clock.doubt)}\n" for _ in range(bool(clock.doubt)))
-    text += f"time = {{ column = {_string(clock.column)}, unit = {_string(clock.unit)} }} # {clock.why}\n"
+    text += to_toml({"row": [{"time": clock.row}]}).splitlines()[1] + f" # {clock.why}\n"
     text += f"episode = {_string(draft.episode)}\n" if draft.episode else ""
     blocks = [_reading("commands", reading) for reading in draft.commands]
     blocks += [_reading("measurements", reading) for reading in draft.measurements]

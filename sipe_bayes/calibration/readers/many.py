@@ -95,6 +95,20 @@ def clock_of(table: Columns, column: str, clock: str) -> str:
     return next((name for name in around if name in table), clock)
 
 
+def with_clock(table: Columns, clock: str, rate: float | None) -> Columns:
+    """The table with a clock for rows that come at ``rate`` Hz; as it is without one.
+
+    Raises:
+        LogError: where it has such a column already.
+    """
+    if rate is None:
+        return table
+    if clock in table:
+        raise LogError(f"`columns.time.rate` is for logs without a clock, but there is a column {clock!r}; drop it")
+    rows = max((len(values) for values in table.values()), default=0)
+    return {**table, clock: np.arange(rows) / rate}
+
+
 def digest(path: Path) -> str:
     """SHA-256 of a file; of a folder, of the names and contents of its logs and of what tells about them."""
     if path.is_file():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,15 +14,25 @@ from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 DRIVE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">
   <joint name="shaft" axis="0 1 0" damping=".002"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".01" mass=".2"/></body></worldbody><actuator>
   <dcmotor name="motor" joint="shaft" resistance="1" motorconst=".1"/></actuator></mujoco>"""
+ROCKING = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <geom type="plane" size="3 3 .1"/><body name="trunk" pos="0 0 .05"><freejoint/>
+  <geom type="box" size=".1 .1 .05" mass="1"/><site name="imu"/>
+  <body name="rod" pos="0 0 .05"><joint name="arm" axis="0 1 0" damping=".05"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .2" size=".01" mass=".2" contype="0" conaffinity="0"/></body></body>
+  </worldbody>
+  <actuator><position name="arm" joint="arm" kp="5" kv=".1"/></actuator>
+  <sensor><gyro name="gyro" site="imu"/><accelerometer name="imu" site="imu"/></sensor></mujoco>"""
 DT, STEPS = 0.01, 640
 
 
@@ -40,13 +51,13 @@ def swing() -> tuple[FloatArray, FloatArray, FloatArray]:
 def proposed(folder: Path, columns: dict[str, FloatArray], rate: float | None = None) -> Draft:
     (folder / "model.xml").write_text(DRIVE)
     pd.DataFrame(columns).to_csv(folder / "log.csv", index=False)
-    draft = propose(folder / "model.xml", [folder / "log.csv"], folder)
+    draft = propose(folder / "model.xml", [folder / "log.csv"], folder, rate)
     (folder / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
     load_config(folder / "calibrate.toml")
     return draft
 
 
-@pytest.mark.parametrize("counts", [1024, 4096, 16384])
+@pytest.mark.parametrize("counts", [1024, 4096])
 def test_counts_of_an_encoder_and_a_duty_of_a_battery(tmp_path: Path, counts: int) -> None:
     """Whole numbers of 255 and of a turn, a battery in mV; the counts next to them (4000) may be told beside them."""
     angle, duty, volts = swing()
@@ -73,3 +84,47 @@ def test_a_duty_without_a_supply_stays_open(tmp_path: Path) -> None:
     angle, duty, _ = swing()
     draft = proposed(tmp_path, {"time": DT * np.arange(STEPS), "angle_rad": angle[:-1], "duty": duty})
     assert any("a share of which voltage?" in doubt for doubt in draft.open_doubts), draft.open_doubts
+
+
+def test_a_log_without_a_clock_needs_its_rate(tmp_path: Path) -> None:
+    angle, duty, volts = swing()
+    columns = {"angle_rad": angle[:-1], "voltage": duty * volts}
+    with pytest.raises(LogError, match=r"no column is a clock .* give the rows' Hz: --rate 500"):
+        proposed(tmp_path, columns)
+    draft = proposed(tmp_path, columns, rate=1 / DT)
+    assert [m.unit for m in draft.measurements] == ["rad"]
+    text = (tmp_path / "calibrate.toml").read_text()
+    assert "time = {rate = 100.0}" in text
+    assert prepare(tmp_path / "calibrate.toml", 1).train[0].dt == pytest.approx(DT)
+    (tmp_path / "calibrate.toml").write_text(text.replace("time = {rate = 100.0}", ""))
+    with pytest.raises(LogError, match=r"no column 'time' in log.csv; .* needs its Hz, `columns.time.rate`"):
+        prepare(tmp_path / "calibrate.toml", 1)
+    proposed(tmp_path, {"time": DT * np.arange(STEPS), **columns})
+    (tmp_path / "calibrate.toml").write_text(text)
+    with pytest.raises(LogError, match="is for logs without a clock, but there is a column 'time'"):
+        prepare(tmp_path / "calibrate.toml", 1)
+
+
+def test_an_inertial_unit_that_alone_tells_of_a_body_is_fitted_with_its_biases(tmp_path: Path) -> None:
+    """A box on the floor that rocks under an arm."""
+    model = mujoco.MjModel.from_xml_string(ROCKING)
+    data, rows = mujoco.MjData(model), []
+    for k in range(400):
+        mujoco.mj_forward(model, data)
+        data.ctrl[0] = 0.8 * np.sin(0.06 * k)
+        rows.append([0.01 * k, data.ctrl[0], data.qpos[7], *data.sensordata])
+        mujoco.mj_step(model, data, 5)
+    axes = [f"{sensor}_{axis}" for sensor in ("gyro", "acc") for axis in "xyz"]
+    pd.DataFrame(rows, columns=["time", "goal_arm", "arm", *axes]).to_csv(tmp_path / "log.csv", index=False)
+    (tmp_path / "model.xml").write_text(ROCKING)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
+    problem = prepare(tmp_path / "calibrate.toml", 1)
+    assert isinstance(problem.likelihood, StateSpace)
+    assert {f"imu_bias_{axis}" for axis in "xyz"} < set(problem.environment.space.names)
+    assert {m.target for m in problem.config.measurements if m.fit} == {
+        "joint:arm.position",
+        "sensor:gyro",
+        "sensor:imu",
+    }
+    assert not any("trunk" in doubt for doubt in draft.open_doubts)
