@@ -31,7 +31,8 @@ from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misspecification import MISFIT, misfit
+from sipe_bayes.diagnostics.misspecification import misfit
+from sipe_bayes.diagnostics.probed_logs import MISFIT, ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -107,7 +108,7 @@ def one(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -
     posterior = method.fit(log)
     noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
     windows = bind(method.likelihood, engine, Trajectories.stack(log))
-    found = misfit(windows, posterior.mode.numpy(), noise, seed=seed)
+    found = misfit(ProbedLogs(windows, posterior.mode.numpy(), noise), seed=seed)
     return {"seed": seed, "cpu_seconds": round(time.process_time() - began, 2), **asdict(found)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,6 @@ from sipe_bayes.calibration.gathered import Marginals
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import in_pieces, log_estimates, marginal
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
 from sipe_bayes.diagnostics.evaluate import (
     compare_errors,
@@ -20,13 +20,14 @@ from sipe_bayes.diagnostics.evaluate import (
     fitted_units,
     signals,
 )
+from sipe_bayes.diagnostics.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misspecification import misfit
-from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Signal
+from sipe_bayes.diagnostics.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
-from sipe_bayes.inference.random_effects import random_effects
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.fitted import FittedStructure
@@ -113,18 +114,25 @@ class _Model:
         prior = self.structures.search.fitting.prior_of(simulator)
         return Marginals.of(self.structures.posterior_of(self.one), prior, seed).summaries()
 
-    def further(self, seed: int) -> Posterior | None:
-        """Of the user's parameters that a further log would ask for; None where single logs cannot be fitted."""
-        fitting, theta = self.structures.search.fitting, self.one.theta
-        simulator, count = self.structures.simulator(self.one), len(self.problem.prior.space)
-        logs = in_pieces(fitting.trajectories, fitting.windows(simulator).start)
-        alone, _ = log_estimates(simulator, fitting.likelihood, logs, theta, seed)
-        if len(alone) < 2:
+    @functools.cached_property
+    def probed(self) -> ProbedLogs | None:
+        """The training logs as the checks of their residuals see them; None where the simulation diverges."""
+        fitting, one = self.structures.search.fitting, self.one
+        windows = fitting.windows(self.structures.simulator(one))
+        prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
+        try:
+            return ProbedLogs(windows, one.theta, one.noise, one.starts, prior)
+        except ValueError:  # LinAlgError is one
             return None
-        own = [
-            replace(log, mean=log.mean[:count], information=marginal(log.information, range(count))) for log in alone
-        ]
-        return random_effects(own, self.problem.prior, seed).new_log
+
+    def further(self, seed: int) -> Posterior | None:
+        """Of the user's parameters that a further log would ask for; None where that cannot be said."""
+        prior = self.structures.search.fitting.prior_of(self.structures.simulator(self.one))
+        missing = None if self.probed is None else missing_physics(self.probed, prior, seed)
+        if missing is None:
+            return None
+        space = self.problem.prior.space
+        return Particles(missing.further.theta[:, : len(space)], space, weights=missing.further.weights)
 
     def stage(self, seed: int) -> Stage:
         """What it leaves of the training logs."""
@@ -134,17 +142,9 @@ class _Model:
         rows = zip(one.sd.tolist(), one.tau.tolist(), fitted_units(windows), strict=True)
         noise = {channel: ChannelNoise(*row) for channel, row in zip(windows.fitted, rows, strict=True)}
         residuals = fitted_residuals(windows, one.theta, one.noise, one.starts)
-        return Stage(noise, self._misfit(windows, seed), tuple(residuals))
-
-    def _misfit(self, windows: Windows, seed: int) -> Misfit | None:
-        prior = QuadraticPrior.of(self.structures.search.fitting.prior_of(windows.simulator))
-        sd = self.structures.posterior_of(self.one).stddev.numpy()
-        try:
-            return misfit(
-                windows, self.one.theta, self.one.noise, starts=self.one.starts, sd=sd, prior=prior, seed=seed
-            )
-        except ValueError:  # LinAlgError is one
-            return None
+        sd = self.structures.posterior_of(one).stddev.numpy()
+        seen = None if self.probed is None else misfit(self.probed, sd, seed)
+        return Stage(noise, seen, tuple(residuals))
 
 
 def _errors(use: str, before: _Model, after: _Model, logs: Trajectories) -> list[ModelErrors]:

@@ -24,7 +24,7 @@ from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import Disagreement, disagreement, in_pieces, linear_estimates, log_estimates
+from sipe_bayes.diagnostics.agreement import Disagreement, disagreement, linear_estimates, log_estimates, parts_of
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
     both_predicted,
@@ -36,9 +36,11 @@ from sipe_bayes.diagnostics.evaluate import (
     white_noise,
 )
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
+from sipe_bayes.diagnostics.missing_physics import MissingPhysics, missing_physics
 from sipe_bayes.diagnostics.misspecification import misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
+from sipe_bayes.diagnostics.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -89,16 +91,15 @@ def calibrate(
     alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
     # what the model lacks
     tell("checking what the model lacks")
-    lacks, residuals = _residuals(problem, method, fit, posterior.stddev.numpy(), unknown)
+    probed, residuals = _residuals(problem, method, fit, unknown)
+    lacks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
     outside = _outside(problem, method, fit.windows, unknown)
     # how well it predicts
     tell("simulating the posterior's band")
     marginals = Marginals.of(posterior, problem.prior, method.seed)
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
-    if doubted and len(logs) == 1:
-        alone = _by_pieces(replace(problem, train=logs), fit, method.seed, tell)
-    further = random_effects(alone, problem.prior, method.seed).new_log if doubted and alone[1:] else None
+    missing = _missing(probed, alone, problem.prior, method.seed) if doubted else None
     predictions = _Predictions.of(problem, theta)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
@@ -119,7 +120,8 @@ def calibrate(
         estimator=method.name,
         posterior=posterior,
         prior=problem.prior,
-        parameters=marginals.summaries(further),
+        parameters=marginals.summaries(None if missing is None else missing.further),
+        causes=() if missing is None else missing.causes,
         train=predictions.train,
         holdout=predictions.holdout,
         findings=noticed,
@@ -239,19 +241,18 @@ def _one_by_one(
         return [], None, []
     space = problem.environment.space
     if fit.lin is not None and fit.lin.valid:
-        alone = linear_estimates(fit.windows, fit.theta, fit.starts, fit.noise, fit.lin)
+        alone = linear_estimates(fit.windows, fit.theta, fit.starts, fit.noise, fit.lin, parts_of(fit.windows))
         if disagreement(space, alone) is None:
             return alone, None, []
     alone, skipped = log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell)
     return alone, disagreement(space, alone), [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
 
 
-def _by_pieces(problem: Problem, fit: _Fit, seed: int, tell: Callable[[str], None]) -> list[LogEstimate]:
-    """What pieces of a single log say, each by itself."""
-    if grows(fit.windows):
-        return []
-    pieces = in_pieces(problem.train, fit.windows.start)
-    return log_estimates(problem.simulator, problem.likelihood, pieces, fit.theta, seed, tell)[0]
+def _missing(probed: ProbedLogs | None, alone: list[LogEstimate], prior: Posterior, seed: int) -> MissingPhysics | None:
+    """What a further log would ask for; from the logs' own estimates where nothing could be probed."""
+    if probed is not None:
+        return missing_physics(probed, prior, seed)
+    return MissingPhysics(random_effects(alone, prior, seed).new_log, (), False) if alone[1:] else None
 
 
 def _mixing(method: Estimator) -> Mixing | None:
@@ -271,12 +272,12 @@ def _channel_noise(fitted: Windows, noise: Noise) -> dict[str, ChannelNoise]:
 
 
 def _residuals(
-    problem: Problem, method: Estimator, fit: _Fit, sd: FloatArray, unknown: list[Finding]
-) -> tuple[Misfit | None, list[Residual]]:
-    """What the residuals look like, and the residuals.
+    problem: Problem, method: Estimator, fit: _Fit, unknown: list[Finding]
+) -> tuple[ProbedLogs | None, list[Residual]]:
+    """The logs as the checks of their residuals see them, and the residuals.
 
-    Nothing with a ``StateSpace``, whose process noise takes what the model lacks. sd (N,): of the posterior in theta;
-    unknown: gets a finding where they cannot be looked at.
+    Nothing with a ``StateSpace``, whose process noise takes what the model lacks. unknown: gets a finding where they
+    cannot be looked at.
     """
     if isinstance(problem.likelihood, StateSpace):
         return None, []
@@ -285,12 +286,11 @@ def _residuals(
         unknown.append(finding(Code.MISFIT_NOT_ASKED))
         return None, fitted_residuals(windows, theta, noise, starts)
     try:
-        prior = QuadraticPrior.of(problem.prior)
-        lacks = misfit(windows, theta, noise, starts=starts, sd=sd, prior=prior, seed=method.seed, lin=fit.lin)
+        probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(problem.prior), fit.lin)
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
-        lacks = None
-    return lacks, fitted_residuals(windows, theta, noise, starts)
+        probed = None
+    return probed, fitted_residuals(windows, theta, noise, starts)
 
 
 def _outside(problem: Problem, method: Estimator, fitted: Windows, unknown: list[Finding]) -> list[OutsidePrior]:

@@ -13,7 +13,6 @@ explains it. And each log is left out in turn: where the others agree without on
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -82,19 +81,14 @@ class Disagreement:
         return self.finding.text
 
 
-def in_pieces(trajectories: Trajectories, windows: IntArray) -> Trajectories:
-    """The logs; of a single one, pieces of whole windows that stand for several, each under the log's name.
-
-    Args:
-        trajectories: the logs.
-        windows: (W,), the control steps at which the windows of the logs begin.
-    """
-    if len(trajectories) > 1 or len(windows) < 2:
-        return trajectories
-    (log,) = trajectories
-    parts = np.array_split(np.sort(windows), min(_PIECES, len(windows)))
-    edges = [0, *(int(part[0]) for part in parts[1:]), len(log)]
-    return Trajectories.stack([log.slice(start, stop) for start, stop in itertools.pairwise(edges)])
+def parts_of(windows: Windows) -> list[tuple[str, IntArray]]:
+    """Each log's name and windows; of a single one pieces that stand for several, of whole windows."""
+    logs = windows.trajectories
+    if len(logs) > 1:
+        own = [(name, np.flatnonzero(windows.log == k)) for k, name in enumerate(logs.names)]
+        return [(name, mine) for name, mine in own if len(mine)]
+    pieces = np.array_split(np.argsort(windows.start), min(_PIECES, windows.num_windows))
+    return [(logs.names[0], piece) for piece in pieces]
 
 
 def log_estimates(
@@ -132,9 +126,14 @@ def log_estimates(
 
 
 def linear_estimates(
-    windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise, lin: Linearisation
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    noise: Noise,
+    lin: Linearisation,
+    parts: Sequence[tuple[str, IntArray]],
 ) -> list[LogEstimate]:
-    """What each log by itself says to first order, with noise of its own: no simulation beside the linearisation.
+    """What each part of the logs by itself says to first order, with noise of its own; it simulates nothing.
 
     Args:
         windows: the logs.
@@ -142,15 +141,13 @@ def linear_estimates(
         starts: (W, D) there.
         noise: (C,) there, from which that of each log is searched.
         lin: the linearisation at both.
+        parts: by ``parts_of``.
 
     Returns:
-        One for each log, none for a single one.
+        One for each part.
     """
     logs, n, estimates = windows.trajectories, len(theta), []
-    if len(logs) < 2:
-        return []
-    for k, name in enumerate(logs.names):
-        mine = np.flatnonzero(windows.log == k)
+    for name, mine in parts:
         part, pull = windows.part(mine), -windows.start_precision * starts[mine]
         moments = part.moments(Linearisation(lin.residual[mine], lin.jacobian[mine], True))
         pulls = Pulls(_FLAT * np.eye(n), np.zeros(n), windows.start_precision, pull, np.ones(n, bool))

@@ -96,6 +96,7 @@ class Calibration:
         misfit: what the residuals look like; None where they could not be looked at.
         outside: of each training log, whether the prior gives such a one.
         noise: of each fitted channel.
+        causes: for which the parameters' ``further`` allow, to first order.
         mixing: of Markov chains; None of other methods.
         logs: what was read and what was done to it.
         run: configuration, versions, seed and checksums, as JSON has them.
@@ -119,6 +120,7 @@ class Calibration:
     misfit: Misfit | None = None
     outside: list[OutsidePrior] = field(default_factory=list)
     noise: dict[str, ChannelNoise] = field(default_factory=dict)
+    causes: tuple[str, ...] = ()
     mixing: Mixing | None = None
     logs: list[LogReport] = field(default_factory=list)
     run: dict[str, object] = field(default_factory=dict)
@@ -185,6 +187,7 @@ class Calibration:
             "train": [asdict(s) for s in self.train],
             "comparison": None if self.comparison is None else self.comparison.to_dict(),
             "misfit": None if self.misfit is None else {**asdict(self.misfit), "matters": self.misfit.matters},
+            "causes": list(self.causes),
             "outside_prior": [asdict(o) for o in self.outside],
             "ridges": [{"text": r.text, **asdict(r)} for r in self.ridges],
             "findings": [item.to_dict() for item in self.findings],

@@ -180,10 +180,13 @@ def verdicts(calibration: Calibration) -> list[Verdict]:
 
 
 def between_logs(calibration: Calibration) -> Verdict | None:
-    """What the column beside the intervals holds, where there is one."""
+    """What the intervals with what the model lacks hold, where there are any."""
     if all(p.further is None for p in calibration.parameters):
         return None
     single = len({score.log for score in calibration.train}) == 1
     logs = "pieces of the log" if single else "logs"
-    text = "Beside each interval: the one for what a further log would ask for. It holds what differs between the"
-    return Verdict("fair", f"{text} {logs}, not what the model lacks in all of them.")
+    text = f"The intervals with what the model lacks hold what differs between the {logs}"
+    if not calibration.causes:
+        return Verdict("fair", f"{text}, not what all of them miss alike.")
+    named = [*calibration.causes[:_DOUBTS], *["others"] * (len(calibration.causes) > _DOUBTS)]
+    return Verdict("fair", f"{text} and, to first order, what {listed(named)} would move.")

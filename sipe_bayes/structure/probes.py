@@ -41,10 +41,11 @@ class Effect:
 
 @dataclass(frozen=True)
 class Probe:
-    """A cause that a model may lack: what it is, and what to do about it, in words."""
+    """A cause that a model may lack: what it is, and what to do about it, in words; whether it is of one log alone."""
 
     name: str
     remedy: str
+    by_log: bool = False
 
 
 def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[Probe], FloatArray, BoolArray]:
@@ -79,7 +80,8 @@ def _unit(change: FloatArray) -> FloatArray:
 def _named(placed: Placed) -> Probe:
     targets = [target for parameter in placed.parameters for target in parameter.targets]
     what = "a parameter" if len(targets) == 1 else "parameters"
-    return Probe(placed.sentence, f"make {' and '.join(targets)} {what}, or widen its bounds")
+    by_log = any(parameter.log is not None for parameter in placed.parameters)
+    return Probe(placed.sentence, f"make {' and '.join(targets)} {what}, or widen its bounds", by_log)
 
 
 def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:

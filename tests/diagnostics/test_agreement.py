@@ -7,7 +7,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import disagreement, in_pieces, log_estimates
+from sipe_bayes.diagnostics.agreement import disagreement, log_estimates
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.likelihood.settings import Segments
 from tests.problems.pendulums import log, pendulum
@@ -153,15 +153,3 @@ def test_a_log_that_says_nothing_disagrees_with_nobody() -> None:
     silent = LogEstimate("silent", np.array([5.0, -3.0]), np.zeros((2, 2)))
     loud = LogEstimate("loud", np.array([0.5, 0.5]), 1e4 * np.eye(2))
     assert disagreement(space, [silent, loud]) is None
-
-
-def test_a_single_log_stands_in_pieces_of_whole_windows() -> None:
-    recorded = log(pendulum(), [0.6, 0.08], 3)
-    begins = np.arange(0, len(recorded), 25)
-    pieces = in_pieces(Trajectories.stack([recorded]), begins)
-    assert [piece.name for piece in pieces] == [recorded.name] * 5
-    assert sum(len(piece) for piece in pieces) == len(recorded)
-    assert all(len(piece) % 25 == 0 for piece in pieces[:-1])
-    np.testing.assert_array_equal(np.concatenate([piece.actions for piece in pieces]), recorded.actions)
-    both = Trajectories.stack([recorded, recorded])
-    assert in_pieces(both, begins) is both

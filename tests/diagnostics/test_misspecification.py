@@ -11,8 +11,9 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import best_starts
-from sipe_bayes.diagnostics.misspecification import _Residuals, misfit
+from sipe_bayes.diagnostics.misspecification import misfit
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
+from sipe_bayes.diagnostics.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
@@ -37,7 +38,7 @@ def found(recorded: Trajectory, seed: int = 0) -> Misfit:
     posterior = method.fit(recorded)
     windows = bind(method.likelihood, simulator, Trajectories.stack(recorded))
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
-    return misfit(windows, posterior.mode.numpy(), noise, seed=seed, simulated=39)
+    return misfit(ProbedLogs(windows, posterior.mode.numpy(), noise), seed=seed, simulated=39)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +95,7 @@ def test_a_small_effect_is_called_small() -> None:
     assert "pass for noise" in quiet.text
 
 
-def residuals(rho: float) -> _Residuals:
+def residuals(rho: float) -> ProbedLogs:
     """Of two logs with a gap, at their truth."""
     simulator = pendulum()
     one, two = (log(simulator, [0.6, 0.08], seed, name=f"log {seed}", steps=130, rho=rho) for seed in (1, 2))
@@ -105,7 +106,7 @@ def residuals(rho: float) -> _Residuals:
     theta = simulator.space.normalise(np.array([0.6, 0.08]))
     noise = Noise(np.array([0.01]), np.array([0.0 if rho == 0 else -0.01 / np.log(rho)]))
     flat = QuadraticPrior(theta, np.zeros((2, 2)))
-    return _Residuals(windows, theta, noise, best_starts(windows, theta, noise), flat)
+    return ProbedLogs(windows, theta, noise, best_starts(windows, theta, noise), flat)
 
 
 def test_products_formed_together_are_those_formed_one_by_one() -> None:
@@ -168,7 +169,8 @@ def of_mass_and_damping(recorded: Trajectory, high: float = 1.0, believed: float
     windows = bind(method.likelihood, simulator, Trajectories.stack(recorded))
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
     print(posterior.mode, noise)
-    return misfit(windows, posterior.mode.numpy(), noise, prior=QuadraticPrior.of(method.prior), simulated=39)
+    seen = ProbedLogs(windows, posterior.mode.numpy(), noise, prior=QuadraticPrior.of(method.prior))
+    return misfit(seen, simulated=39)
 
 
 def test_an_optimum_at_a_bound_is_no_excuse() -> None:

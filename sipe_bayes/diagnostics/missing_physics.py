@@ -1,0 +1,255 @@
+r"""Intervals for a model that lacks something: what further logs would ask for, with what the library might explain.
+
+A wrong model's parameters make up for what it lacks, so that their plain intervals are a fraction of their distance
+from the truth. Two things tell how far they may be off. Logs, or pieces of one, that were moved differently ask for
+different values (``inference.random_effects``): that holds what differs between them, and misses what all share. And
+the library of extensions says to first order what missing physics would have done to every sample. In the linear model
+
+.. math:: r = J_\theta \delta + E b + J_x x + \varepsilon, \qquad b_k \sim \mathcal N(0, 1 / \alpha_k),
+
+of ``diagnostics.probed_logs``, the few columns of E that the evidence keeps are those whose alpha is finite at its
+maximum (sparse Bayesian learning: M. Tipping, A. Faul, "Fast marginal likelihood maximisation for sparse Bayesian
+models", AISTATS 2003, https://proceedings.mlr.press/r4/tipping03a.html). Their posterior, means and covariance, moves
+and widens what each log asks for.
+
+Where the corrected residuals pass for noise, the interval is the corrected one alone. Else physics are missing that the
+library does not hold, or that are not small: both intervals, plain and corrected, are then mixed in equal parts.
+
+Deviations:
+
+- A column is taken only where it raises the log evidence by ``gain``: there are dozens, and many are alike.
+- The noise is estimated anew with the columns that were taken, in turns.
+- Gains that differ between logs are not taken: they would explain why logs differ, which the spread is to hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
+from sipe_bayes.diagnostics.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, chosen
+from sipe_bayes.inference.random_effects import LogEstimate, random_effects
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.windows import Linearisation
+from sipe_bayes.posterior import Particles, Posterior
+
+
+@dataclass(frozen=True)
+class MissingPhysicsOptions(Options):
+    """How causes are taken from the library."""
+
+    gain: float = option(2.0, "of the log evidence, below which a cause is not taken", "nats", least=0)
+    rounds: int = option(3, "in which causes and noise are estimated in turn", least=1)
+    most: int = option(300, "steps of the search for causes", least=1)
+
+
+_OPTIONS = MissingPhysicsOptions()
+
+
+@dataclass(frozen=True)
+class MissingPhysics:
+    """What a further log would ask for, with what the model lacks.
+
+    Args:
+        further: theta of such a log.
+        causes: that the evidence keeps, to first order, in words.
+        explained: whether the residuals pass for noise with them.
+    """
+
+    further: Particles
+    causes: tuple[str, ...]
+    explained: bool
+
+
+def missing_physics(
+    logs: ProbedLogs, prior: Posterior, seed: int = 0, options: MissingPhysicsOptions = _OPTIONS
+) -> MissingPhysics | None:
+    """The interval for a model that lacks something; no simulation beside what ``logs`` took.
+
+    Args:
+        logs: linearised at the estimate.
+        prior: of theta.
+        seed: of the draws.
+        options: of the search for causes.
+
+    Returns:
+        None where nothing can be compared: a single log of one window, or estimates that all lie far outside the cube.
+    """
+    parts = parts_of(logs.windows)
+    if len(parts) < 2:
+        return None
+    causes = _Causes.of(logs, options)
+    plain = _further(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed)
+    if not len(causes.kept):
+        return None if plain is None else MissingPhysics(plain, (), False)
+    explained = causes.explain(logs, seed)
+    corrected = _further(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed)
+    if corrected is None:
+        return None if plain is None else MissingPhysics(plain, (), False)
+    corrected = causes.widened(corrected, np.random.default_rng(seed))
+    named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
+    if explained or plain is None:
+        return MissingPhysics(corrected, named, explained)
+    return MissingPhysics(_mixed(plain, corrected), named, False)
+
+
+def _estimates(
+    logs: ProbedLogs, parts: Sequence[tuple[str, IntArray]], noise: Noise, sizes: FloatArray
+) -> list[LogEstimate]:
+    """What each part of the logs asks for, to first order, where the causes have these sizes (K,)."""
+    n, count = logs.windows.num_theta, logs.count
+    residual = logs.residual - logs.jacobian[..., n:count] @ sizes
+    lin = Linearisation(residual, np.concatenate([logs.jacobian[..., :n], logs.jacobian[..., count:]], -1), True)
+    return linear_estimates(logs.windows, logs.theta, logs.starts, noise, lin, parts)
+
+
+def _further(estimates: list[LogEstimate], prior: Posterior, seed: int) -> Particles | None:
+    try:
+        return random_effects(estimates, prior, seed).new_log
+    except ValueError:  # none near the cube
+        return None
+
+
+def _mixed(one: Particles, other: Particles) -> Particles:
+    weights = np.concatenate([0.5 * p.weights.numpy() / p.weights.numpy().sum() for p in (one, other)])
+    return Particles(np.concatenate([one.theta.numpy(), other.theta.numpy()]), one.space, weights=weights)
+
+
+@dataclass(frozen=True)
+class _Causes:
+    """Columns of the library that the evidence keeps, to first order.
+
+    Args:
+        kept: (A,) their numbers.
+        step: (N + A,) of theta and of their sizes.
+        covariance: (A, A) of their sizes.
+        response: (N, A) of theta to them.
+        noise: (C,) with them.
+    """
+
+    kept: IntArray
+    step: FloatArray
+    covariance: FloatArray
+    response: FloatArray
+    noise: Noise
+
+    @classmethod
+    def of(cls, logs: ProbedLogs, options: MissingPhysicsOptions) -> _Causes:
+        """In turns with the noise."""
+        windows, n = logs.windows, logs.windows.num_theta
+        moments = logs.moments(logs.residual[..., None])[0][1]
+        pull, noise = -windows.start_precision * logs.starts, logs.noise
+        span = float(windows.dt.min()), windows.trajectories.longest
+        usable = np.array([not probe.by_log for probe in logs.probes], bool)
+        for _ in range(options.rounds):
+            arrow = eliminate_starts(moments.normal(noise), logs.count, windows.start_precision, pull)
+            precision, gradient = arrow.precision + FLAT_PRECISION * np.eye(logs.count), arrow.gradient
+            alpha = sparse(precision, gradient, n, usable, logs.one_sided, options)
+            kept = np.flatnonzero(np.isfinite(alpha))
+            columns = np.concatenate([np.arange(n), n + kept])
+            beliefs = np.diag(np.concatenate([np.zeros(n), alpha[kept]]))
+            covariance = np.linalg.inv(precision[np.ix_(columns, columns)] + beliefs)
+            starts = logs.count + np.arange(2 * windows.num_start + 1)
+            part = chosen(moments, np.concatenate([columns, starts]), len(columns))
+            pulls = Pulls(
+                beliefs + FLAT_PRECISION * np.eye(len(columns)),
+                np.zeros(len(columns)),
+                windows.start_precision,
+                pull,
+                np.ones(len(columns), bool),
+            )
+            noise = estimate_noise(part, noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales)
+            noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
+        response = -np.linalg.solve(precision[:n, :n], precision[:n, n + kept])
+        return cls(kept, covariance @ gradient[columns], covariance[n:, n:], np.asarray(response), noise)
+
+    def sizes(self, logs: ProbedLogs) -> FloatArray:
+        """Of all K columns, zero of those not kept."""
+        sizes = np.zeros(len(logs.probes))
+        sizes[self.kept] = self.step[logs.windows.num_theta :]
+        return sizes
+
+    def explain(self, logs: ProbedLogs, seed: int) -> bool:
+        """Whether what they leave passes for noise, by the null of the check of the residuals."""
+        pull = -logs.windows.start_precision * logs.starts
+        moments = logs.moments(logs.residual[..., None])[0][1]
+        arrow = eliminate_starts(moments.normal(self.noise), logs.count, logs.windows.start_precision, pull)
+        step = np.concatenate([self.step[: logs.windows.num_theta], self.sizes(logs)])
+        seen = logs.whiteness(logs.left(logs.residual, step, arrow.blocks(step)), self.noise)
+        null = logs.null(seed, MISFIT.simulated)[:, len(logs.probes) :]
+        middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
+        odd, largest = ((seen - middle) / spread).max(), ((null - middle) / spread).max(1)
+        return bool((1 + (largest >= odd).sum()) / (1 + len(null)) > THRESHOLDS.misfit)
+
+    def widened(self, further: Particles, random: np.random.Generator) -> Particles:
+        """With what is not known of their sizes."""
+        theta = further.theta.numpy()
+        sizes = random.multivariate_normal(np.zeros(len(self.kept)), self.covariance, len(theta))
+        return Particles(np.clip(theta + sizes @ self.response.T, 0, 1), further.space, weights=further.weights.numpy())
+
+
+def sparse(
+    precision: FloatArray,
+    gradient: FloatArray,
+    plain: int,
+    usable: BoolArray,
+    one_sided: BoolArray,
+    options: MissingPhysicsOptions = _OPTIONS,
+) -> FloatArray:
+    """Precisions of the priors of K columns beside others at the maximum of the evidence, infinite of those left out.
+
+    Columns are taken, changed and dropped one at a time, each time the one that raises the evidence most (Tipping and
+    Faul 2003, section 4; s and q as there).
+
+    Args:
+        precision: (P + K, P + K) of all columns' likelihood.
+        gradient: (P + K,), so that the flat optimum is precision^-1 gradient.
+        plain: P, columns that are always in.
+        usable: (K,) those that may be taken.
+        one_sided: (K,) those whose size may not be negative.
+        options: of the search.
+
+    Returns:
+        (K,).
+    """
+    size = np.diag(precision)[plain:]
+    alpha = np.full(len(size), np.inf)
+    for _ in range(options.most):
+        kept = np.flatnonzero(np.isfinite(alpha))
+        columns = np.concatenate([np.arange(plain), plain + kept])
+        beliefs = np.diag(np.concatenate([np.zeros(plain), alpha[kept]]))
+        covariance = np.linalg.inv(precision[np.ix_(columns, columns)] + beliefs)
+        cross = precision[plain:][:, columns]
+        s = size - np.einsum("ki,ij,kj->k", cross, covariance, cross)
+        q = gradient[plain:] - cross @ (covariance @ gradient[columns])
+        own = alpha[kept] / (alpha[kept] - s[kept])
+        s[kept], q[kept] = own * s[kept], own * q[kept]
+        s = np.maximum(s, 1e-12 * np.maximum(size, 1e-300))
+        better = (q**2 > s) & (s > 1e-5 * size) & usable & ~(one_sided & (q < 0))
+        best = np.where(better, s**2 / np.where(better, q**2 - s, 1.0), np.inf)
+        gain = _evidence(best, s, q)
+        weak = kept[gain[kept] < options.gain]
+        if len(weak):
+            alpha[weak[np.argmin(gain[weak])]] = np.inf
+            continue
+        taken = np.isfinite(alpha)
+        rise = np.where(taken, gain - _evidence(alpha, s, q), np.where(gain >= options.gain, gain, 0.0))
+        k = int(rise.argmax())
+        if rise[k] < 1e-3:
+            break
+        alpha[k] = best[k]
+    return alpha
+
+
+def _evidence(alpha: FloatArray, s: FloatArray, q: FloatArray) -> FloatArray:
+    """Log evidence that each column adds with these priors (K,); 0 of one that is left out."""
+    inside = np.isfinite(alpha)
+    own = np.where(inside, alpha, 1.0)
+    return np.where(inside, 0.5 * (np.log(own / (own + s)) + q**2 / (own + s)), 0.0)

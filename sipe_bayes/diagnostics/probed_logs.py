@@ -1,0 +1,244 @@
+"""Logs linearised at an estimate, with what the library of extensions would do to them beside the parameters.
+
+The columns of the linear model are the N parameters, K probes (a small step of each extension of ``structure``, see
+``structure.probes``) and the windows' starts. What the checks of the residuals ask (``diagnostics.misspecification``)
+and the intervals for a model that lacks something (``diagnostics.missing_physics``) are both answered in it.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.diagnostics.evaluate import best_starts
+from sipe_bayes.diagnostics.thinning import spread_windows
+from sipe_bayes.likelihood.block_tridiagonal import Eliminated
+from sipe_bayes.likelihood.moments import Moments
+from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.structure.probes import probes
+
+FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
+_PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
+
+
+@dataclass(frozen=True)
+class MisfitOptions(Options):
+    """What residuals are asked, and how the null is simulated."""
+
+    simulated: int = option(99, "draws of the null: p resolves a percent", least=1)
+    pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
+    lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
+    alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
+    causes: int = option(3, "that are named at most", least=1)
+    steps: int = option(1600, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
+    batch: int = option(16, "draws of the null whose products are formed together", least=1)
+
+
+MISFIT = MisfitOptions()
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A residual solved for theta and starts, without the K probes.
+
+    Args:
+        statistics: (K + 2 C,) cube roots: probes, sums of squared autocorrelations, largest mean squares of a piece.
+        left: (W, L, C) of the residual.
+        step: (N + K,) of theta; zero of the probes.
+        score: (K,) of each probe.
+        information: (K,) of each probe, all else projected out.
+        answer: (N, K) of theta to the probes.
+        variance: (N,) of theta.
+        arrow: the windows' starts eliminated.
+    """
+
+    statistics: FloatArray
+    left: FloatArray
+    step: FloatArray
+    score: FloatArray
+    information: FloatArray
+    answer: FloatArray
+    variance: FloatArray
+    arrow: Eliminated
+
+
+class ProbedLogs:
+    """The logs linearised at the estimate, with K probes beside the N parameters.
+
+    Costs a linearisation and a rollout for each probe. Of long or many logs some windows are looked at, spread evenly.
+
+    Args:
+        windows: the logs, W windows of C channels.
+        theta: (N,) the estimate.
+        noise: (C,) there.
+        starts: (W, D) of the windows; default the best.
+        prior: of the fit; default flat.
+        lin: at theta and starts, where it is known.
+
+    Raises:
+        ValueError: where the simulation diverges at theta.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        theta: FloatArray,
+        noise: Noise,
+        starts: FloatArray | None = None,
+        prior: QuadraticPrior | None = None,
+        lin: Linearisation | None = None,
+    ) -> None:
+        kept = spread_windows(windows, MISFIT.steps)
+        if len(kept) < windows.num_windows:
+            windows, starts = windows.part(kept), None if starts is None else starts[kept]
+            lin = None if lin is None else Linearisation(lin.residual[kept], lin.jacobian[kept], lin.valid)
+        starts = best_starts(windows, theta, noise) if starts is None else starts
+        prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
+        self.windows, self.theta, self.noise = windows, theta, noise
+        self.starts = starts
+        linearisation = lin or windows.linearise(theta, starts)
+        if not linearisation.valid:
+            raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
+        self.probes, effects, self.one_sided = probes(windows, theta, starts)
+        n = windows.num_theta
+        parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
+        self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
+        self.count = n + len(self.probes)
+        self.coloured = bool((noise.tau > 0).any())
+        self.inner = prior.precision + FLAT_PRECISION * np.eye(n)
+        self.free, self.pull = np.ones(n, bool), prior.pull(theta)
+        arrow = self._arrow(self.moments(self.residual[..., None])[0][1], noise)
+        total = arrow.gradient[:n] + self.pull
+        self._nulls: dict[tuple[int, int], FloatArray] = {}
+        self.free = ~(((theta <= _PRESSED) & (total < 0)) | ((theta >= 1 - _PRESSED) & (total > 0)))
+
+    def seen(self) -> Solved:
+        """Of the logs themselves."""
+        return self.solved(self.residual, self.moments(self.residual[..., None])[0][1], self.noise, self.pull)
+
+    def null(self, seed: int, simulated: int) -> FloatArray:
+        """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated; made once."""
+        key = seed, simulated
+        if key not in self._nulls:
+            self._nulls[key] = self._simulated(np.random.default_rng(seed), simulated)
+        return self._nulls[key]
+
+    def _simulated(self, rng: np.random.Generator, simulated: int) -> FloatArray:
+        draws, rows = self.drawn(rng, simulated), []
+        for part in np.array_split(np.arange(simulated), max(1, simulated // MISFIT.batch)):
+            for s, (plain, probed) in zip(part, self.moments(draws[..., part]), strict=True):
+                noise = self.estimated(plain)
+                rows.append(self.solved(draws[..., s], probed, noise).statistics)
+        return np.stack(rows)
+
+    def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
+        """Residuals (W, L, C, S) of the noise alone."""
+        out = np.zeros((*self.residual.shape, simulated))
+        for c, s in enumerate(self.windows.sequences):
+            a = coefficients(s.gaps, float(self.noise.tau[c]))[s.gap]
+            flat = rng.standard_normal((len(s.index), simulated)) * np.sqrt(1 - a**2)[:, None]
+            for i in np.flatnonzero(a):
+                flat[i] += a[i] * flat[i - 1]
+            column = np.zeros((self.residual[:, :, c].size, simulated))
+            column[s.index] = self.noise.sd[c] * flat
+            out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
+        return out
+
+    def moments(self, residuals: FloatArray) -> list[tuple[Moments, Moments]]:
+        """For each of residuals (W, L, C, S) the products without the probes and with them."""
+        n, count, many = self.windows.num_theta, self.count, residuals.shape[-1]
+        parts = (self.jacobian[..., :count], residuals, self.jacobian[..., count:])
+        rows = np.concatenate(parts, axis=-1)
+        whole = Moments(np.zeros(rows.shape[:3]), rows, count + many, self.windows.sequences)
+        starts = count + many + np.arange(2 * self.windows.num_start)
+
+        def of(s: int, first: int) -> Moments:
+            return chosen(whole, np.concatenate([np.arange(first), starts, [count + s]]), first)
+
+        return [(of(s, n), of(s, count)) for s in range(many)]
+
+    def estimated(self, moments: Moments) -> Noise:
+        """The noise that a fit would have found in a draw of it."""
+        windows = self.windows
+        pulls = Pulls(self.inner, np.zeros(moments.num_theta), windows.start_precision, windows.no_starts(), self.free)
+        span = float(windows.dt.min()), windows.trajectories.longest
+        return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span, windows.scales)
+
+    def _arrow(self, moments: Moments, noise: Noise) -> Eliminated:
+        windows = self.windows
+        return eliminate_starts(moments.normal(noise), self.count, windows.start_precision, windows.no_starts())
+
+    def solved(self, residual: FloatArray, moments: Moments, noise: Noise, pull: FloatArray | None = None) -> Solved:
+        """Statistics of a residual, with what they are made of.
+
+        Args:
+            residual: (W, L, C).
+            moments: its products with theta, probes and starts.
+            noise: (C,) of the channels.
+            pull: (N,) of the prior; default none.
+        """
+        n = self.windows.num_theta
+        # information of theta and probes with the starts eliminated; inverted among the parameters that are free
+        arrow = self._arrow(moments, noise)
+        inner, inverse = arrow.precision + FLAT_PRECISION * np.eye(self.count), np.zeros((n, n))
+        inner[:n, :n] = arrow.precision[:n, :n] + self.inner
+        among = np.ix_(self.free, self.free)
+        inverse[among] = np.linalg.inv(inner[:n, :n][among])
+        base, cross = inverse @ (arrow.gradient[:n] + (0.0 if pull is None else pull)), inverse @ inner[:n, n:]
+        # score and information of each probe with theta projected out; one that theta can imitate is not usable
+        gradient = arrow.gradient[n:] - inner[n:, :n] @ base
+        information = np.diag(inner)[n:] - np.einsum("ik,ik->k", inner[:n, n:], cross)
+        usable = information > 1e-6 * np.diag(inner)[n:] + 2 * FLAT_PRECISION
+        information = np.where(usable & ~(self.one_sided & (gradient < 0)), information, np.inf)
+        # what theta and starts leave, whitened by channel
+        base = np.concatenate([base, np.zeros(self.count - n)])
+        left = self.left(residual, base, arrow.blocks(base))
+        statistics = np.concatenate([np.cbrt(gradient**2 / information), self.whiteness(left, noise)])
+        return Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
+
+    def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
+        """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest piece's mean square."""
+        white = self.white(residual, noise)
+        pieces = [
+            max((float((p**2).mean()) for p in np.array_split(z, MISFIT.pieces) if len(p)), default=0.0) for z in white
+        ]
+        return np.cbrt(np.array([autocorrelation(z) for z in white] + pieces))
+
+    def left(self, residual: FloatArray, step: FloatArray, starts: FloatArray) -> FloatArray:
+        """What a step of theta and probes (N + K,) and one of the starts (W, D) leave of a residual (W, L, C)."""
+        moved = self.jacobian[..., : self.count] @ step
+        turned = np.einsum("wlcd,wd->wlc", self.jacobian[..., self.count :], starts)
+        return np.where(self.windows.observed, residual - moved - turned, 0.0)
+
+    def white(self, residual: FloatArray, noise: Noise) -> list[FloatArray]:
+        """Each channel of a residual (W, L, C), whitened."""
+        rows = zip(np.moveaxis(residual, -1, 0), self.windows.sequences, noise.sd, noise.tau, strict=True)
+        return [whiten(channel.reshape(-1), s, float(sd), float(tau)) for channel, s, sd, tau in rows]
+
+
+def chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
+    """Moments of some columns [theta | x_w | x_{w-1} | r] of others; the first ``num_theta`` are theta's."""
+    part, width = copy.copy(moments), moments.num_theta + 2 * moments.num_start + 1
+    products = moments.products.reshape(-1, moments.windows, width, width)
+    products = products.take(columns, axis=-1).take(columns, axis=-2)
+    part.products, part.num_theta = products.reshape(len(products), -1), num_theta
+    return part
+
+
+def autocorrelation(z: FloatArray) -> float:
+    """Box and Pierce's sum of squared autocorrelations of z (n,) at ``MISFIT.lags``, times n."""
+    z = z - z.mean()
+    square = max(float(z @ z), 1e-300)
+    return float(len(z) * sum((z[lag:] @ z[:-lag] / square) ** 2 for lag in lags(z)))
+
+
+def lags(z: FloatArray) -> list[int]:
+    """Of ``MISFIT.lags`` those that z (n,) is long enough for."""
+    return [lag for lag in MISFIT.lags if lag < len(z) // 4]
