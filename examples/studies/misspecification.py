@@ -31,8 +31,8 @@ from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misspecification import misfit
-from sipe_bayes.diagnostics.probed_logs import MISFIT, ProbedLogs
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sipe_bayes.calibration.gathered import Marginals
 from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
 from sipe_bayes.diagnostics.evaluate import (
     compare_errors,
@@ -18,11 +21,12 @@ from sipe_bayes.diagnostics.evaluate import (
     errors_from_best_starts,
     fitted_residuals,
     fitted_units,
+    measured_starts,
     signals,
 )
-from sipe_bayes.diagnostics.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misspecification import misfit
-from sipe_bayes.diagnostics.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
@@ -45,11 +49,8 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
         seconds: that the search took.
     """
     before, after = _Model(problem, structures, structures.plain), _Model(problem, structures, structures.best)
-    compared, drawn = [], []
-    for use, logs in (("holdout", problem.holdout), ("train", problem.train)):
-        if logs is not None:
-            compared += _errors(use, before, after, logs)
-            drawn += _signals(use, before, after, logs, seed)
+    logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
+    compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
     added = [p for label in structures.best.labels for p in _added(structures, label, seed)]
     averaged = Marginals.of(structures.posterior, problem.prior, seed)
     plain, left = before.stage(seed), after.stage(seed)
@@ -71,7 +72,7 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
         comparison=_comparison(problem, before, after),
         before=plain,
         after=left,
-        signals=tuple(drawn),
+        signals=tuple(_signals(before, after, logs, seed)),
         named_share=structures.named_share,
         settled=structures.settled,
         rollouts=structures.rollouts,
@@ -101,6 +102,11 @@ class _Model:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
         logs = corrected(logs, self.structures.columns, self.problem.environment.actuators)
         return Windows(replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs)
+
+    def predicted(self, windows: Windows) -> FloatArray:
+        """Predictions (W, L, C) from measured starts."""
+        theta = self.one.theta[None]
+        return windows.predict(theta, measured_starts(windows, theta))[0][0]
 
     @property
     def values(self) -> dict[str, float]:
@@ -163,13 +169,13 @@ def _errors(use: str, before: _Model, after: _Model, logs: Trajectories) -> list
     ]
 
 
-def _signals(use: str, before: _Model, after: _Model, logs: Trajectories, seed: int) -> list[Signal]:
-    """Of the structure, with the calibrated plain model in place of the model as given."""
-    new, old = (
-        signals(model.windows(logs), use, model.one.theta, model.structures.posterior_of(model.one), seed)
-        for model in (after, before)
-    )
-    return [replace(line, default=plain.mode) for line, plain in zip(new, old, strict=True)]
+def _signals(before: _Model, after: _Model, logs: Mapping[str, Trajectories], seed: int) -> list[Signal]:
+    """Of the structure, with the calibrated plain model in place of the model as given; logs by their use."""
+    windows, plain = ({use: model.windows(own) for use, own in logs.items()} for model in (after, before))
+    predicted = {use: np.stack([after.predicted(windows[use]), before.predicted(plain[use])]) for use in logs}
+    theta, posterior = after.one.theta, after.structures.posterior_of(after.one)
+    bands = predictive_bands(windows, predicted, theta, posterior, seed)
+    return [line for use in logs for line in signals(windows[use], use, predicted[use], bands[use])]
 
 
 def _comparison(problem: Problem, before: _Model, after: _Model) -> Comparison | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import Disagreement, disagreement, linear_estimates, log_estimates, parts_of
+from sipe_bayes.diagnostics.bands import band_coverage, predictive_bands
 from sipe_bayes.diagnostics.evaluate import (
     best_starts,
     both_predicted,
@@ -36,10 +37,10 @@ from sipe_bayes.diagnostics.evaluate import (
     white_noise,
 )
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
-from sipe_bayes.diagnostics.missing_physics import MissingPhysics, missing_physics
-from sipe_bayes.diagnostics.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
-from sipe_bayes.diagnostics.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.base import Estimator
@@ -89,18 +90,17 @@ def calibrate(
     problem = replace(problem, train=_tamed(problem.train, method))
     dead = dead_ranges(fit.windows, theta)
     alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
-    # what the model lacks
     tell("checking what the model lacks")
     probed, residuals = _residuals(problem, method, fit, unknown)
     lacks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
     outside = _outside(problem, method, fit.windows, unknown)
-    # how well it predicts
     tell("simulating the posterior's band")
     marginals = Marginals.of(posterior, problem.prior, method.seed)
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
     missing = _missing(probed, alone, problem.prior, method.seed) if doubted else None
     predictions = _Predictions.of(problem, theta)
+    bands = predictions.bands(posterior, missing, method.seed)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
         *problem.findings,
@@ -125,9 +125,10 @@ def calibrate(
         train=predictions.train,
         holdout=predictions.holdout,
         findings=noticed,
-        signals=predictions.signals(posterior, method.seed),
+        signals=predictions.signals(bands),
         residuals=residuals,
         ridges=combinations,
+        bands=band_coverage(predictions.windows["holdout"], *bands["holdout"]) if "holdout" in bands else None,
         comparison=predictions.comparison,
         misfit=lacks,
         outside=outside,
@@ -211,11 +212,18 @@ class _Predictions:
         worse = worse_in_training(self.windows["train"], self.theta, self.train)
         return worse if of_starts else [*worse, *not_better(self.holdout)]
 
-    def signals(self, posterior: Posterior, seed: int) -> list[Signal]:
-        """What the report draws, held-out logs first."""
+    def bands(
+        self, posterior: Posterior, missing: MissingPhysics | None, seed: int
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """The ends (W, L, C) of 90 % bands by use: of the posterior, or where the model lacks something for that."""
+        believed, lacking = (posterior, False) if missing is None else (missing.further, True)
+        return predictive_bands(self.windows, self.predicted, self.theta, believed, seed, lacking)
+
+    def signals(self, bands: Mapping[str, tuple[FloatArray, FloatArray]]) -> list[Signal]:
+        """What the report draws, held-out logs first; the ends (W, L, C) of their bands by use."""
         drawn = []
         for use, windows in reversed(self.windows.items()):
-            drawn += signals(windows, use, self.theta, posterior, seed, self.predicted[use])
+            drawn += signals(windows, use, self.predicted[use], bands[use])
         return drawn
 
 

@@ -197,12 +197,11 @@ def print_calibration(calibration: Calibration) -> None:
     from rich.text import Text
 
     from sipe_bayes.core.findings import Findings
-    from sipe_bayes.report.verdicts import headline, verdicts
+    from sipe_bayes.report.verdicts import verdicts
 
     console, findings = _console(), Findings(calibration.findings)
     console.print(Text(f"{calibration.name}: posterior by {calibration.estimator}"))
-    brief = headline(calibration.parameters, findings, brief=True)
-    sentences = [brief if v == headline(calibration.parameters, findings) else v for v in verdicts(calibration)]
+    sentences = verdicts(calibration, brief=True)
     for verdict in sentences[:_SENTENCES]:
         console.print(Text(_cut(verdict.text), style=_TONES[verdict.tone]))
     below = [*_pooled(calibration)[:_CHANNELS], *_worst(findings)]
@@ -220,8 +219,9 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
     from sipe_bayes.report.verdicts import parameter_verdict
     from sipe_bayes.report.words import significant
 
-    table, numbers, words = Table(box=None, pad_edge=False), ["value", "90 % interval"], ["unit", "verdict"]
-    numbers += ["a further log's"] * any(p.further is not None for p in calibration.parameters)
+    wider = any(p.further is not None for p in calibration.parameters)
+    table, words = Table(box=None, pad_edge=False), ["unit", "verdict"]
+    numbers = ["value", *["with what it lacks"] * wider, "plain" if wider else "90 % interval"]
     for heading in ("parameter", *numbers, *words):
         table.add_column(heading, justify="right" if heading in numbers else "left", no_wrap=True)
     shown = calibration.parameters
@@ -230,10 +230,8 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
         verdict = parameter_verdict(p, findings)
-        cells = [value, f"{low} .. {high}"]
-        if len(numbers) > len(cells):
-            ends = [] if p.further is None else [significant(x, p.sd, scale) for x in p.further]
-            cells.append(" .. ".join(ends))
+        ends = [] if p.further is None else [significant(x, p.sd, scale) for x in p.further]
+        cells = [value, *[" .. ".join(ends)] * wider, f"{low} .. {high}"]
         # brackets of a name are not markup
         table.add_row(Text(p.name), *cells, p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
     if len(shown) < len(calibration.parameters):

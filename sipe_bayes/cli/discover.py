@@ -84,7 +84,7 @@ def lines_of(discovery: Discovery) -> list[str]:
     for row in value_rows(discovery):
         if row["before"] and not row["nuisance"]:
             value = f"{row['name']} {row['value']} {row['unit']}".rstrip() + f" ({row['interval']})"
-            value += f", a further log's {row['further']}" if row["further"] else ""
+            value += f", with what it lacks {row['further']}" if row["further"] else ""
             values.append(f"{value}; before {row['before']} ({row['before_interval']})")
     lines += _cut(values, _VALUES)
     return lines + _cut([f"warning: {warning}" for warning in warnings(discovery)], 1)

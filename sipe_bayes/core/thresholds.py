@@ -83,6 +83,11 @@ class Thresholds(Options):
 
     # predictions of held-out logs
     comparison: float = option(0.05, "false alarms of two models that predict alike", "p-value of the paired t-test")
+    band_off: float = option(
+        0.05,
+        "bands that hold so much more or less than they say, beyond two standard errors, are not relied on",
+        "share",
+    )
     method_comparison: float = option(
         0.05, "false alarms of one method compared with another, or with a baseline", "p-value"
     )

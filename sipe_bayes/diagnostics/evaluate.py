@@ -221,40 +221,44 @@ def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
     return np.concatenate([predicted[:, w][:, windows.owned[w]] for w in mine], axis=1)
 
 
-def signals(
-    windows: Windows,
-    use: str,
-    theta: FloatArray,
-    posterior: Posterior,
-    seed: int,
-    predicted: FloatArray | None = None,
-) -> list[Signal]:
-    """What the report draws of each log and channel; where the posterior is narrow its band is to first order.
+def signals(windows: Windows, use: str, predicted: FloatArray, band: tuple[FloatArray, FloatArray]) -> list[Signal]:
+    """What the report draws of each log and channel.
 
     Args:
         windows: the logs.
         use: ``train`` or ``holdout``.
-        theta: (N,) the mode.
-        posterior: whose draws make the band.
-        seed: of the draws.
-        predicted: what ``both_predicted`` gave.
+        predicted: (2, W, L, C) at the mode and by what it is compared with.
+        band: ends (W, L, C).
     """
-    both = both_predicted(windows, theta) if predicted is None else predicted
-    draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
-    predicted = np.concatenate([both, _band(windows, theta, draws, both[0])])
-    out = []
+    every, out = np.concatenate([predicted, np.stack(band)]), []
     for k, trajectory in enumerate(windows.trajectories):
-        lines = _stitched(windows, predicted, k)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
-            low, high = np.nanquantile(lines[2:], [0.05, 0.95], axis=0)
+        lines = _stitched(windows, every, k)
         begins = windows.start[windows.log == k] * trajectory.dt
         for c, channel in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
             measured = trajectory.observations[:, windows.channels[c]]
-            mode, q05, q95, default = (x[:, c] for x in (lines[0], low, high, lines[1]))
-            line = Signal(trajectory.name, use, *channel, trajectory.time, measured, mode, q05, q95, default, begins)
+            mode, other, low, high = lines[..., c]
+            line = Signal(trajectory.name, use, *channel, trajectory.time, measured, mode, low, high, other, begins)
             out.append(line)
     return out
+
+
+def posterior_band(
+    windows: Windows, theta: FloatArray, posterior: Posterior, seed: int, here: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """5 and 95 % quantiles (W, L, C) of predictions over a posterior, to first order where it is narrow.
+
+    Args:
+        windows: the logs.
+        theta: (N,) the mode.
+        posterior: whose draws make the band.
+        seed: of the draws.
+        here: (W, L, C), the prediction at theta.
+    """
+    draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
+        low, high = np.nanquantile(_band(windows, theta, draws, here), [0.05, 0.95], axis=0)
+    return low, high
 
 
 def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArray) -> FloatArray:

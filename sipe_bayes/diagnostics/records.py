@@ -43,6 +43,23 @@ def improvement(scores: Iterable[ChannelScore]) -> float:
 
 
 @dataclass(frozen=True)
+class BandCoverage:
+    """How much of held-out logs the 90 % bands hold.
+
+    Args:
+        share: of the samples, the mean over pieces of the logs.
+        error: standard error by pieces.
+        pieces: tenths of each log and channel.
+        half: channel -> median half width of its band, in its unit.
+    """
+
+    share: float
+    error: float
+    pieces: int
+    half: dict[str, float]
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Whether the held-out errors are smaller than those of the model as given.
 
@@ -85,8 +102,8 @@ class Signal:
         time: s.
         measured: what the log holds.
         mode: prediction at the posterior mode.
-        low: 5 % quantile of the predictions over posterior draws, without measurement noise.
-        high: 95 % quantile.
+        low: lower end of the 90 % band of what a sensor reads.
+        high: its upper end.
         default: prediction of the model as given.
         window_starts: (W,) s, where every window of the log starts anew.
     """

@@ -10,6 +10,7 @@ from sipe_bayes.core.findings import Code, Finding, Findings
 from sipe_bayes.core.html import Page, html_table
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
+    BandCoverage,
     ChannelNoise,
     ChannelScore,
     Comparison,
@@ -92,6 +93,7 @@ class Calibration:
         signals: what to draw of each log and channel.
         residuals: of each training log and fitted channel.
         ridges: combinations that are better known than their members.
+        bands: how much of the held-out logs their bands hold; None without any.
         comparison: of the held-out errors with the model as given; None without any.
         misfit: what the residuals look like; None where they could not be looked at.
         outside: of each training log, whether the prior gives such a one.
@@ -116,6 +118,7 @@ class Calibration:
     signals: list[Signal] = field(default_factory=list)
     residuals: list[Residual] = field(default_factory=list)
     ridges: list[Ridge] = field(default_factory=list)
+    bands: BandCoverage | None = None
     comparison: Comparison | None = None
     misfit: Misfit | None = None
     outside: list[OutsidePrior] = field(default_factory=list)
@@ -186,6 +189,7 @@ class Calibration:
             "holdout": [asdict(s) for s in self.holdout],
             "train": [asdict(s) for s in self.train],
             "comparison": None if self.comparison is None else self.comparison.to_dict(),
+            "bands": None if self.bands is None else asdict(self.bands),
             "misfit": None if self.misfit is None else {**asdict(self.misfit), "matters": self.misfit.matters},
             "causes": list(self.causes),
             "outside_prior": [asdict(o) for o in self.outside],

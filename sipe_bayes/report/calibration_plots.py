@@ -215,7 +215,7 @@ def _signal_handles() -> list[Artist]:
     return [
         line_handle(MEASURED, "measured", lw=1),
         line_handle(POSTERIOR, "posterior mode", lw=1.5),
-        shade_handle(POSTERIOR, "90 % band of the posterior"),
+        shade_handle(POSTERIOR, "90 % band of what is read"),
         line_handle(DEFAULT, "model as given", "--", lw=1),
         line_handle(PRIOR, "a window starts", "none", marker="|", ms=8, mew=1.2),
     ]

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from sipe_bayes.core.finding_texts import TEXTS
 from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.records import ChannelScore, Comparison
+from sipe_bayes.diagnostics.records import BandCoverage, ChannelScore, Comparison
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report.words import listed, number
 
 _ONE = "The one value may be trusted within its interval"
 _NAMED, _DOUBTS = 6, 2  # parameters and doubts that a sentence lists
+_FIVE_TO_95 = 0.9 * math.sqrt(12)  # sds of a uniform prior
 
 _PROBLEMS = (
     Code.MODE_AT_BOUND,
@@ -29,6 +30,8 @@ _PROBLEMS = (
     Code.MISFIT_SHIFTS,
 )
 """Findings for which a parameter's value is not to be trusted, in the order in which its row names them."""
+_ALLOWED_FOR = (Code.LOGS_DISAGREE, Code.LOGS_DISAGREE_UNEXPLAINED, Code.MISFIT, Code.MISFIT_SHIFTS)
+"""Those of which the intervals with what the model lacks take account."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +54,16 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     shared = bool(others) and parameter.contraction < THRESHOLDS.well_determined and Code.NO_EFFECT not in codes
     if shared:
         codes.discard(Code.NOT_DETERMINED)
-    problems = [TEXTS[code].row for code in _PROBLEMS if code in codes]
+    allowed = _ALLOWED_FOR if parameter.further is not None else ()
+    problems = [TEXTS[code].row for code in _PROBLEMS if code in codes and code not in allowed]
     if problems:
         return Verdict("bad", ", ".join(problems))
     if shared:
         return Verdict("fair", f"only with {listed(others)}")
     if not parameter.sd > 0:
         return Verdict("fair", "a point without uncertainty")
+    if parameter.further is not None:
+        return _with_what_is_lacking(parameter, findings)
     partly = f"; {TEXTS[Code.DEAD_RANGE].row}" if Code.DEAD_RANGE in codes else ""
     if parameter.contraction < THRESHOLDS.well_determined:
         return Verdict("fair", "weakly determined" + partly)
@@ -65,29 +71,77 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
 
 
-def headline(parameters: Sequence[ParameterSummary], findings: Findings, brief: bool = False) -> Verdict:
+def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Verdict:
+    """How far the wider interval determines a parameter."""
+    low, high = parameter.further or (math.nan, math.nan)
+    prior = _FIVE_TO_95 * parameter.sd / max(1 - parameter.contraction, 1e-12)
+    if not (high - low) < (1 - THRESHOLDS.not_determined) * prior:
+        return Verdict("bad", "not determined with what the model lacks")
+    doubted = "; but see the doubt above" if _doubts(findings, [parameter]) else ""
+    return Verdict("fair", "within the wider interval" + doubted)
+
+
+def _doubts(findings: Findings, parameters: Sequence[ParameterSummary]) -> list[str]:
+    """The texts of findings that block, but for those of which wider intervals take account."""
+    wider = any(p.further is not None for p in parameters)
+    return [item.text for item in findings.blocking if not (wider and item.code in _ALLOWED_FOR)]
+
+
+def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None) -> Verdict:
+    """What a model that lacks something may be used for."""
+    tones = {p.name: parameter_verdict(p, findings).tone for p in parameters}
+    usable, open_ = [n for n, tone in tones.items() if tone != "bad"], [n for n, tone in tones.items() if tone == "bad"]
+    text = "It does not tell how well it predicts"
+    if bands is not None:
+        share, error = 100 * bands.share, 100 * bands.error
+        text = f"Use it to predict: its 90 % bands hold {share:.0f} ± {error:.0f} % of the held-out samples"
+        if abs(bands.share - THRESHOLDS.shown_interval) > 2 * bands.error + THRESHOLDS.band_off:
+            text = f"Do not rely on its bands: those of 90 % hold {share:.0f} ± {error:.0f} % of the held-out samples"
+        half = ", ".join(f"± {number(width, 2)} in {channel}" for channel, width in list(bands.half.items())[:_DOUBTS])
+        text += f" ({half})"
+    if usable:
+        text += f"; {_few(usable)} within the intervals with what the model lacks"
+    if open_:
+        text += f"; {_few(open_)} not at all"
+    return Verdict("fair" if usable else "bad", f"{text}.")
+
+
+def _few(names: Sequence[str]) -> str:
+    return listed(names) if len(names) <= _NAMED else f"{listed(names[:_NAMED])} and others"
+
+
+def headline(
+    parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None = None, brief: bool = False
+) -> Verdict:
     """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks.
 
-    brief: without the doubts, where they are told beside it.
+    Where the model lacks something: what it may be used for.
+
+    Args:
+        parameters: all of them.
+        findings: about them.
+        bands: what those of the held-out logs hold.
+        brief: without the doubts, where they stand beside it.
     """
     wanted = [p for p in parameters if not p.nuisance]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
-    doubts = findings.doubts
+    doubts = _doubts(findings, wanted)
     if doubts and brief:
         return Verdict("bad", "No value may be trusted within its interval yet; the first warning says why.")
     if doubts:
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
         first = "; ".join(doubts[:_DOUBTS])
         return Verdict("bad", f"No value may be trusted within its interval yet: {first}{others}.")
+    if any(p.further is not None for p in wanted):
+        return _use(wanted, findings, bands)
     good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
         return Verdict("good", f"{text}.")
-    named = listed(good) if len(good) <= _NAMED else f"{listed(good[:_NAMED])} and others"
-    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals: {named}"
+    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals: {_few(good)}"
     return Verdict("fair", f"{text}; the table says why not the others.")
 
 
@@ -166,11 +220,14 @@ def mixing_verdict(calibration: Calibration) -> Verdict | None:
     return Verdict("bad", text)
 
 
-def verdicts(calibration: Calibration) -> list[Verdict]:
-    """The sentences at the top of the report; the first says so where the calibration does not help."""
+def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:
+    """The sentences at the top of the report; the first says so where the calibration does not help.
+
+    brief: without the doubts, where they are told beside it.
+    """
     findings = Findings(calibration.findings)
     predicted = prediction(calibration.holdout, calibration.comparison)
-    first = [headline(calibration.parameters, findings), predicted]
+    first = [headline(calibration.parameters, findings, calibration.bands, brief), predicted]
     if predicted.tone == "bad":
         first.reverse()
     mixing = mixing_verdict(calibration)

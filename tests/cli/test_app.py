@@ -236,8 +236,8 @@ def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log
     text('file = "log.csv"\nname = "rest"\nuse = "holdout"', 'file = "other.csv"\nname = "other"')(tmp_path)
     result = call(config, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr
-    assert "a further" in result.stdout
-    assert "a further log's" in (tmp_path / "out" / "report.html").read_text()
+    assert "with what it lacks" in result.stdout
+    assert "with what the model lacks" in (tmp_path / "out" / "report.html").read_text()
     found = strict_json((tmp_path / "out" / "result.json").read_text())
     assert any("logs disagree" in said for said in found["doubts"])
     (mass,) = (p for p in found["parameters"] if p["name"] == "mass")
@@ -246,7 +246,7 @@ def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log
     assert high - low > 3 * (mass["q95"] - mass["q05"])
 
 
-@pytest.mark.parametrize("part", ["misfit", "outside_prior"])
+@pytest.mark.parametrize("part", ["ProbedLogs", "outside_prior"])
 def test_a_check_that_fails_is_one_warning(
     part: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
+    BandCoverage,
     ChannelScore,
     Comparison,
 )
@@ -184,6 +185,31 @@ def test_headline_counts_without_nuisance_parameters() -> None:
         assert judged.headline(values, doubts) == expected
     assert judged.parameter_verdict(good, Findings()).tone == "good"
     assert judged.parameter_verdict(good, doubts).tone == "fair"
+
+
+def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
+    """Values whose wider interval still determines them, bands with what they hold; other doubts come first.
+
+    The prior's 90 % are 3.1 wide, half of it 1.6.
+    """
+    narrow = dataclasses.replace(parameter(0.9), further=(0.5, 1.5))
+    wide = dataclasses.replace(parameter(0.9), name="damping", further=(0.2, 2.2))
+    misfits = [noticed(Code.MISFIT, name) for name in ("mass", "damping")]
+    lacks = Findings([noticed(Code.LOGS_DISAGREE, "mass", severity=Severity.BLOCKING), *misfits])
+    assert judged.parameter_verdict(narrow, lacks) == judged.Verdict("fair", "within the wider interval")
+    assert judged.parameter_verdict(wide, lacks).tone == "bad"
+    held = BandCoverage(0.88, 0.03, 20, {"angle": 0.02})
+    expected = (
+        "Use it to predict: its 90 % bands hold 88 ± 3 % of the held-out samples (± 0.02 in angle); mass within the "
+        "intervals with what the model lacks; damping not at all."
+    )
+    assert judged.headline([narrow, wide], lacks, held) == judged.Verdict("fair", expected)
+    off = judged.headline([narrow, wide], lacks, dataclasses.replace(held, share=0.6))
+    assert off.text.startswith("Do not rely on its bands: those of 90 % hold 60 ± 3 %")
+    assert judged.headline([wide], lacks).text == "It does not tell how well it predicts; damping not at all."
+    doubted = Findings([*lacks, doubt("the chains have not mixed", Code.NOT_MIXED)])
+    assert "yet: the chains have not mixed" in judged.headline([narrow, wide], doubted, held).text
+    assert "doubt above" in judged.parameter_verdict(narrow, doubted).text
 
 
 def doubt(text: str, code: Code = Code.SEARCH_SPREAD) -> Finding:

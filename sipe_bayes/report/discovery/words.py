@@ -145,11 +145,10 @@ def trust(discovery: Discovery) -> Verdict:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
         return Verdict("good", "Values may be trusted within the intervals averaged over the structures, no narrower.")
-    text = "No value may be trusted within its interval yet: the intervals are those of models that are still wrong"
     if any(p.further is not None for p in discovery.parameters):
-        text += (
-            "; beside them is what a further log would ask for, which holds what differs between logs or their pieces"
-        )
+        text = "Use values within the intervals with what the model lacks: the plain ones are those of models that are"
+        return Verdict("fair", f"{text} still wrong.")
+    text = "No value may be trusted within its interval yet: the intervals are those of models that are still wrong"
     return Verdict("bad", f"{text}.")
 
 

@@ -7,7 +7,7 @@ the library of extensions says to first order what missing physics would have do
 
 .. math:: r = J_\theta \delta + E b + J_x x + \varepsilon, \qquad b_k \sim \mathcal N(0, 1 / \alpha_k),
 
-of ``diagnostics.probed_logs``, the few columns of E that the evidence keeps are those whose alpha is finite at its
+of ``misfit.probed_logs``, the few columns of E that the evidence keeps are those whose alpha is finite at its
 maximum (sparse Bayesian learning: M. Tipping, A. Faul, "Fast marginal likelihood maximisation for sparse Bayesian
 models", AISTATS 2003, https://proceedings.mlr.press/r4/tipping03a.html). Their posterior, means and covariance, moves
 and widens what each log asks for.
@@ -17,7 +17,8 @@ library does not hold, or that are not small: both intervals, plain and correcte
 
 Deviations:
 
-- A column is taken only where it raises the log evidence by ``gain``: there are dozens, and many are alike.
+- A column is taken only where it raises the log evidence by ``gain``, and ``causes`` at most: there are dozens, and a
+  dozen of them together would explain anything.
 - The noise is estimated anew with the columns that were taken, in turns.
 - Gains that differ between logs are not taken: they would explain why logs differ, which the spread is to hold.
 """
@@ -33,7 +34,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
-from sipe_bayes.diagnostics.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, chosen
+from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, chosen
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
@@ -46,6 +47,7 @@ class MissingPhysicsOptions(Options):
     """How causes are taken from the library."""
 
     gain: float = option(2.0, "of the log evidence, below which a cause is not taken", "nats", least=0)
+    causes: int = option(4, "columns that are taken at most: a dozen small ones together explain anything", least=1)
     rounds: int = option(3, "in which causes and noise are estimated in turn", least=1)
     most: int = option(300, "steps of the search for causes", least=1)
 
@@ -240,7 +242,9 @@ def sparse(
             alpha[weak[np.argmin(gain[weak])]] = np.inf
             continue
         taken = np.isfinite(alpha)
-        rise = np.where(taken, gain - _evidence(alpha, s, q), np.where(gain >= options.gain, gain, 0.0))
+        room = taken.sum() < options.causes
+        new = np.where(room & (gain >= options.gain), gain, 0.0)
+        rise = np.where(taken, gain - _evidence(alpha, s, q), new)
         k = int(rise.argmax())
         if rise[k] < 1e-3:
             break

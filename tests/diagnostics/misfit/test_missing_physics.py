@@ -10,8 +10,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.agreement import parts_of
-from sipe_bayes.diagnostics.missing_physics import MissingPhysics, missing_physics, sparse
-from sipe_bayes.diagnostics.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, sparse
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise

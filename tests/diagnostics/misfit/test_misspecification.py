@@ -11,9 +11,9 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import best_starts
-from sipe_bayes.diagnostics.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
-from sipe_bayes.diagnostics.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator

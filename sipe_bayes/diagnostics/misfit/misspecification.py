@@ -35,7 +35,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.probed_logs import MISFIT, ProbedLogs, Solved, lags
+from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs, Solved, lags
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.structure.probes import Probe
 

@@ -1,8 +1,8 @@
 """Logs linearised at an estimate, with what the library of extensions would do to them beside the parameters.
 
 The columns of the linear model are the N parameters, K probes (a small step of each extension of ``structure``, see
-``structure.probes``) and the windows' starts. What the checks of the residuals ask (``diagnostics.misspecification``)
-and the intervals for a model that lacks something (``diagnostics.missing_physics``) are both answered in it.
+``structure.probes``) and the windows' starts. What the checks of the residuals ask (``misfit.misspecification``) and
+the intervals for a model that lacks something (``misfit.missing_physics``) are both answered in it.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class ProbedLogs:
         return Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
 
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
-        """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest piece's mean square."""
+        """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares."""
         white = self.white(residual, noise)
         pieces = [
             max((float((p**2).mean()) for p in np.array_split(z, MISFIT.pieces) if len(p)), default=0.0) for z in white

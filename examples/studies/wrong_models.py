@@ -1,0 +1,202 @@
+"""Do intervals hold physical values where the model lacks something? Six logs each, plain intervals beside.
+
+    python examples/studies/wrong_models.py                       # hours
+    python examples/studies/wrong_models.py --seeds 2
+    python examples/studies/wrong_models.py --seeds 0             # the tables of what there is
+
+The machines of ``discover.py`` (a pendulum, a double pendulum, a slide; masses and damping unknown, truths drawn in
+.2 to .8 of their ranges), six logs of 5 s with commands of different sizes, .5 % noise. Planted at a joint, of a tenth
+of the joint's usual force: friction under load, a delay of two samples, dry friction that differs by direction, dry
+friction, backlash (3 % of what the joint moves) and compliance; and nothing. Each is fitted twice: with the library
+as it is, and without the planted extension in it (``unknown``), as where nobody has thought of what is missing.
+
+Coverage is that of 90 % intervals, pooled over parameters: plain ones, those for a further log from the spread between
+the logs alone, and those with what the model lacks, which are printed where the residuals raise an alarm or the logs
+disagree; ``printed`` is what the report shows first. Every fit is one line in runs/, results/wrong_models.json holds
+the tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from itertools import product
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from _kept import fits, keep
+from discover import DT, MACHINES, commands, plain, values
+
+import sipe_bayes as sipe
+from sipe_bayes.core.files import write_text
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.agreement import disagreement, linear_estimates, parts_of
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.random_effects import random_effects
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.machine import Machine, machine_of
+from sipe_bayes.structure.registry import EXTENSIONS, get_extension
+
+HERE = Path(__file__).parent
+RUNS = HERE / "runs" / "wrong_models.jsonl"
+EFFECTS = ("load_friction", "delay", "direction_friction", "dry_friction", "gear_backlash", "gear_compliance")
+LOGS, SIZE = 6, 0.1
+KINDS = ("plain", "spread", "lacking", "printed")
+
+
+def truth_of(placed: Placed, machine: Machine) -> list[float]:
+    """The extension's parameters, by its force or by a share of what its joint moves."""
+    if placed.extension.name in ("gear_backlash", "gear_compliance"):
+        own = min(machine.joints[placed.site].position, 1.0)
+        return [0.03 * own, *(float(p.value(0.5)) for p in placed.parameters[1:])]
+    return values(placed, machine, SIZE)
+
+
+def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, Trajectories]:
+    """The plain model, the truth (N,) in theta, and the logs of a machine that has an effect."""
+    simulator = plain(name)
+    rng = np.random.default_rng([seed, [*MACHINES].index(name), ("null", *EFFECTS).index(effect)])
+    actions = [commands(name, rng)[0] * rng.uniform(0.5, 1.3) for _ in range(LOGS)]
+    truth = rng.uniform(0.2, 0.8, len(simulator.space))
+    engine, theta, start = simulator, truth, simulator.default_state()[None]
+    if effect != "null":
+        quiet = simulator.rollout(truth[None], actions[0][None], start, DT)
+        seen = Trajectories.stack([Trajectory(quiet.observations[0], actions[0], DT, channels=quiet.channels)])
+        windows = Windows(Segments(), simulator, seen)
+        machine = machine_of(windows, truth, windows.no_starts())
+        choices = list(placements(get_extension(effect), machine))
+        one = choices[seed % len(choices)]
+        assert isinstance(simulator.environment, MjcfEnvironment)
+        engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)
+        own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine), strict=True)]
+        theta, start = np.concatenate([truth, own]), engine.default_state()[None]
+    logs = []
+    for k, command in enumerate(actions):
+        clean = engine.rollout(theta[None], command[None], start, DT)
+        sd = 0.005 * np.sqrt((clean.observations[0] ** 2).mean(0))
+        noisy = clean.observations[0] + sd * rng.standard_normal(clean.observations[0].shape)
+        logs.append(Trajectory(noisy, command, DT, name=f"log {k}", channels=clean.channels))
+    return simulator, truth, Trajectories.stack(logs)
+
+
+def fitted(name: str, effect: str, seed: int, unknown: bool) -> dict[str, Any]:
+    """One fit, as a row."""
+    simulator, truth, logs = recorded(name, effect, seed)
+    method, began = Laplace(simulator, seed=seed), time.process_time()
+    posterior = method.fit(logs)
+    fit_s, theta = time.process_time() - began, posterior.mode.numpy()
+    windows = bind(method.likelihood, simulator, logs)
+    noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
+    starts = method.fitted_starts(theta)
+    assert starts is not None
+    lin, parts = windows.linearise(theta, starts), parts_of(windows)
+    with mock.patch("sipe_bayes.structure.probes.EXTENSIONS", [e for e in EXTENSIONS if not (unknown and e == effect)]):
+        probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(method.prior), lin)
+    seen = misfit(probed, posterior.stddev.numpy(), seed)
+    alone = linear_estimates(windows, theta, starts, noise, lin, parts)
+    conflict = disagreement(simulator.space, alone)
+    missing = missing_physics(probed, method.prior, seed)
+    alarm = seen.alarm or conflict is not None
+    try:
+        spread: Posterior | None = random_effects(alone, method.prior, seed).new_log
+    except ValueError:  # none near the cube
+        spread = None
+    lacking = None if missing is None else missing.further
+    kinds = dict(zip(KINDS, (posterior, spread, lacking, lacking if alarm else posterior), strict=True))
+    return {
+        "machine": name,
+        "effect": effect,
+        "seed": seed,
+        "unknown": unknown,
+        "alarm": alarm,
+        "truth": truth.tolist(),
+        "ends": {kind: None if p is None else ends(p) for kind, p in kinds.items()},
+        "causes": [] if missing is None else list(missing.causes),
+        "explained": missing is not None and missing.explained,
+        "fit_s": round(fit_s, 1),
+        "checks_s": round(time.process_time() - began - fit_s, 1),
+    }
+
+
+def ends(posterior: Posterior) -> list[list[float]]:
+    """Of the 90 % intervals, (2, N) in theta."""
+    quantiles: list[list[float]] = posterior.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).tolist()
+    return quantiles
+
+
+def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Coverage, its standard error by fit, and the median width in the range; None of intervals that are not there."""
+    out: dict[str, Any] = {"fits": len(rows), "alarms": float(np.mean([row["alarm"] for row in rows]))}
+    for kind in KINDS:
+        inside, widths = [], []
+        for row in rows:
+            if row["ends"][kind] is not None:
+                low, high = np.array(row["ends"][kind])
+                truth = np.array(row["truth"])
+                inside.append(float(((low <= truth) & (truth <= high)).mean()))
+                widths += (high - low).tolist()
+        if inside:
+            error = float(np.std(inside) / np.sqrt(len(inside)))
+            out[kind] = {"coverage": float(np.mean(inside)), "error": error, "width": float(np.median(widths))}
+            out[kind] = {key: round(value, 4) for key, value in out[kind].items()} | {
+                "without": len(rows) - len(inside)
+            }
+    return out
+
+
+def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """All wrong models with the library and without the cause in it, right ones, and by effect."""
+    wrong = [row for row in rows if row["effect"] != "null"]
+    out = {"right models": shares([r for r in rows if r["effect"] == "null"])} if len(wrong) < len(rows) else {}
+    for unknown, what in ((False, "in the library"), (True, "unknown")):
+        mine = [row for row in wrong if row["unknown"] == unknown]
+        if mine:
+            out[what] = shares(mine)
+            out[f"{what}, by effect"] = {
+                effect: shares([row for row in mine if row["effect"] == effect])
+                for effect in EFFECTS
+                if any(row["effect"] == effect for row in mine)
+            }
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--machines", nargs="+", default=list(MACHINES))
+    parser.add_argument("--effects", nargs="+", default=["null", *EFFECTS])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--out", type=Path, default=RUNS)
+    given = parser.parse_args()
+    rows = fits(given.out)
+    done = {(r["machine"], r["effect"], r["seed"], r["unknown"]) for r in rows}
+    for seed, *rest in product(range(given.seeds), given.machines, given.effects, (False, True)):
+        cell = (rest[0], rest[1], seed, rest[2])
+        if cell in done or (cell[1] == "null" and cell[3]):
+            continue
+        row = keep(given.out, fitted(*cell))
+        rows.append(row)
+        truth = np.array(row["truth"])
+        held = {
+            k: v and int(((np.array(v[0]) <= truth) & (truth <= np.array(v[1]))).sum()) for k, v in row["ends"].items()
+        }
+        print(*cell, held, "of", len(truth), row["causes"], row["explained"], row["checks_s"], flush=True)
+        write_text(HERE / "results" / "wrong_models.json", json.dumps(tables(rows), indent=1) + "\n")
+    print(json.dumps({k: v for k, v in tables(rows).items() if "by effect" not in k}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
