@@ -7,13 +7,14 @@ after its posterior: a record that exists is whole.
 
 from __future__ import annotations
 
-import fcntl
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.bank import Bank
@@ -114,14 +115,17 @@ def claimed(folder: Path) -> Iterator[None]:
     """The folder, made if need be, for one run at a time; raises OutputError where another one is at work."""
     not_a_file(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / _LOCK).open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError(
-                f"--out {folder}: another run is at work in it; wait for it, or choose another folder"
-            ) from None
+    lock = FileLock(folder / _LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise OutputError(
+            f"--out {folder}: another run is at work in it; wait for it, or choose another folder"
+        ) from None
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def without_record(cells: Sequence[Cell], order: Order, kind: AnyMeasurement) -> list[Cell]:
