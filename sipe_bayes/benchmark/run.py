@@ -115,6 +115,7 @@ def claimed(folder: Path) -> Iterator[None]:
     """The folder, made if need be, for one run at a time; raises OutputError where another one is at work."""
     not_a_file(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / _LOCK).touch()  # where it can not be written, the error names it
     lock = FileLock(folder / _LOCK)
     try:
         lock.acquire(blocking=False)
