@@ -1,6 +1,13 @@
-"""The site: `make docs`."""
+"""The site: `make docs`.
 
+Pages with code cells are run when it is built, as notebooks. What they gave is kept in `_build` for as long as neither
+they nor the package change.
+"""
+
+import hashlib
+import os
 import re
+from pathlib import Path
 
 import sphinx.application
 
@@ -8,7 +15,7 @@ import sipe_bayes
 
 project = "sipe_bayes"
 release = version = sipe_bayes.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 exclude_patterns = ["_build"]
@@ -17,6 +24,19 @@ html_title = f"sipe_bayes {release}"
 html_theme_options = {"show_toc_level": 2}
 html_copy_source = False
 myst_heading_anchors = 3
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted(p for name in ("sipe_bayes", "examples", "results") for p in (ROOT / name).rglob("*") if p.is_file())
+CODE = [
+    p for p in (*SOURCES, ROOT / "constraints.txt") if p.suffix in (".py", ".toml", ".xml", ".csv", ".json", ".txt")
+]
+VERSION = hashlib.sha256(b"".join(path.read_bytes() for path in CODE)).hexdigest()[:16]
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(Path(__file__).parent / "_build" / f".run-{VERSION}")
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 240
+nb_merge_streams = True
+os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # tqdm's, of a notebook without ipywidgets
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+((?:examples|results|sipe_bayes|\.github)[^)#]*)(?:#[^)]*)?\)")
 
 

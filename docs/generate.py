@@ -319,7 +319,7 @@ def llms() -> str:
     )
     lines = []
     for path in pages:
-        text = path.read_text(encoding="utf-8").replace(NOTE, "")
+        text = re.sub(r"\A---\n.*?\n---\n", "", path.read_text(encoding="utf-8"), flags=re.DOTALL).replace(NOTE, "")
         title, _, rest = text.strip().partition("\n")
         first = " ".join(rest.strip().split("\n\n")[0].split())
         about = first.split(". ")[0].rstrip(".:") if first[:1].isalpha() else ""

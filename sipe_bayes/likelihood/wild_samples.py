@@ -87,12 +87,11 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
     spread = windows.spread
     for c, sequence in enumerate(windows.sequences):
         index = sequence.index
-        least = _least(windows, c) * spread[c]
-        if not np.isfinite(least) or len(index) <= 2 * WILD.neighbours + 1:
+        if not np.isfinite(least := _least(windows, c)) or len(index) <= 2 * WILD.neighbours + 1:
             continue
         series, log = residual[..., c].reshape(-1)[index], windows.log[sequence.window]
         steps, within = np.abs(np.diff(series)), np.diff(log) == 0
-        limit = np.maximum(WILD.residual_sds * _scale(steps[within]), least)
+        limit = np.maximum(WILD.residual_sds * _scale(steps[within]), least * spread[c])
         limit = np.maximum(WILD.residual_times * _around(steps), limit)
         at, wild = np.flatnonzero((steps > limit) & within), np.zeros(len(index), bool)
         moved = np.abs(np.diff(windows.measured[..., c].reshape(-1)[index]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import importlib.util
 import json
@@ -32,8 +33,11 @@ ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 OWN = [README, *(ROOT / name for name in ("CHANGELOG.md", "SECURITY.md", "llms.txt"))]
 PAGES = OWN + sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts)
-BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", flags=re.DOTALL)
-KINDS = {"python", "toml", "bash"}
+BLOCK = re.compile(
+    r"(?:<!-- (?P<mark>[^\n]*) -->\n)?```(?:\{code-cell\} )?(?P<kind>\w+)\n(?P<text>.*?)```", flags=re.DOTALL
+)
+CELLS = "ipython3"  # which `make docs` runs
+KINDS = {"python", "toml", "bash", CELLS}
 COMMAND: Any = typer.main.get_command(app)
 
 
@@ -104,6 +108,33 @@ def test_blocks_are_of_kinds_that_are_tested() -> None:
     for page in PAGES:
         kinds = {m["kind"] for m in BLOCK.finditer(page.read_text(encoding="utf-8"))}
         assert kinds <= KINDS, page
+
+
+def test_pages_with_cells_are_notebooks() -> None:
+    """`make docs` runs those alone."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert text.startswith("---\nfile_format: mystnb\n") == bool(blocks(page, CELLS)), page
+
+
+def test_gallery_has_every_figure() -> None:
+    """Each public function of the figures' modules that returns one."""
+    shown = "\n".join(text for _, text in blocks(ROOT / "docs" / "gallery.md", CELLS))
+    wanted = []
+    for path in sorted((ROOT / "sipe_bayes").rglob("*.py")):
+        if re.search(r"(plots?|figures)\.py$", path.name):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            wanted += [
+                f"{path.stem.replace('sipe_plot', '')}.{f.name}".lstrip(".")
+                for f in tree.body
+                if isinstance(f, ast.FunctionDef)
+                and not f.name.startswith("_")
+                and f.returns is not None
+                and ast.unparse(f.returns) in ("Figure", "list[Figure]")
+                and f.name not in ("log_figure",)  # a part of others
+            ]
+    assert len(wanted) > 15
+    assert not [name for name in wanted if f"{name}(" not in shown]
 
 
 RUN = """\
