@@ -55,6 +55,8 @@ def suggest(
         whole("--draws", draws)
         positive("--duration", duration)
         problem = prepare(config, threads)
+        if any(command.supply is not None for command in problem.config.commands):
+            raise ValueError(f"{config}: a supply's voltage can not be planned; drop `supply` from the commands")
         read = (config, problem.config.model, *(log.file for log in problem.config.logs), *(given or []))
         if out.resolve() in (path.resolve() for path in read):
             raise ValueError(f"--out {out}: is what {config} reads, and would be lost; choose another name")
@@ -118,7 +120,7 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
     from sipe_bayes.core.units import to_si
     from sipe_bayes.diagnostics.expected import Plan
 
-    clock, commands, model = problem.config.columns.time, problem.config.drives, problem.simulator.model
+    clock, commands, model = problem.config.columns.time, problem.config.commands, problem.simulator.model
     table, names = read_table(file), [clock.column, *(c.column for c in commands)]
     for name in names:
         if name not in table:
@@ -129,7 +131,8 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
         raise ValueError(f"--given {file}: expected a command for each time, and times that increase; sort the rows")
     grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
     held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
-    columns = [c.sign * to_si(c.unit)[0] * values[held] for c, values in zip(commands, series, strict=True)]
+    scales = [c.sign * c.factor * to_si(c.unit)[0] for c in commands]
+    columns = [scale * values[held] for scale, values in zip(scales, series, strict=True)]
     for command, values in zip(commands, columns, strict=True):
         actuator = model.actuator(command.actuator).id
         low, high = model.actuator_ctrlrange[actuator]
@@ -161,6 +164,6 @@ def _write(problem: Problem, plan: Plan, out: Path) -> None:
 
     clock = problem.config.columns.time
     columns: dict[str, Any] = {clock.column: np.arange(len(plan.actions)) * plan.dt / to_si(clock.unit)[0]}
-    for command, column in zip(problem.config.drives, plan.actions.T, strict=True):
-        columns[command.column] = command.sign * column / to_si(command.unit)[0]
+    for command, column in zip(problem.config.commands, plan.actions.T, strict=True):
+        columns[command.column] = command.sign * column / (command.factor * to_si(command.unit)[0])
     write_text(out, pd.DataFrame(columns).to_csv(index=False, float_format="%.9g"))

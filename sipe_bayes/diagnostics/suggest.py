@@ -27,8 +27,6 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
-from sipe_bayes.envs.laws.firmware import supplies_of
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import Posterior
@@ -138,9 +136,7 @@ def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArr
     """
     environment, model = simulator.environment, simulator.model
     ranges = np.full((environment.num_actions, 2), np.nan)
-    names: tuple[str, ...] | None = None
-    if isinstance(environment, MjcfEnvironment):
-        names = (*environment.actuators, *supplies_of(environment.edits))
+    names = getattr(environment, "actuators", None)
     for j in range(environment.num_actions):
         actuator = model.actuator(names[j]).id if names is not None else None
         if actuator is not None and model.actuator_ctrllimited[actuator]:

@@ -176,13 +176,14 @@ class _Loop:
         if not block.shape[1] or not self.numbers.delay.any():
             return set_point
         times, values = np.split(block, 2, axis=1)
-        arrived = set_point.copy()
-        for row in np.flatnonzero(self.numbers.delay > 0):
-            order = np.argsort(times[row])
-            at = here[row, 0] - self.numbers.delay[row]
-            known = np.append(times[row, order], here[row, 0]), np.append(values[row, order], set_point[row])
-            arrived[row] = np.interp(at, *known)
-        return arrived
+        order, now = np.argsort(times, axis=1), here[:, :1]
+        times = np.concatenate([np.take_along_axis(times, order, 1), now], axis=1)
+        values = np.concatenate([np.take_along_axis(values, order, 1), set_point[:, None]], axis=1)
+        at = now - self.numbers.delay[:, None]
+        after = np.clip((times < at).sum(1, keepdims=True), 1, times.shape[1] - 1)
+        (t0, t1), (u0, u1) = ([np.take_along_axis(x, k, 1) for k in (after - 1, after)] for x in (times, values))
+        share = np.clip((at - t0) / np.maximum(t1 - t0, 1e-12), 0, 1)
+        return np.asarray((u0 + share * (u1 - u0))[:, 0])
 
 
 class FirmwareSteps:
@@ -244,14 +245,19 @@ class FirmwareSteps:
                         here[:, bound.activations.stop - 1] = loop.output * share
                 out, seen = steps(models, here, inputs, control_spec, reads)
                 for loop in loops:
-                    self._restore(loop, out, times[:, a:b], controls[:, a:b, loop.bound.control])
+                    self._restore(loop, out, times[:, a:b], controls[:, a:b, loop.bound.control], timestep)
                 here = out[:, -1].copy()
                 states.append(out)
                 sensors.append(seen)
         return np.concatenate(states, axis=1), np.concatenate(sensors, axis=1)
 
-    def _restore(self, loop: _Loop, out: FloatArray, times: FloatArray, set_points: FloatArray) -> None:
-        """Put into states (B, n, S) what the controller remembers, and the set-points (B, n) that came at times."""
+    def _restore(
+        self, loop: _Loop, out: FloatArray, times: FloatArray, set_points: FloatArray, timestep: FloatArray
+    ) -> None:
+        """Put into states (B, n, S) what the controller remembers, and the set-points (B, n) that came at times.
+
+        Physics steps take ``timestep`` (B,) seconds.
+        """
         bound = loop.bound
         first = bound.activations.start
         out[:, :, first : first + loop.kept.shape[1]] = loop.kept[:, None]
@@ -259,9 +265,10 @@ class FirmwareSteps:
         if samples:
             begin = bound.history.start
             stamped, value = out[:, :, begin : begin + samples], out[:, :, begin + samples : bound.history.stop]
-            near = np.abs(stamped[..., None] - times[:, None, None]) < 1e-9
-            new = (near * set_points[:, None, None]).sum(-1)
-            value[:] = np.where(near.any(-1), new, value)
+            begun, last = times[:, :1, None], times.shape[1] - 1
+            step = (stamped - begun) / timestep[:, None, None]
+            new = np.take_along_axis(set_points[:, None], np.clip(np.rint(step), 0, last).astype(int), axis=2)
+            value[:] = np.where((step > -0.5) & (step < last + 0.5), new, value)
 
 
 def _due(times: FloatArray, period: float) -> BoolArray:
