@@ -26,7 +26,7 @@ import scipy.optimize
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.evaluate import posterior_band
+from sipe_bayes.diagnostics.evaluate import fitted_units, posterior_band
 from sipe_bayes.diagnostics.records import BandCoverage
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
@@ -101,12 +101,13 @@ def predictive_bands(
 def band_coverage(windows: Windows, low: FloatArray, high: FloatArray) -> BandCoverage | None:
     """How much of logs their bands (W, L, C) hold; None where nothing was measured."""
     shares, halves = [], {}
-    for c, channel in enumerate(windows.fitted):
+    for c, (channel, unit) in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
         inside = (low[..., c] <= windows.measured[..., c]) & (windows.measured[..., c] <= high[..., c])
         pieces = _pieces(windows, c)
         if pieces:
             shares.append([float(inside[piece].mean()) for piece in pieces])
-            halves[channel] = float(np.median(np.concatenate([(high - low)[..., c][p] for p in pieces])) / 2)
+            width = np.concatenate([(high - low)[..., c][piece] for piece in pieces])
+            halves[channel] = float(np.median(width)) / 2, unit
     if not shares:
         return None
     every = np.concatenate(shares)

@@ -50,13 +50,13 @@ class BandCoverage:
         share: of the samples, the mean over pieces of the logs.
         error: standard error by pieces.
         pieces: tenths of each log and channel.
-        half: channel -> median half width of its band, in its unit.
+        half: channel -> median half width of its band, and its unit.
     """
 
     share: float
     error: float
     pieces: int
-    half: dict[str, float]
+    half: dict[str, tuple[float, str]]
 
 
 @dataclass(frozen=True)

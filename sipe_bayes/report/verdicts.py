@@ -97,7 +97,8 @@ def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: Band
         text = f"Use it to predict: its 90 % bands hold {share:.0f} ± {error:.0f} % of the held-out samples"
         if abs(bands.share - THRESHOLDS.shown_interval) > 2 * bands.error + THRESHOLDS.band_off:
             text = f"Do not rely on its bands: those of 90 % hold {share:.0f} ± {error:.0f} % of the held-out samples"
-        half = ", ".join(f"± {number(width, 2)} in {channel}" for channel, width in list(bands.half.items())[:_DOUBTS])
+        widths = list(bands.half.items())[:_DOUBTS]
+        half = ", ".join(f"± {number(width, 2)} {unit}".rstrip() + f" in {name}" for name, (width, unit) in widths)
         text += f" ({half})"
     if usable:
         text += f"; {_few(usable)} within the intervals with what the model lacks"

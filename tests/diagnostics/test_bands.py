@@ -28,6 +28,8 @@ def windows(measured: FloatArray, logs: int) -> Any:
         trajectories=range(logs),
         rounding=np.zeros(channels),
         fitted=[f"c{k}" for k in range(channels)],
+        simulator=SimpleNamespace(environment=None),
+        channels=range(channels),
     )
 
 

@@ -198,10 +198,10 @@ def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
     lacks = Findings([noticed(Code.LOGS_DISAGREE, "mass", severity=Severity.BLOCKING), *misfits])
     assert judged.parameter_verdict(narrow, lacks) == judged.Verdict("fair", "within the wider interval")
     assert judged.parameter_verdict(wide, lacks).tone == "bad"
-    held = BandCoverage(0.88, 0.03, 20, {"angle": 0.02})
+    held = BandCoverage(0.88, 0.03, 20, {"angle": (0.02, "rad")})
     expected = (
-        "Use it to predict: its 90 % bands hold 88 ± 3 % of the held-out samples (± 0.02 in angle); mass within the "
-        "intervals with what the model lacks; damping not at all."
+        "Use it to predict: its 90 % bands hold 88 ± 3 % of the held-out samples (± 0.02 rad in angle); mass "
+        "within the intervals with what the model lacks; damping not at all."
     )
     assert judged.headline([narrow, wide], lacks, held) == judged.Verdict("fair", expected)
     off = judged.headline([narrow, wide], lacks, dataclasses.replace(held, share=0.6))
