@@ -8,12 +8,14 @@ jitter by 50 us. The values drawn here are hidden from the calibration; ``truth.
 
 from __future__ import annotations
 
-import argparse
-import json
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from making import make
 
 RATE, SECONDS, RUNS = 500.0, 10.0, 10  # Hz, as the physics, s, logs
 TICK = 2 * np.pi / 16384  # rad
@@ -71,20 +73,13 @@ def log(model: mujoco.MjModel, rng: np.random.Generator) -> dict[str, np.ndarray
     return {"time": stamps, "torque": np.round(1e2 * np.array(torques)).astype("i2"), "angle": np.array(angles, "i2")}
 
 
-def main() -> None:
-    """Write the logs and the truth."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
-    given = parser.parse_args()
-    rng = np.random.default_rng(given.seed)
-    truth = {name: float(low + (high - low) * rng.uniform(0.15, 0.85)) for name, (low, high) in BOUNDS.items()}
+def logs(truth: dict[str, float], rng: np.random.Generator, out: Path) -> None:
+    """Write every run."""
     model = truthful(Path(__file__).parent / "arm.xml", truth)
-    (given.out / "logs").mkdir(parents=True, exist_ok=True)
+    (out / "logs").mkdir(exist_ok=True)
     for run in range(RUNS):
-        np.savez_compressed(given.out / "logs" / f"run{run}.npz", **log(model, rng))
-    (given.out / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+        np.savez_compressed(out / "logs" / f"run{run}.npz", **log(model, rng))
 
 
 if __name__ == "__main__":
-    main()
+    make(__file__, BOUNDS, logs)

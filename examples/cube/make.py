@@ -2,29 +2,33 @@
 
 Friction and the contact's solref are drawn here and hidden from the calibration; ``truth.json`` keeps them.
 
-    python examples/cube/make.py [--tosses 50] [--seed 0] [--out examples/cube]
+    python examples/cube/make.py [--seed 0] [--out examples/cube]
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from making import make
+
 RATE, SECONDS, SUBSTEPS = 148.0, 0.6, 4  # samples per second, a toss, physics steps between samples
 POSITION_SD, TURN_SD = 0.002, np.radians(1.0)  # m, rad
-TRUTH = {"friction": 0.18, "timeconst": 0.012, "dampratio": 0.55}
+TOSSES = 50
+TRUTH = {"friction": 0.18, "timeconst": 0.012, "dampratio": 0.55}  # of the tosses in the repository
+BOUNDS = {"friction": (0.05, 0.6), "timeconst": (0.005, 0.03), "dampratio": (0.1, 1.2)}
 
 
-def truthful(path: Path) -> mujoco.MjModel:
+def truthful(path: Path, truth: dict[str, float]) -> mujoco.MjModel:
     """The model with the hidden values."""
     model = mujoco.MjModel.from_xml_path(str(path))
     model.opt.timestep = 1 / (RATE * SUBSTEPS)
-    model.geom_friction[:, 0] = TRUTH["friction"]
-    model.geom_solref[:] = TRUTH["timeconst"], TRUTH["dampratio"]
+    model.geom_friction[:, 0] = truth["friction"]
+    model.geom_solref[:] = truth["timeconst"], truth["dampratio"]
     return model
 
 
@@ -46,22 +50,15 @@ def toss(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
     return np.array(rows)
 
 
-def main() -> None:
-    """Write the logs and the truth."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tosses", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
-    given = parser.parse_args()
-    rng = np.random.default_rng(given.seed)
-    model = truthful(Path(__file__).parent / "cube.xml")
-    (given.out / "tosses").mkdir(parents=True, exist_ok=True)
-    for number in range(given.tosses):
+def logs(truth: dict[str, float], rng: np.random.Generator, out: Path) -> None:
+    """Write every toss."""
+    model = truthful(Path(__file__).parent / "cube.xml", truth)
+    (out / "tosses").mkdir(exist_ok=True)
+    for number in range(TOSSES):
         rows = [",".join([f"{r[0]:.5f}", *(f"{x:.4f}" for x in r[1:])]) for r in toss(model, rng)]
         text = "\n".join(["time,x,y,z,qw,qx,qy,qz", *rows]) + "\n"
-        (given.out / "tosses" / f"toss{number:02d}.csv").write_text(text)
-    (given.out / "truth.json").write_text(json.dumps(TRUTH, indent=2) + "\n")
+        (out / "tosses" / f"toss{number:02d}.csv").write_text(text)
 
 
 if __name__ == "__main__":
-    main()
+    make(__file__, BOUNDS, logs, committed=TRUTH)

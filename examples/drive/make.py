@@ -8,12 +8,14 @@ drawn here are hidden from the calibration; ``truth.json`` keeps them.
 
 from __future__ import annotations
 
-import argparse
-import json
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from making import make
 
 RATE, SECONDS = 1000.0, 24.8  # Hz, as the physics, s
 BOUNDS = {"mass": (1.0, 5.0), "damping": (0.0, 30.0), "friction": (0.0, 15.0), "offset": (-3.0, 3.0)}
@@ -37,14 +39,8 @@ def wanted(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return waves + 0.03 * np.sign(np.sin(2 * np.pi * step * t))
 
 
-def main() -> None:
-    """Write the log and the truth."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
-    given = parser.parse_args()
-    rng = np.random.default_rng(given.seed)
-    truth = {name: float(low + (high - low) * rng.uniform(0.15, 0.85)) for name, (low, high) in BOUNDS.items()}
+def log(truth: dict[str, float], rng: np.random.Generator, out: Path) -> None:
+    """Write the log."""
     model = truthful(Path(__file__).parent / "drive.xml", truth)
     count = round(SECONDS * RATE) + 1
     times = np.arange(count) / RATE
@@ -55,11 +51,9 @@ def main() -> None:
         rows.append((time + rng.normal(0, 1e-5), force, np.round((data.qpos[0] + rng.normal(0, 3e-6)) / 5e-6)))
         mujoco.mj_step(model, data)
     t, force, x = np.array(rows).T
-    given.out.mkdir(parents=True, exist_ok=True)
     columns = {"t": np.round(1e6 * (t - t[0])).astype("i4"), "force": np.round(100 * force).astype("i2")}
-    np.savez_compressed(given.out / "log.npz", **columns, x=x.astype("i4"))
-    (given.out / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+    np.savez_compressed(out / "log.npz", **columns, x=x.astype("i4"))
 
 
 if __name__ == "__main__":
-    main()
+    make(__file__, BOUNDS, log)

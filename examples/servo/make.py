@@ -8,12 +8,14 @@ turn. The values drawn here are hidden from the calibration; ``truth.json`` keep
 
 from __future__ import annotations
 
-import argparse
-import json
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from making import make
 
 RATE, SECONDS, RUNS, SUBSTEPS = 190.0, 4.0, 16, 6  # Hz, s, logs, physics steps between samples
 TICK = 2 * np.pi / 4096  # rad
@@ -58,21 +60,14 @@ def log(model: mujoco.MjModel, run: int, rng: np.random.Generator) -> list[str]:
     return rows
 
 
-def main() -> None:
-    """Write the logs and the truth."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent)
-    given = parser.parse_args()
-    rng = np.random.default_rng(given.seed)
-    truth = {name: float(low + (high - low) * rng.uniform(0.15, 0.85)) for name, (low, high) in BOUNDS.items()}
+def logs(truth: dict[str, float], rng: np.random.Generator, out: Path) -> None:
+    """Write every run."""
     model = truthful(Path(__file__).parent / "servo.xml", truth)
-    (given.out / "logs").mkdir(parents=True, exist_ok=True)
+    (out / "logs").mkdir(exist_ok=True)
     for run in range(RUNS):
         rows = ["time,goal,position", *log(model, run, rng)]
-        (given.out / "logs" / f"run{run:02d}.csv").write_text("\n".join(rows) + "\n")
-    (given.out / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+        (out / "logs" / f"run{run:02d}.csv").write_text("\n".join(rows) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    make(__file__, BOUNDS, logs)

@@ -295,6 +295,9 @@ def _residuals(
         return None, fitted_residuals(windows, theta, noise, starts)
     try:
         probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(problem.prior), fit.lin)
+        if probed.windows.num_windows < windows.num_windows:
+            asked = probed.windows.num_windows
+            unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=windows.num_windows))
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         probed = None

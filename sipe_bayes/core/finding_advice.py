@@ -120,6 +120,7 @@ ADVICE: dict[Code, str] = {
     Code.MISFIT_SHIFTS: f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong.",
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
+    Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",
     Code.PROCESS_NOISE: "What the model lacks acts there. A few per cent are usual of a good model.",
     Code.PROCESS_OUTLIERS: "Look at the log at these times: a kick, a contact, a sample that was lost.",

@@ -209,6 +209,7 @@ class Code(Enum):
         "whether the residuals are noise is not asked: through impacts no linearisation says what other physics does"
     )
     MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
+    CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "
         "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "

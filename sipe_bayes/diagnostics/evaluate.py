@@ -255,9 +255,13 @@ def posterior_band(
         here: (W, L, C), the prediction at theta.
     """
     draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
+    lines = _band(windows, theta, draws, here)
+    if np.isfinite(lines).all():
+        low, high = np.quantile(lines, [0.05, 0.95], axis=0)  # many times faster than with NaN
+        return low, high
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
-        low, high = np.nanquantile(_band(windows, theta, draws, here), [0.05, 0.95], axis=0)
+        low, high = np.nanquantile(lines, [0.05, 0.95], axis=0)
     return low, high
 
 

@@ -152,10 +152,14 @@ def _predictive(windows: Windows, logs: Trajectories, prior: Posterior, noise: N
 
 def _outlier_factors(simulated: FloatArray, log: FloatArray, scale: FloatArray) -> FloatArray:
     """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another, in scales (F,)."""
-    from sklearn.neighbors import LocalOutlierFactor
-
     every, varies = np.concatenate([log[None], simulated]), simulated.std(0) > 1e-12
     if not varies.any():
         return np.zeros(len(every))
-    factor = LocalOutlierFactor(n_neighbors=min(_OPTIONS.neighbours, len(simulated) - 1))
-    return np.asarray(-factor.fit(every[:, varies] / scale[varies]).negative_outlier_factor_)
+    points = every[:, varies] / scale[varies]
+    apart = np.sqrt(((points[:, None] - points) ** 2).sum(-1))
+    np.fill_diagonal(apart, np.inf)
+    near = np.argsort(apart, axis=1)[:, : min(_OPTIONS.neighbours, len(simulated) - 1)]
+    ways = np.take_along_axis(apart, near, axis=1)
+    # how densely the neighbourhood is filled, a way counted as no shorter than the neighbour's own to its k-th
+    density = 1 / (np.maximum(ways, ways[near, -1]).mean(1) + 1e-10)
+    return np.asarray(density[near].mean(1) / density)

@@ -9,7 +9,6 @@ import functools
 
 import mujoco
 import numpy as np
-import scipy.signal
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
@@ -197,7 +196,11 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
     span = _span(len(series), dt)
     if span < 3:
         return np.gradient(series, dt, axis=0) if derivative else series
-    return scipy.signal.savgol_filter(series, span, 2, deriv=derivative, delta=dt, axis=0)
+    weights, columns, half = _weights(span, derivative), series.reshape(len(series), -1), span // 2
+    inner = [np.convolve(column, weights[half, ::-1], "valid") for column in columns.T]
+    ends = weights[:half] @ columns[:span], weights[half + 1 :] @ columns[-span:]
+    smooth = np.concatenate([ends[0], np.stack(inner, axis=1), ends[1]])
+    return np.asarray(smooth.reshape(series.shape) / dt**derivative)
 
 
 def _span(count: int, dt: float) -> int:
@@ -206,10 +209,16 @@ def _span(count: int, dt: float) -> int:
 
 
 @functools.lru_cache(maxsize=64)
-def _weights(span: int, derivative: int, dt: float) -> FloatArray:
-    """Weights (span, span) of a local quadratic's samples, for its value or slope at each of them."""
-    rows = [scipy.signal.savgol_coeffs(span, 2, derivative, dt, pos=place, use="dot") for place in range(span)]
-    return np.stack(rows)
+def _weights(span: int, derivative: int) -> FloatArray:
+    """Weights (span, span) of a local quadratic's samples, for its value or slope per sample at each of them.
+
+    A. Savitzky, M. Golay 1964, "Smoothing and differentiation of data by simplified least squares procedures",
+    Anal. Chem. 36.
+    """
+    place = np.arange(span) - span // 2
+    powers = np.stack([np.ones(span), place, place**2], axis=1)
+    wanted = np.stack([np.zeros(span), np.ones(span), 2.0 * place], axis=1) if derivative else powers
+    return np.asarray(wanted @ np.linalg.pinv(powers))
 
 
 def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -225,8 +234,8 @@ def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, Floa
     neighbours = begin[:, None] + np.arange(span)
     ways = between(vectors[neighbours], vectors[:, None])
     place = np.arange(count) - begin
-    smooth, slope = ((_weights(span, derivative, dt)[place][..., None] * ways).sum(1) for derivative in (0, 1))
-    return added(vectors, smooth), slope
+    smooth, slope = ((_weights(span, derivative)[place][..., None] * ways).sum(1) for derivative in (0, 1))
+    return added(vectors, smooth), slope / dt
 
 
 def moved(model: mujoco.MjModel, states: FloatArray, tangent: FloatArray) -> FloatArray:

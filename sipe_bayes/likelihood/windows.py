@@ -74,6 +74,7 @@ class Windows:
         settings: of the likelihood.
         simulator: what is calibrated.
         trajectories: the logs.
+        like: windows of these logs, of which only the same are cut.
 
     Raises:
         ValueError: for logs that do not fit the simulator or the settings.
@@ -81,7 +82,9 @@ class Windows:
 
     _masked = 0
 
-    def __init__(self, settings: Segments, simulator: Simulator, trajectories: Trajectories) -> None:
+    def __init__(
+        self, settings: Segments, simulator: Simulator, trajectories: Trajectories, like: Windows | None = None
+    ) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
         self.rollouts, self.budget, self.short = 0, math.inf, False
         self._subset: Windows | None = None
@@ -92,7 +95,7 @@ class Windows:
             raise ValueError(
                 "starts: 'recorded' needs trajectories with states of this model; use 'estimated' for a measured log"
             )
-        self._cut(trajectories)
+        self._cut(trajectories, like)
         self._read_samples(trajectories)
 
     @property
@@ -100,7 +103,7 @@ class Windows:
         """Names of the C fitted channels."""
         return [self.simulator.environment.channels[c] for c in self.channels]
 
-    def _cut(self, trajectories: Trajectories) -> None:
+    def _cut(self, trajectories: Trajectories, like: Windows | None) -> None:
         pieces, overrides = [], dict(self.settings.windows)
         for k, trajectory in enumerate(trajectories):
             window = overrides.get(trajectory.name, self.settings.window)
@@ -113,7 +116,9 @@ class Windows:
             steps = self.simulator.engine.firmware.whole(steps, trajectory.dt)
             pieces += [(k, s, min(steps, len(trajectory) - s)) for s in range(0, len(trajectory), steps)]
         self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
-        if self.settings.seconds is not None:
+        if like is not None:
+            self.log, self.start, self.steps = like.log, like.start, like.steps
+        elif self.settings.seconds is not None:
             lasting = float((self.steps * trajectories.dt[self.log]).sum())
             keep = spread_blocks(self.log, self.settings.seconds / lasting)
             self.log, self.start, self.steps = self.log[keep], self.start[keep], self.steps[keep]
@@ -138,7 +143,7 @@ class Windows:
             self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)
         ][:, :-1]
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
-        guesses = [estimate_states(simulator, t) for t in trajectories]
+        guesses = {k: estimate_states(simulator, trajectories[k]) for k in np.unique(self.log).tolist()}
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from functools import cached_property
 from typing import ClassVar, Self
 
 import mujoco
@@ -73,6 +74,10 @@ class Simulated:
 
     def default_state(self) -> FloatArray:
         """State (S,) after a reset of the default model."""
+        return self._default_state.copy()
+
+    @cached_property
+    def _default_state(self) -> FloatArray:
         data, state = mujoco.MjData(self.model), np.empty(self.engine.physics_size)
         mujoco.mj_getState(self.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if not self.environment.memory_size:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
@@ -133,19 +133,11 @@ def _possible(windows: Windows, environment: MjcfEnvironment, group: list[Placed
     return windows.settings.starts == "estimated" or sizes[0] == sizes[1]
 
 
-def _same(windows: Windows, others: Windows) -> IntArray:
-    """Numbers among ``others`` of the windows, all cut alike from the same logs."""
-    number = {(k, s): i for i, (k, s) in enumerate(zip(others.log.tolist(), others.start.tolist(), strict=True))}
-    return np.array([number[one] for one in zip(windows.log.tolist(), windows.start.tolist(), strict=True)])
-
-
 def _simulated(
     windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed], environment: MjcfEnvironment
 ) -> list[Effect]:
     simulator = Simulator(extended(environment, group), windows.simulator.num_threads)
-    bound = Windows(windows.settings, simulator, windows.trajectories)
-    if bound.num_windows > windows.num_windows:
-        bound = bound.part(_same(windows, bound))
+    bound = Windows(windows.settings, simulator, windows.trajectories, windows)
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
     for one in group:

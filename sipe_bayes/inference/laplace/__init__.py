@@ -27,9 +27,11 @@ mean lies beyond it, and the truncated density is right up to the bound.
 3. Record where that ends (``window_optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
    over a handful of weighted noise values.
 4. Look around (``pattern_search``) and go on from a better place, or from the middle of a ridge.
-5. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
+5. Send scouts from draws of the prior: whoever comes to rest as low elsewhere is a further starting point
+   (``scouting``).
+6. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
-6. Probe whether a single optimum's normal is the posterior (``inference.importance``); where it is not, importance
+7. Probe whether a single optimum's normal is the posterior (``inference.importance``); where it is not, importance
    draws and kernels on them take its place.
 
 **Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::

@@ -61,6 +61,21 @@ class GrowingTuning(Options):
 
 
 @dataclass(frozen=True)
+class ScoutTuning(Options):
+    """How other values that fit as well are looked for; see ``scouting``."""
+
+    scouts: int = option(6, "starting points of theirs: each is cheap, and a wide valley holds one", least=0)
+    draws: int = option(64, "of the prior, of which they take those that are farthest apart", least=6)
+    steps: int = option(8, "of a scout, who comes to rest sooner", least=1)
+    least_windows: int = option(4, "that scouts look at", least=1)
+    most_windows: int = option(10, "the same at most, and a tenth of all: they need not be exact", least=1)
+    tolerance: float = option(1e-2, "gain of a step below which a scout rests", "of the energy", above=0)
+    as_good: float = option(2.0, "how much higher a further starting point may lie", "of the energy", above=1)
+    slack: float = option(20.0, "climb from one place to another within one valley", "nats", above=0)
+    most_points: int = option(2, "further starting points at most", least=0)
+
+
+@dataclass(frozen=True)
 class LaplaceTuning(Options):
     """Numbers of the search that users hardly ever change."""
 
@@ -68,6 +83,7 @@ class LaplaceTuning(Options):
     screening: ScreeningTuning = option(ScreeningTuning(), "how starting points are chosen")
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
+    scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
     pattern: PatternTuning = option(PatternTuning(), "how the surroundings of an optimum are looked at")
     state_space: ChainTuning = option(ChainTuning(), "how the searches over a chain of states go")

@@ -51,6 +51,7 @@ from sipe_bayes.inference.laplace.growing_windows import (
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST, pattern_size
+from sipe_bayes.inference.laplace.scouting import scouted
 from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.window_energy import (
@@ -155,6 +156,10 @@ class WindowSearch:
     def _next(self, state: WindowState) -> WindowState:
         """At the next starting point; after the last, groups of windows that tumble are fitted apart."""
         onward = state.next_point(self._begin)
+        if onward.done and not state.scouted and self.problem.options.initial is None and not grows(self.windows):
+            more = scouted(self.problem, self.windows, state.optima)
+            state = replace(state, points=np.concatenate([state.points, more]), scouted=True)
+            onward = state.next_point(self._begin)
         if not (onward.done and grows(self.windows)) or not state.optima:
             return onward
         if num_groups(self.windows, self._tuning.growing):
@@ -207,7 +212,7 @@ class WindowSearch:
             kept=replace(here.kept, residual=point.residual if again or view is windows else None),
         )
         state = replace(state, here=here)
-        return state.next_point(self._begin) if state.known else state
+        return self._next(state) if state.known else state
 
     def _whole(self, state: WindowState) -> WindowState:
         """The first step on all windows: every other one went well, but perhaps not all do."""

@@ -135,6 +135,7 @@ class WindowState(StrategyState[Position]):
     Args:
         estimates: (N,) each, of groups of windows that were fitted apart.
         aside: the optima as they were recorded, while these are.
+        scouted: whether other values that fit as well have been looked for.
         wild: (k, 3), samples that are left out; see ``likelihood.wild_samples``.
     """
 
@@ -142,6 +143,7 @@ class WindowState(StrategyState[Position]):
     optima: tuple[WindowOptimum, ...] = ()
     estimates: tuple[FloatArray, ...] = ()
     aside: tuple[WindowOptimum, ...] = ()
+    scouted: bool = False
     wild: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
     @property
