@@ -29,6 +29,7 @@ from sipe_bayes.calibration.problem import method_of, prepare
 from sipe_bayes.core.files import write_text
 
 HERE = Path(__file__).parent
+_FAR = 6.0  # sds of the posterior: the fit is elsewhere
 MACHINES = ("servo", "drive", "arm", "double_pendulum", "quadruped")
 
 
@@ -73,6 +74,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
                 "refused": sorted({code for row in mine if row["blocked"] for code in row["findings"]}),
                 "coverage": round(float(np.mean(ended)), 3) if ended else None,
                 "standard_error": round(float(np.std(ended) / np.sqrt(len(ended))), 3) if ended else None,
+                "seeds_far_off": [row["seed"] for row in mine if np.abs(row["sds_off"]).max() > _FAR],
                 "median_rollouts": float(np.median([row["rollouts"] for row in mine])),
                 "median_cpu_s": float(np.median([row["cpu_s"] for row in mine])),
             }
