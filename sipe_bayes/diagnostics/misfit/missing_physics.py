@@ -146,7 +146,7 @@ class _Causes:
     def of(cls, logs: ProbedLogs, options: MissingPhysicsOptions) -> _Causes:
         """In turns with the noise."""
         windows, n = logs.windows, logs.windows.num_theta
-        moments = logs.moments(logs.residual[..., None])[0][1]
+        moments = logs.moments()
         pull, noise = -windows.start_precision * logs.starts, logs.noise
         span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
@@ -181,7 +181,7 @@ class _Causes:
     def explain(self, logs: ProbedLogs, seed: int) -> bool:
         """Whether what they leave passes for noise, by the null of the check of the residuals."""
         pull = -logs.windows.start_precision * logs.starts
-        moments = logs.moments(logs.residual[..., None])[0][1]
+        moments = logs.moments()
         arrow = eliminate_starts(moments.normal(self.noise), logs.count, logs.windows.start_precision, pull)
         step = np.concatenate([self.step[: logs.windows.num_theta], self.sizes(logs)])
         seen = logs.whiteness(logs.left(logs.residual, step, arrow.blocks(step)), self.noise)

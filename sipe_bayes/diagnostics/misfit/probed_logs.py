@@ -8,6 +8,8 @@ the intervals for a model that lacks something (``misfit.missing_physics``) are 
 from __future__ import annotations
 
 import copy
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,14 +116,14 @@ class ProbedLogs:
         self.coloured = bool((noise.tau > 0).any())
         self.inner = prior.precision + FLAT_PRECISION * np.eye(n)
         self.free, self.pull = np.ones(n, bool), prior.pull(theta)
-        arrow = self._arrow(self.moments(self.residual[..., None])[0][1], noise)
+        arrow = self._arrow(self.moments().normal(noise))
         total = arrow.gradient[:n] + self.pull
         self._nulls: dict[tuple[int, int], FloatArray] = {}
         self.free = ~(((theta <= _PRESSED) & (total < 0)) | ((theta >= 1 - _PRESSED) & (total > 0)))
 
     def seen(self) -> Solved:
         """Of the logs themselves."""
-        return self.solved(self.residual, self.moments(self.residual[..., None])[0][1], self.noise, self.pull)
+        return self.solved(self.residual, self.moments().normal(self.noise), self.noise, self.pull)
 
     def null(self, seed: int, simulated: int) -> FloatArray:
         """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated; made once."""
@@ -133,9 +135,9 @@ class ProbedLogs:
     def _simulated(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         draws, rows = self.drawn(rng, simulated), []
         for part in np.array_split(np.arange(simulated), max(1, simulated // MISFIT.batch)):
-            for s, (plain, probed) in zip(part, self.moments(draws[..., part]), strict=True):
+            for s, (plain, normal) in zip(part, self.together(draws[..., part]), strict=True):
                 noise = self.estimated(plain)
-                rows.append(self.solved(draws[..., s], probed, noise).statistics)
+                rows.append(self.solved(draws[..., s], normal(noise), noise).statistics)
         return np.stack(rows)
 
     def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
@@ -151,18 +153,29 @@ class ProbedLogs:
             out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
         return out
 
-    def moments(self, residuals: FloatArray) -> list[tuple[Moments, Moments]]:
-        """For each of residuals (W, L, C, S) the products without the probes and with them."""
+    def moments(self) -> Moments:
+        """Products of the logs' own residual with theta, probes and starts."""
+        return Moments(self.residual, self.jacobian, self.count, self.windows.sequences)
+
+    def together(self, residuals: FloatArray) -> list[tuple[Moments, Callable[[Noise], FloatArray]]]:
+        """For each of residuals (W, L, C, S) the products without the probes, and those with them, whitened by a noise.
+
+        The latter are (W, K', K') as ``Moments.normal`` gives them.
+        """
         n, count, many = self.windows.num_theta, self.count, residuals.shape[-1]
         parts = (self.jacobian[..., :count], residuals, self.jacobian[..., count:])
         rows = np.concatenate(parts, axis=-1)
         whole = Moments(np.zeros(rows.shape[:3]), rows, count + many, self.windows.sequences)
         starts = count + many + np.arange(2 * self.windows.num_start)
 
-        def of(s: int, first: int) -> Moments:
-            return chosen(whole, np.concatenate([np.arange(first), starts, [count + s]]), first)
+        def columns(s: int, first: int) -> IntArray:
+            return np.concatenate([np.arange(first), starts, [count + s]])
 
-        return [(of(s, n), of(s, count)) for s in range(many)]
+        def whitened(s: int, noise: Noise) -> FloatArray:
+            mine = columns(s, count)
+            return whole.normal(noise).take(mine, axis=-1).take(mine, axis=-2)
+
+        return [(chosen(whole, columns(s, n), n), functools.partial(whitened, s)) for s in range(many)]
 
     def estimated(self, moments: Moments) -> Noise:
         """The noise that a fit would have found in a draw of it."""
@@ -171,22 +184,22 @@ class ProbedLogs:
         span = float(windows.dt.min()), windows.trajectories.longest
         return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span, windows.scales)
 
-    def _arrow(self, moments: Moments, noise: Noise) -> Eliminated:
+    def _arrow(self, normal: FloatArray) -> Eliminated:
         windows = self.windows
-        return eliminate_starts(moments.normal(noise), self.count, windows.start_precision, windows.no_starts())
+        return eliminate_starts(normal, self.count, windows.start_precision, windows.no_starts())
 
-    def solved(self, residual: FloatArray, moments: Moments, noise: Noise, pull: FloatArray | None = None) -> Solved:
+    def solved(self, residual: FloatArray, normal: FloatArray, noise: Noise, pull: FloatArray | None = None) -> Solved:
         """Statistics of a residual, with what they are made of.
 
         Args:
             residual: (W, L, C).
-            moments: its products with theta, probes and starts.
+            normal: (W, K', K') its products with theta, probes and starts, whitened by the noise.
             noise: (C,) of the channels.
             pull: (N,) of the prior; default none.
         """
         n = self.windows.num_theta
         # information of theta and probes with the starts eliminated; inverted among the parameters that are free
-        arrow = self._arrow(moments, noise)
+        arrow = self._arrow(normal)
         inner, inverse = arrow.precision + FLAT_PRECISION * np.eye(self.count), np.zeros((n, n))
         inner[:n, :n] = arrow.precision[:n, :n] + self.inner
         among = np.ix_(self.free, self.free)

@@ -113,12 +113,13 @@ def test_products_formed_together_are_those_formed_one_by_one() -> None:
     made = residuals(0.9)
     draws, n = made.drawn(np.random.default_rng(0), 3), made.windows.num_theta
     kept = np.concatenate([made.jacobian[..., :n], made.jacobian[..., made.count :]], axis=-1)
-    for s, (plain, probed) in enumerate(made.moments(draws)):
-        for ours, jacobian, count in ((plain, kept, n), (probed, made.jacobian, made.count)):
-            reference = Moments(draws[..., s], jacobian, count, made.windows.sequences)
-            scale = np.abs(reference.products).max()
-            np.testing.assert_allclose(ours.products, reference.products, atol=1e-10 * scale)
-            assert ours.num_theta == reference.num_theta
+    noise = Noise(np.array([0.02]), np.array([0.05]))
+    for s, (plain, whitened) in enumerate(made.together(draws)):
+        reference = Moments(draws[..., s], kept, n, made.windows.sequences)
+        np.testing.assert_allclose(plain.products, reference.products, atol=1e-10 * np.abs(reference.products).max())
+        assert plain.num_theta == n
+        normal = Moments(draws[..., s], made.jacobian, made.count, made.windows.sequences).normal(noise)
+        np.testing.assert_allclose(whitened(noise), normal, atol=1e-10 * np.abs(normal).max())
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
