@@ -87,7 +87,7 @@ class Marginals:
         """One for each parameter.
 
         Args:
-            further: of the theta that a further log would have.
+            further: of the theta that a further log would have; its intervals hold the plain ones.
         """
         mode = self.space.values(self.theta)
         beyond = None if further is None else further.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy()
@@ -99,7 +99,8 @@ class Marginals:
             marginal = (mean, sd, q05, q50, q95, best, p.default, determined, p.log is not None)
             ends = None
             if beyond is not None and p.log is None:
-                ends = float(p.value(float(beyond[0, j]))), float(p.value(float(beyond[1, j])))
+                low, high = (float(p.value(float(end))) for end in beyond[:, j])
+                ends = min(low, q05), max(high, q95)
             summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends))
         return summaries
 

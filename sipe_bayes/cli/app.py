@@ -46,7 +46,8 @@ app = typer.Typer(
 _REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
 _LINES, _SENTENCES, _WARNINGS, _CHANNELS = 20, 3, 3, 3  # that a calibration may fill, and of each kind of line
-_LONGEST = 300  # characters of a sentence on the terminal
+_SDS = 3.3  # in a 90 % interval
+_LONGEST, _VERDICT = 300, 44  # characters of a sentence on the terminal, and of a verdict in the table
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
@@ -213,6 +214,7 @@ def print_calibration(calibration: Calibration) -> None:
 
 def _print_parameters(console: Console, calibration: Calibration, findings: Findings, lines: int) -> None:
     """The table of the parameters in so many lines at most; the heading is one."""
+    from rich.measure import Measurement
     from rich.table import Table
     from rich.text import Text
 
@@ -230,12 +232,15 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
         scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
         verdict = parameter_verdict(p, findings)
-        ends = [] if p.further is None else [significant(x, p.sd, scale) for x in p.further]
+        wide = p.sd if p.further is None else max((p.further[1] - p.further[0]) / _SDS, 1e-300)
+        ends = [] if p.further is None else [significant(x, wide, max(map(abs, p.further))) for x in p.further]
         cells = [value, *[" .. ".join(ends)] * wider, f"{low} .. {high}"]
         # brackets of a name are not markup
-        table.add_row(Text(p.name), *cells, p.unit, Text(verdict.text, style=_TONES[verdict.tone]))
+        table.add_row(Text(p.name), *cells, p.unit, Text(_cut(verdict.text, _VERDICT), style=_TONES[verdict.tone]))
     if len(shown) < len(calibration.parameters):
         table.add_row(f"and {len(calibration.parameters) - len(shown)} more, in the report")
+    # a number that is cut is a wrong one: lines that are too long are the terminal's to wrap
+    console.width = max(console.width, Measurement.get(console, console.options.update(max_width=10**3), table).maximum)
     console.print(table)
 
 
@@ -273,9 +278,9 @@ def _report(calibration: Calibration) -> str:
     return f"; report: {Path(calibration.out) / 'report.html'}" if calibration.out else ""
 
 
-def _cut(text: str) -> str:
+def _cut(text: str, most: int = _LONGEST) -> str:
     """A sentence that does not fill the screen."""
-    return text if len(text) <= _LONGEST else text[: text.rindex(" ", 0, _LONGEST)].rstrip(",;:") + " ..."
+    return text if len(text) <= most else text[: text.rindex(" ", 0, most)].rstrip(",;:") + " ..."
 
 
 _PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which a newcomer needs them

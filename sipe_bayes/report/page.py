@@ -64,11 +64,19 @@ def _parameter_row(summary: ParameterSummary, parameter: Parameter, calibration:
         "contraction": f"{100 * summary.contraction:.0f} %" if math.isfinite(summary.contraction) else "–",
         "bar": f"{100 * min(max(np.nan_to_num(summary.contraction), 0.0), 1.0):.1f}",
         "default": number(summary.default, 4),
-        "further": " to ".join(significant(x, summary.sd, abs(x)) for x in summary.further or ()),
+        "further": _further(summary),
         "outside": summary.default is not None and not summary.q05 <= summary.default <= summary.q95,
         "tone": verdict.tone,
         "verdict": verdict.text,
     }
+
+
+def _further(summary: ParameterSummary) -> str:
+    """The interval with what the model lacks, to the digits that its own width leaves."""
+    if summary.further is None:
+        return ""
+    low, high = summary.further
+    return " to ".join(significant(x, max(high - low, 1e-300) / 3, max(abs(low), abs(high))) for x in (low, high))
 
 
 def _score_row(score: ChannelScore) -> dict[str, str]:

@@ -76,7 +76,7 @@ def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Ve
     low, high = parameter.further or (math.nan, math.nan)
     prior = _FIVE_TO_95 * parameter.sd / max(1 - parameter.contraction, 1e-12)
     if not (high - low) < (1 - THRESHOLDS.not_determined) * prior:
-        return Verdict("bad", "not determined with what the model lacks")
+        return Verdict("bad", "not determined")
     doubted = "; but see the doubt above" if _doubts(findings, [parameter]) else ""
     return Verdict("fair", "within the wider interval" + doubted)
 
