@@ -33,6 +33,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import searches
+import shapes
 import transfer
 
 from sipe_bayes.calibration.problem import prepare
@@ -244,7 +245,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
         *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws"),
-        *("discover", "transfer"),
+        *("discover", "transfer", "shapes"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
@@ -272,6 +273,8 @@ def main() -> None:
             laws.table(given.pairs, side_by_side)
         elif name == "discover":
             searches.table(prepare(PENDULUM))
+        elif name == "shapes":
+            shapes.table()
         elif name == "transfer":
             transfer.table(given.pairs, side_by_side)
         elif name == "batch":
