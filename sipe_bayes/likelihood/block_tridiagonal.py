@@ -150,6 +150,8 @@ class Border:
 
 def inverse(precision: FloatArray) -> tuple[FloatArray, float]:
     """Covariance (N, N), positive definite also where rounding leaves a precision that is not, and log|precision|."""
+    if not len(precision):  # every parameter is held, at its bound
+        return precision, 0.0
     diagonal = np.diag(precision)
     sd = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * np.abs(diagonal).max()))
     eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)

@@ -20,6 +20,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import descend
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
 from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint, present_noise
+from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
 
@@ -38,22 +39,24 @@ class _Rest:
 
 
 def scouted(problem: SearchProblem, windows: Windows, optima: Sequence[Optimum]) -> FloatArray:
-    """Further starting points (K, N), none where there is nothing to look for or no budget to do it."""
+    """Further starting points (K, N).
+
+    Raises:
+        BudgetExhausted: where the budget may not last.
+    """
     tuning = problem.options.tuning.scouting
-    nothing = np.zeros((0, windows.num_theta))
     few = min(windows.num_windows, tuning.most_windows, max(tuning.least_windows, windows.num_windows // 10))
     view = windows.part(np.linspace(0, windows.num_windows - 1, few).round().astype(int))
     share = view.steps.sum() / windows.steps.sum()
     most = tuning.scouts * tuning.steps * (windows.num_theta + 2) * len(windows.trajectories)
-    if not windows.num_start or not windows.starts_measured or windows.rollouts + share * most > windows.budget:
-        return nothing
+    if windows.rollouts + share * most > windows.budget:
+        raise BudgetExhausted
     view.budget, before, begin = math.inf, windows.rollouts, view.no_starts()
     best = max(optima, key=lambda optimum: optimum.evidence).theta
     residual, valid = view.residuals(best[None], begin[None])
     energy = WindowEnergy(view, present_noise(view, residual[0]), problem.quadratic_prior)
     level, rests = energy(best, begin, residual[0]), list[_Rest]()
-    draws = _apart(problem, best) if valid[0] else nothing
-    for theta in draws:
+    for theta in _apart(problem, best) if valid[0] else []:
         rest = _rest(problem, energy, theta)
         if rest is None or rest.energy > tuning.as_good * level or rest.leads_to(best, level, tuning.slack):
             continue

@@ -131,6 +131,7 @@ class WindowSearch:
             Phase.ROUGH: self._rough,
             Phase.DESCEND: self._descend,
             Phase.NOISE: self._noise,
+            Phase.SCOUT: self._scout,
         }
         return phases[state.here.phase](state)
 
@@ -156,10 +157,8 @@ class WindowSearch:
     def _next(self, state: WindowState) -> WindowState:
         """At the next starting point; after the last, groups of windows that tumble are fitted apart."""
         onward = state.next_point(self._begin)
-        if onward.done and not state.scouted and self.problem.options.initial is None and not grows(self.windows):
-            more = scouted(self.problem, self.windows, state.optima)
-            state = replace(state, points=np.concatenate([state.points, more]), scouted=True)
-            onward = state.next_point(self._begin)
+        if onward.done and not state.scouted and state.optima and self._scouts:
+            return replace(state, here=replace(state.here, phase=Phase.SCOUT))
         if not (onward.done and grows(self.windows)) or not state.optima:
             return onward
         if num_groups(self.windows, self._tuning.growing):
@@ -169,6 +168,12 @@ class WindowSearch:
             return onward
         unknown = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
         return replace(onward, optima=tuple(replace(optimum, finding=unknown) for optimum in state.optima))
+
+    def _scout(self, state: WindowState) -> WindowState:
+        """Further starting points, from which the search goes on."""
+        more = scouted(self.problem, self.windows, state.optima)
+        state = replace(state, points=np.concatenate([state.points, more]), scouted=True)
+        return self._next(state)
 
     def _apart(self, number: int, state: WindowState) -> Position:
         """Where a group of windows is fitted from: the best optimum's theta, and the measured starts."""
@@ -385,6 +390,12 @@ class WindowSearch:
         look = pattern_size(windows.num_theta, tuning.pattern)
         looks = 2 * look * len(windows.trajectories) < windows.budget
         return not windows.has_room(step + look if looks else step)
+
+    @property
+    def _scouts(self) -> bool:
+        """Whether scouts may look for other values: they need measured starts, and bodies that do not tumble."""
+        windows, begun = self.windows, self.problem.options.initial is not None
+        return bool(windows.num_start) and windows.starts_measured and not begun and not grows(windows)
 
     @property
     def _tuning(self) -> LaplaceTuning:

@@ -31,6 +31,8 @@ class Phase(StrEnum):
     """The noise as it was estimated last."""
     NOISE = auto()
     """The noise is estimated anew before the step."""
+    SCOUT = auto()
+    """After the last starting point: other values that fit as well; see ``scouting``."""
 
 
 @dataclass(frozen=True)

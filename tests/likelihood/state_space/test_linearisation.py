@@ -10,6 +10,7 @@ import pytest
 from sipe_bayes.inference.laplace.state_space.options import OutlierTuning
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import rarity, regular_gains
 from sipe_bayes.inference.laplace.state_space.smoother import border
+from sipe_bayes.likelihood.block_tridiagonal import Border
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
@@ -18,6 +19,7 @@ from sipe_bayes.likelihood.state_space.linearisation import (
     energy,
     expected_squares,
     jump_normal,
+    log_likelihood,
     restricted,
 )
 
@@ -151,3 +153,14 @@ def test_fishers_gradient_of_the_noise(some_outliers: bool, bent: bool, held: bo
             moved = np.exp(logs + step * np.eye(5)[j])
             around.append(restricted(linear, replace(noise, sd=moved[:2], process=moved[2:]), hold, held)[0])
         assert (around[0] - around[1]) / 2e-5 == pytest.approx(slope, rel=1e-5, abs=1e-6)
+
+
+def test_parameters_that_all_sit_at_bounds_leave_the_likelihood_of_the_states() -> None:
+    linear, noise = random_chain(np.random.default_rng(3), False, False)
+    held = Border(np.eye(2), np.zeros(2), np.zeros(2, bool))
+    step, covariance, determinant = held.solve(eliminate_states(linear, noise))
+    assert not step.any()
+    assert not covariance.any()
+    assert determinant == 0.0
+    alone = log_likelihood(linear, noise, eliminate_states(linear, noise))
+    assert restricted(linear, noise, held)[0] == pytest.approx(alone)
