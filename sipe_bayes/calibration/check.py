@@ -2,9 +2,9 @@
 
 Truths are drawn from the prior, the recorded experiment is simulated at each of them with the noise of the recording
 (``sipe_bayes.likelihood.replicas``), the estimator is fitted to each simulated log, and ``diagnostics.coverage``
-compares. Each fit has a seed of its own: with one seed the errors of sampling would be the same in all. An amortised
-estimator is trained once, so that its errors are, and then conditions on each log. Every fit is one file, so an
-interrupted check goes on.
+compares. Where the answer is clear sooner (``diagnostics.sequential``) the rest is spared. Each fit has a seed of its
+own: with one seed the errors of sampling would be the same in all. An amortised estimator is trained once, so that
+its errors are, and then conditions on each log. Every fit is one file, so an interrupted check goes on.
 
 A truth whose simulation diverges is drawn anew: the check is of the prior restricted to what can be simulated.
 """
@@ -15,7 +15,7 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,8 @@ from sipe_bayes.core.seeding import seed_integer, torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
-from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draws
+from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draws, mass_below
+from sipe_bayes.diagnostics.sequential import clearly_wrong
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recalibrated import Recalibrated
 from sipe_bayes.likelihood.replicas import Replicas
@@ -97,6 +98,7 @@ class CheckResult:
         seconds: of all fits.
         rollouts: of all fits.
         warned: fits of which the estimator itself warned.
+        spared: logs that were not simulated any more, as the posteriors were clearly wrong before.
     """
 
     study: Study
@@ -108,6 +110,12 @@ class CheckResult:
     seconds: float
     rollouts: int
     warned: int
+    spared: int = 0
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether nothing gives cause for alarm."""
+        return self.check.calibrated and not self.spared
 
     def sentence(self) -> str:
         """The verdict."""
@@ -118,7 +126,8 @@ class CheckResult:
         )
         lost = f"; {self.failed} more logs could not be fitted" if self.failed else ""
         lost += f"; the estimator itself warned of {self.warned} fits" if self.warned else ""
-        if self.check.calibrated:
+        lost += f"; {self.spared} logs were spared, as the answer was clear" if self.spared else ""
+        if self.calibrated:
             idle = [n for n, c in zip(self.check.names, self.contraction, strict=True) if c < THRESHOLDS.idle]
             but = f", but of {', '.join(idle)} the posterior says no more than the prior" if idle else ""
             return f"{held}: no cause for alarm{but}{lost}"
@@ -129,7 +138,7 @@ class CheckResult:
         verdicts = [self.check.verdict(name) for name in self.check.names]
         wrong = sorted(set(verdicts) - {"calibrated"})
         if not wrong:
-            return "the parameters are not right jointly (TARP)"
+            return "too few hold it" if self.spared else "the parameters are not right jointly (TARP)"
         most = max(wrong, key=verdicts.count)
         named = [name for name, verdict in zip(self.check.names, verdicts, strict=True) if verdict == most]
         return most if len(named) == len(self.check.names) else f"{most} ({', '.join(named)})"
@@ -146,13 +155,17 @@ class CheckResult:
             "sharpness": {name: {"contraction": c, "interval_score": s} for name, c, s in by_name},
             "failed": self.failed,
             "warned": self.warned,
+            "spared": self.spared,
             "rollouts": self.rollouts,
             "seconds": round(self.seconds, 1),
             **self.check.to_dict(),
+            "calibrated": self.calibrated,
         }
 
 
-def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done, of: None) -> CheckResult:
+def run(
+    study: Study, truths: int, folder: Path, tell: Tell = lambda what, done, of: None, early: bool = False
+) -> CheckResult:
     """Fit what is missing in a folder, compare, write figures and result.
 
     Args:
@@ -160,6 +173,7 @@ def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done,
         truths: how many, at least 20.
         folder: of this check.
         tell: called with what is being done, how many are done, and of how many.
+        early: whether it ends as soon as the posteriors are clearly wrong.
 
     Raises:
         ValueError: where the folder holds another check, or fewer than 20 logs could be fitted.
@@ -168,20 +182,32 @@ def run(study: Study, truths: int, folder: Path, tell: Tell = lambda what, done,
     identity = study.identity()
     claim(folder, identity, IDENTITY, sorted(identity), "check")
     worker = _Worker(study, folder, tell)
-    fits = []
+    fits, ranks = list[Fit](), list[FloatArray]()
     for number in range(truths):
         path = folder / FITS / f"{number:05d}.npz"
         fit = Fit.load(path)
         if fit is None:
-            tell(f"{study.method}: log {number + 1} of {truths}", number, truths)
+            tell(f"{study.method}: log {number + 1} of {truths}{_left(fits, truths)}", number, truths)
             fit = worker.fit(number)
             fit.save(path)
         fits.append(fit)
-    result = compare(study, fits)
+        if not fit.error:
+            ranks.append(mass_below(fit.draws, fit.truth, np.random.default_rng([study.seed, 6, number])))
+        if early and len(ranks) >= FEWEST and clearly_wrong(np.stack(ranks)):
+            break
+    result = replace(compare(study, fits), spared=truths - len(fits))
     write_bytes(folder / "ranks.png", png(rank_check(result.check)))
     write_bytes(folder / "coverage.png", png(coverage_curve(result.check)))
     write_text(folder / RESULT, to_json(result.to_dict(), indent=2))
     return result
+
+
+def _left(fits: list[Fit], truths: int) -> str:
+    """The time that the rest will take, in words; that of the first log holds an amortised estimator's training."""
+    if len(fits) < 2:
+        return ""
+    minutes = float(np.mean([fit.seconds for fit in fits[1:]])) * (truths - len(fits)) / 60
+    return f", about {minutes:.0f} minutes left" if minutes >= 1.5 else ", about a minute left"
 
 
 def compare(study: Study, fits: list[Fit]) -> CheckResult:

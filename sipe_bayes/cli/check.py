@@ -13,6 +13,8 @@ from sipe_bayes.cli.errors import exit_on_error
 from sipe_bayes.core.validation import at_least, whole
 from sipe_bayes.inference.registry import ESTIMATORS
 
+_TIMED = 3  # logs after which the time of all is told where there is no line that changes
+
 
 def check(
     target: Annotated[str, typer.Argument(help="A configuration (.toml), or a task of `sipe envs`.")],
@@ -22,6 +24,7 @@ def check(
     refits: Annotated[int, typer.Option(help="Check sipe.Recalibrated(ESTIMATOR, refits=...) instead.")] = 0,
     noise: Annotated[float, typer.Option(help="Of a task: sd as a share of each channel's spread.")] = 0.01,
     steps: Annotated[int, typer.Option(help="Of a task: control steps of a log.")] = 100,
+    every: Annotated[bool, typer.Option("--every", help="Go on where the answer is clear before the end.")] = False,
     seed: Annotated[int, typer.Option(help="Of truths, noise and fits.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder; default checks/NAME-ESTIMATOR. The same command goes on.")
@@ -58,7 +61,7 @@ def check(
         of = f" of at most {each} rollouts each" * bool(each)
         if not as_json:
             print(f"{trained}{truths} fits{of}, kept in {folder}", flush=True)
-        outcome = checks.run(study, truths, folder, _say if not as_json and sys.stderr.isatty() else _silent)
+        outcome = checks.run(study, truths, folder, _silent if as_json else _say, early=not every)
     if as_json:
         print(to_json(outcome.to_dict()))
     else:
@@ -68,12 +71,15 @@ def check(
         for name, c in zip(outcome.check.names, outcome.contraction, strict=True):
             print(f"{name}: {outcome.check.verdict(name)}, mean contraction {c:.2f}")
         print(f"figures: {folder / 'ranks.png'}, {folder / 'coverage.png'}")
-    if not outcome.check.calibrated:
+    if not outcome.calibrated:
         raise typer.Exit(1)
 
 
 def _say(what: str, done: int, of: int) -> None:
-    print(f"\r{what}\033[K", end="\r", file=sys.stderr, flush=True)
+    if sys.stderr.isatty():
+        print(f"\r{what}\033[K", end="\r", file=sys.stderr, flush=True)
+    elif done == _TIMED:
+        print(what, file=sys.stderr, flush=True)
 
 
 def _silent(what: str, done: int, of: int) -> None:

@@ -210,7 +210,7 @@ def check_draws(
     if theta.shape != (len(draws), len(names)) or not np.isfinite(theta).all():
         raise ValueError(f"truths: expected finite theta ({len(draws)}, {len(names)}), got shape {theta.shape}")
     rng = np.random.default_rng(seed)
-    ranks = np.stack([_mass(drawn, truth, rng) for drawn, truth in zip(draws, theta, strict=True)])
+    ranks = np.stack([mass_below(drawn, truth, rng) for drawn, truth in zip(draws, theta, strict=True)])
     tarp = tarp_values(draws, theta, rng.random(theta.shape), rng)
     return CalibrationCheck(
         names,
@@ -218,6 +218,12 @@ def check_draws(
         tuple(uniformity(np.abs(2 * column - 1)) for column in ranks.T),
         uniformity(tarp),
     )
+
+
+def mass_below(draws: FloatArray, truth: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Mass (N,) below a truth (N,) of draws (M, N): uniform if the truth is one more draw; ``rng`` breaks ties."""
+    below, equal = (draws < truth).sum(0), (draws == truth).sum(0)
+    return np.asarray((below + rng.random(len(truth)) * (equal + 1)) / (len(draws) + 1))
 
 
 def tarp_values(
@@ -235,7 +241,7 @@ def tarp_values(
         (R,).
     """
     masses = [
-        _mass(np.linalg.norm(d - r, axis=1, keepdims=True), np.linalg.norm(t - r, axis=0, keepdims=True), rng)
+        mass_below(np.linalg.norm(d - r, axis=1, keepdims=True), np.linalg.norm(t - r, axis=0, keepdims=True), rng)
         for d, t, r in zip(draws, truths, references, strict=True)
     ]
     return np.concatenate(masses)
@@ -270,12 +276,6 @@ def _null(count: int) -> tuple[FloatArray, FloatArray]:
         below = np.searchsorted(np.sort(rng.random(count)), LEVELS, side="right")
         smallest[i] = tails[np.arange(len(LEVELS)), below].min()
     return tails, smallest
-
-
-def _mass(draws: FloatArray, truth: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Mass (N,) below the truth (N,) of draws (M, N): uniform if the truth is one more draw."""
-    below, equal = (draws < truth).sum(0), (draws == truth).sum(0)
-    return np.asarray((below + rng.random(len(truth)) * (equal + 1)) / (len(draws) + 1))
 
 
 def _lean(seen: Uniformity) -> float:

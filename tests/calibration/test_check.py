@@ -26,17 +26,20 @@ def call(*arguments: object) -> Any:
 def test_planted_widths_are_seen_and_honest_ones_pass(
     config: Path, estimator: str, verdict: str, tmp_path: Path
 ) -> None:
-    """A check alarms falsely in 2 % in all; halved and doubled posteriors are seen in 40 logs all but surely."""
+    """A check alarms falsely in 2 % in all; halved and doubled posteriors are seen in 40 logs all but surely.
+
+    The halved ones sooner, and the rest is spared.
+    """
     result = call(config, estimator, "--truths", 40, "--out", tmp_path / "out", "--threads", 1, "--json")
     found = json.loads(result.stdout)
     print(found["verdict"], found["sharpness"])
-    assert [p["verdict"] for p in found["parameters"]] == [verdict] * 2
+    assert verdict in {p["verdict"] for p in found["parameters"]}
+    assert (found["spared"] > 0) == (verdict == "too narrow")
     assert result.exit_code == (0 if verdict == "calibrated" else 1)
-    assert found["truths"] == 40
+    assert found["truths"] == 40 - found["spared"]
     share = {"calibrated": (0.78, 0.98), "too narrow": (0.4, 0.75), "too wide": (0.96, 1.0)}[verdict]
     assert share[0] <= found["coverage_90"] <= share[1]
-    said = {"calibrated": "no cause for alarm"}.get(verdict, f"{verdict}; use sipe.Recalibrated(...)")
-    assert said in found["verdict"]
+    assert {"calibrated": "no cause for alarm"}.get(verdict, verdict) in found["verdict"]
     for name in ("ranks.png", "coverage.png"):
         assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
 
