@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.laplace.levenberg_marquardt import descend
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
 from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint, present_noise
@@ -36,6 +37,13 @@ class _Rest:
         """Whether the way to theta (N,) climbs no more than the energies differ: both lie in one valley."""
         way = theta - self.theta
         return bool(0.5 * way @ self.curvature @ way < 2 * abs(energy - self.energy) + slack)
+
+
+def may_scout(problem: SearchProblem, windows: Windows) -> bool:
+    """Whether scouts are of use: not with a starting point given, starts unmeasured, or bodies that tumble."""
+    return (
+        bool(windows.num_start) and windows.starts_measured and problem.options.initial is None and not grows(windows)
+    )
 
 
 def scouted(problem: SearchProblem, windows: Windows, optima: Sequence[Optimum]) -> FloatArray:

@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.inference.laplace.levenberg_marquardt import QuadraticModel
+from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, QuadraticModel
+from sipe_bayes.inference.laplace.options import WindowTuning
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, pooled
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
@@ -155,3 +156,8 @@ def misfit(windows: Windows, residual: FloatArray) -> float:
     moves = spread > 1e-9 * spread.max()
     size = np.where(moves, spread, np.inf) if moves.any() else np.ones_like(spread)
     return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or 1e-300
+
+
+def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
+    """Whether a step gained what the linearisation foretold."""
+    return abs(fit.gained - fit.expected) < tuning.foretold * max(fit.expected, tuning.tolerance)

@@ -49,15 +49,16 @@ from sipe_bayes.inference.laplace.growing_windows import (
     touches,
 )
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
-from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
+from sipe_bayes.inference.laplace.options import LaplaceTuning
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST, pattern_size
-from sipe_bayes.inference.laplace.scouting import scouted
+from sipe_bayes.inference.laplace.scouting import may_scout, scouted
 from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.window_energy import (
     LinearisedWindows,
     WindowEnergy,
     WindowPoint,
+    foretold,
     misfit,
     present_noise,
     same_noise,
@@ -157,7 +158,7 @@ class WindowSearch:
     def _next(self, state: WindowState) -> WindowState:
         """At the next starting point; after the last, groups of windows that tumble are fitted apart."""
         onward = state.next_point(self._begin)
-        if onward.done and not state.scouted and state.optima and self._scouts:
+        if onward.done and not state.scouted and state.optima and may_scout(self.problem, self.windows):
             return replace(state, here=replace(state.here, phase=Phase.SCOUT))
         if not (onward.done and grows(self.windows)) or not state.optima:
             return onward
@@ -172,8 +173,7 @@ class WindowSearch:
     def _scout(self, state: WindowState) -> WindowState:
         """Further starting points, from which the search goes on."""
         more = scouted(self.problem, self.windows, state.optima)
-        state = replace(state, points=np.concatenate([state.points, more]), scouted=True)
-        return self._next(state)
+        return self._next(replace(state, points=np.concatenate([state.points, more]), scouted=True))
 
     def _apart(self, number: int, state: WindowState) -> Position:
         """Where a group of windows is fitted from: the best optimum's theta, and the measured starts."""
@@ -392,20 +392,9 @@ class WindowSearch:
         return not windows.has_room(step + look if looks else step)
 
     @property
-    def _scouts(self) -> bool:
-        """Whether scouts may look for other values: they need measured starts, and bodies that do not tumble."""
-        windows, begun = self.windows, self.problem.options.initial is not None
-        return bool(windows.num_start) and windows.starts_measured and not begun and not grows(windows)
-
-    @property
     def _tuning(self) -> LaplaceTuning:
         return self.problem.options.tuning
 
     @property
     def _white(self) -> bool:
         return self.windows.settings.noise == "white"
-
-
-def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
-    """Whether a step gained what the linearisation foretold."""
-    return abs(fit.gained - fit.expected) < tuning.foretold * max(fit.expected, tuning.tolerance)
