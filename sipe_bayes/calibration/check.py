@@ -235,6 +235,26 @@ def compare(study: Study, fits: list[Fit]) -> CheckResult:
     )
 
 
+def simulated_log(study: Study, number: int, replicas: Replicas | None = None) -> tuple[FloatArray, Trajectories]:
+    """A truth (N,) in theta of a study, and the experiment as it would have been recorded there.
+
+    Args:
+        study: whose experiment it is.
+        number: of the log; the same one gives the same log.
+        replicas: of the study's, where they are at hand.
+    """
+    replicas = replicas or Replicas(study.estimator.simulator, study.trajectories, study.noise, study.process)
+    rng, generator = np.random.default_rng([study.seed, 1, number]), torch_generator([study.seed, 2, number])
+    for _ in range(_TRIES):
+        truth = study.estimator.prior.sample((), generator=generator).numpy()
+        log = replicas.make(truth, rng)
+        if log is not None:
+            return truth, log
+    raise ValueError(
+        f"simulator: {_TRIES} draws of the prior in a row diverged under these commands; narrow the bounds"
+    )
+
+
 class _Worker:
     """Makes a truth's log and fits it."""
 
@@ -246,7 +266,7 @@ class _Worker:
 
     def fit(self, number: int) -> Fit:
         """The fit of one truth's log."""
-        truth, log = self._log(number)
+        truth, log = simulated_log(self.study, number, self.replicas)
         began, draws, error = time.monotonic(), np.empty((0, len(truth))), ""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -261,17 +281,6 @@ class _Worker:
         own = (item for item in estimator.findings if item.severity is not Severity.NOTE and item not in of_training)
         warned = tuple(str(item.code) for item in own)
         return Fit(truth, draws, estimator.rollouts - rollouts, seconds, error, warned)
-
-    def _log(self, number: int) -> tuple[FloatArray, Trajectories]:
-        rng, generator = np.random.default_rng([self.study.seed, 1, number]), self._generator(2, number)
-        for _ in range(_TRIES):
-            truth = self.study.estimator.prior.sample((), generator=generator).numpy()
-            log = self.replicas.make(truth, rng)
-            if log is not None:
-                return truth, log
-        raise ValueError(
-            f"simulator: {_TRIES} draws of the prior in a row diverged under these commands; narrow the bounds"
-        )
 
     def _estimator(self, number: int) -> Estimator:
         study = self.study

@@ -13,14 +13,16 @@ than a tenth of the budget). With ``StateSpace`` the target is that of ``state_s
 
 Deviations:
 
-- R-hat and the autocorrelation time treat the walkers of one ensemble as chains, as emcee's authors do; walkers share
-  information, so R-hat is an optimistic diagnostic.
+- R-hat and effective draws treat the walkers of one ensemble as chains; walkers share information, so both are
+  optimistic.
+- No tempering: that the chains hold every optimum is owed to the independent proposals, which hold those that
+  ``laplace`` came to.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -45,6 +47,9 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.posterior.ensemble import mixing_of
+
+if TYPE_CHECKING:
+    import emcee
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,8 @@ class MCMCOptions(Options):
     """What ``MCMC`` takes beside what every estimator takes."""
 
     walkers: int | None = option(None, "chains of the ensemble; default twice the dimensions plus two, at least 24")
-    effective: int = option(400, "effective draws at which it stops early, once R-hat is small too", least=1)
+    effective: int = option(400, "effective draws, of bulk and tails, at which it stops, once R-hat is small", least=1)
+    mixed: float = option(1.01, "R-hat at which it stops, once there are effective draws enough", above=1)
     restarts: int = option(2, "starting points of the laplace fit that comes first", least=1)
     candidates: int = option(8, "points among which they are chosen", least=0)
     tuning: MCMCTuning = option(MCMCTuning(), "numbers of the chains themselves")
@@ -148,7 +154,8 @@ class MCMC(Estimator[MCMCState]):
 
     Args:
         walkers: chains of the ensemble; default twice the dimensions plus two, at least 24.
-        effective: effective draws at which it stops early, once R-hat is small too.
+        effective: effective draws, of bulk and tails, at which it stops early, once R-hat is small too.
+        mixed: the R-hat that is small.
         restarts, candidates: of the ``laplace`` fit that comes first.
         tuning: numbers of the chains themselves.
     """
@@ -266,13 +273,8 @@ class MCMC(Estimator[MCMCState]):
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")
         target = self._target(windows, state.fit)
-        moves = (
-            emcee.moves.MHMove(IndependentMove(state.proposal, self.space)),
-            emcee.moves.DEMove(),
-            emcee.moves.DESnookerMove(),
-        )
-        shares = list(zip(moves, self.options.tuning.moves, strict=True))
-        sampler = emcee.EnsembleSampler(walkers, dimensions, target, vectorize=True, moves=shares)
+        moves = self.moves(state)
+        sampler = emcee.EnsembleSampler(walkers, dimensions, target, vectorize=True, moves=moves)
         sampler.log_prob_fn = target  # bare: emcee's wrapper prints the walkers when it is interrupted
         begin = emcee.State(state.walkers, log_prob=state.log_prob, random_state=state.random.plain())
         end = sampler.run_mcmc(begin, steps, skip_initial_state_check=True, progress=False)
@@ -292,8 +294,16 @@ class MCMC(Estimator[MCMCState]):
             random=RandomState.of(random),
         )
         mixing = self._mixing(state)
-        enough = mixing["ess"] >= self.options.effective and mixing["rhat"] <= THRESHOLDS.mixed
+        enough = mixing["ess"] >= self.options.effective and mixing["rhat"] <= self.options.mixed
         return replace(state, done=bool(enough))
+
+    def moves(self, state: MCMCState) -> list[tuple[emcee.moves.Move, float]]:
+        """What emcee proposes, and the shares of these moves."""
+        import emcee
+
+        independent = emcee.moves.MHMove(IndependentMove(state.proposal, self.space))
+        kinds = (independent, emcee.moves.DEMove(), emcee.moves.DESnookerMove())
+        return list(zip(kinds, self.options.tuning.moves, strict=True))
 
     def _mixing(self, state: MCMCState) -> dict[str, float]:
         """Worst R-hat over the parameters, effective draws and acceptance of the chain after warm-up."""
