@@ -65,6 +65,10 @@ ADVICE: dict[Code, str] = {
         "Contact makes the likelihood many-valleyed, and the search stands in a valley that its curvature does not "
         "describe. Give `search.restarts` and a larger `budget`, cut the logs shorter, or measure velocities."
     ),
+    Code.STARTS_CONTRADICT: (
+        "Two searches ended in trajectories that exclude each other. Give `search.restarts` and a larger `budget`, cut "
+        "the logs shorter, measure velocities, or begin near a value that you trust."
+    ),
     Code.NOT_JUDGED: "Raise `budget`: simulating 120 draws from the posterior takes as many rollouts of each log.",
     Code.SEARCHED_ON_PARTS: (
         "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "

@@ -122,6 +122,10 @@ class Code(Enum):
         "{effective:.0f} of {draws} draws effective), as in a wrong valley between contacts: do not rely on the "
         "intervals; more restarts, shorter logs or more measured channels may help"
     )
+    STARTS_CONTRADICT = blocking(
+        "another start of the search ended {distance:.0f} sds away, where process noise explains so much of the logs "
+        "that it may be as right: do not rely on the intervals"
+    )
     NOT_JUDGED = blocking(
         "the budget left no room to see whether the posterior is the normal that the intervals are taken from: raise it"
     )

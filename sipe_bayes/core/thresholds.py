@@ -111,6 +111,10 @@ class Thresholds(Options):
         0.5, "weights of which more is effective are nearly alike, whatever the shape of their tail", "of the draws"
     )
 
+    contradiction: float = option(
+        1e-3, "below it two starts of a search that ended as far apart would contradict each other", "probability"
+    )
+
     # searches
     search_wide: float = option(
         0.15, "a search whose distribution is wider was cut short: half of a uniform prior's sd", "sd, of the range"

@@ -20,7 +20,7 @@ from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
-from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.window_search import WindowSearch
@@ -118,9 +118,11 @@ class Laplace(Estimator[LaplaceState]):
             assert isinstance(strategy, StateSpaceSearch)
             assert isinstance(state.search, StateSpaceState)
             search = strategy.shoot(state.search)
-            if search.done:
+            if not search.done:
+                return replace(state, search=search, judgements=())
+            if state.judgements:
                 return replace(state, search=search, done=not self._shots_left(search))
-            return replace(state, search=search, judgements=())
+            return self._probed(windows, replace(state, search=search))
         search = strategy.step(state.search)
         state = replace(state, search=search)
         return self._probed(windows, state) if search.done else state
@@ -136,9 +138,12 @@ class Laplace(Estimator[LaplaceState]):
         """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
         ended, tuning, n = replace(state, done=True), self.options.tuning.importance, len(self.space)
         if isinstance(windows, Chain):
-            judgements = self._judged(windows, distinct(state.search.optima))
+            optima, shots_left = distinct(state.search.optima), self._shots_left(state.search)
+            if shots_left and self._absorbs(windows, optima[0]):
+                return state
+            judgements = self._judged(windows, optima)
             stands = not judgements or judgements[0].normal
-            return replace(state, judgements=judgements, done=stands or not self._shots_left(state.search))
+            return replace(state, judgements=judgements, done=stands or not shots_left)
         if windows.num_start or windows.settings.noise == "sandwich":
             return ended
         kept = distinct(state.search.optima)
@@ -158,6 +163,12 @@ class Laplace(Estimator[LaplaceState]):
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where windows of the logs lead."""
         return isinstance(search, StateSpaceState) and search.shots < self.options.tuning.state_space.shooting.shots
+
+    def _absorbs(self, chain: Chain, optimum: Optimum) -> bool:
+        """Whether process noise explains much of a log through contact: a trajectory that needs less may be found."""
+        assert isinstance(optimum, ChainOptimum)
+        share = self.options.tuning.state_space.shooting.absorbed
+        return optimum.rough and optimum.absorbed > share * chain.observed.sum()
 
     def _judged(self, chain: Chain, kept: list[Optimum]) -> tuple[Judgement, ...]:
         """Of the normals of a chain's optima; fewer where the budget ends."""
@@ -227,6 +238,9 @@ class Laplace(Estimator[LaplaceState]):
                     self.find(Code.NOT_THE_NORMAL, k=one.pareto_k, effective=one.effective, draws=one.draws)
             if state.done and len(state.judgements) < len(kept):
                 self.find(Code.NOT_JUDGED)
+            distance = contradiction([one for one in state.search.optima if isinstance(one, ChainOptimum)])
+            if distance is not None:
+                self.find(Code.STARTS_CONTRADICT, distance=distance)
         if isinstance(state.search, WindowState) and len(state.search.wild):
             wild = state.search.wild
             channels = ", ".join(self.simulator.environment.channels[c] for c in np.unique(wild[:, 2]))

@@ -47,8 +47,12 @@ class Optimum:
 
     def holds(self, other: Optimum) -> bool:
         """Whether this optimum's normal holds another one well inside it."""
+        return self.distance(other) ** 2 < len(self.mean)
+
+    def distance(self, other: Optimum) -> float:
+        """How far off another one's mean is, in sds of this one's normal."""
         gap = other.mean - self.mean
-        return bool(gap @ np.linalg.solve(self.covariance, gap) < len(gap))
+        return float(np.sqrt(gap @ np.linalg.solve(self.covariance, gap)))
 
 
 @dataclass(frozen=True)

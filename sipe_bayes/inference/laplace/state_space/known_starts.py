@@ -19,52 +19,34 @@ likelier. Its normal lies about the best step from there, which the slopes foret
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.state_space.growing_horizon import grown
-from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise, likeliest_share
-from sipe_bayes.inference.laplace.state_space.smoother import border, smooth, solvable
+from sipe_bayes.inference.laplace.state_space.noise import first_noise, likeliest_share
+from sipe_bayes.inference.laplace.state_space.posterior_linearisation import WidePosition, WideSearch
+from sipe_bayes.inference.laplace.state_space.smoother import solvable
 from sipe_bayes.inference.laplace.state_space.state import (
-    ChainSearch,
     ChainState,
     Phase,
-    Position,
     evidence,
     optimum_at,
     screened,
     unknown_noise,
 )
-from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.state_space.differences import linearise_by
-from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation
 
 
 @dataclass(frozen=True)
-class KnownStartPosition(Position):
-    """Where the search from one starting point stands.
-
-    Args:
-        theta_step: (N,), of the next differences.
-        state_step: (K, D).
-        estimate_theta: (N,), where the noise was estimated last.
-    """
-
-    theta_step: FloatArray = field(default_factory=lambda: np.zeros(0))
-    state_step: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    estimate_theta: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-
-@dataclass(frozen=True)
-class KnownStartState(ChainState[KnownStartPosition]):
+class KnownStartState(ChainState[WidePosition]):
     """A search from known first states."""
 
-    here: KnownStartPosition
+    here: WidePosition
 
 
-class KnownStartSearch(ChainSearch[KnownStartState]):
+class KnownStartSearch(WideSearch[KnownStartState]):
     """The ``Strategy`` for a ``StateSpace`` whose first states are known."""
 
     @property
@@ -84,16 +66,12 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
 
     def phases(self) -> dict[Phase, Callable[[KnownStartState, ChainLinearisation], KnownStartState]]:
         """A function for each phase."""
-        return {Phase.FOLLOW: self._follow, Phase.SMOOTH: self._smooth, Phase.NOISE: self._noise}
+        return {Phase.FOLLOW: self._follow, Phase.SMOOTH: self.wide_smooth, Phase.NOISE: self.wide_noise}
 
-    def _linearised(self, here: KnownStartPosition) -> ChainLinearisation | None:
-        """Over the surroundings that are open, after short differences first."""
-        return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
-
-    def _begin(self, theta: FloatArray) -> KnownStartPosition:
+    def _begin(self, theta: FloatArray) -> WidePosition:
         """At a starting point (N,)."""
         chain, ones = self.chain, np.ones(self.chain.num_start)
-        return KnownStartPosition(
+        return WidePosition(
             phase=Phase.FOLLOW,
             theta=theta,
             states=chain.reference,
@@ -122,74 +100,4 @@ class KnownStartSearch(ChainSearch[KnownStartState]):
         optimum = optimum_at(self.problem, state, linear, noise, value, settled=False)
         away = optimum.mean - theta
         optimum = replace(optimum, covariance=optimum.covariance + np.outer(away, away))
-        return self._with_differences(state.with_optimum(optimum), linear, noise)
-
-    def _smooth(self, state: KnownStartState, linear: ChainLinearisation) -> KnownStartState:
-        """A step of theta and all states."""
-        return self._stepped(state, linear, solvable(linear, state.here.noise))
-
-    def _noise(self, state: KnownStartState, linear: ChainLinearisation) -> KnownStartState:
-        """An estimate of the noise, which may be worth recording, and a step."""
-        state, noise, ends = self.estimated(state, linear)
-        if ends:
-            return state.next_point(self._begin)
-        try:
-            return self._stepped(state, linear, noise)
-        except BudgetExhausted:
-            return state  # what was recorded is kept, and the next step ends the search
-
-    # ------------------------------------------------------------------ what they are made of
-
-    def _stepped(self, state: KnownStartState, linear: ChainLinearisation, noise: ChainNoise) -> KnownStartState:
-        """Where a step leads, and how long the differences are there."""
-        here, tuning = state.here, self.tuning.known_starts
-        prior = self.problem.quadratic_prior
-        point, fit = smooth(self.chain, linear, noise, prior, here.point, here.damping, tuning.tolerance, self.tuning)
-        steps = tuning.steps if fit.point is None else here.steps + 1
-        phase = Phase.NOISE if steps >= tuning.steps else Phase.SMOOTH
-        here = replace(here, phase=phase, theta=point.theta, states=point.states, damping=fit.damping)
-        state = state.at(replace(here, steps=steps, iteration=here.iteration + 1))
-        return self._with_differences(state, linear, noise)
-
-    def estimated(self, state: KnownStartState, linear: ChainLinearisation) -> tuple[KnownStartState, ChainNoise, bool]:
-        """Estimate the noise anew.
-
-        Returns:
-            The state with the noise, and with the optimum if it is worth recording; the noise that a step is made for;
-            and whether the search from this starting point ends.
-        """
-        here, prior, tuning = state.here, self.problem.quadratic_prior, self.tuning.known_starts
-        theta, noise = here.theta, solvable(linear, here.noise)
-        # whether a step not yet taken is to be credited
-        hold = border(prior, theta, eliminate_states(linear, noise).gradient)
-        promised = restricted(linear, noise, hold)[0] - restricted(linear, noise, hold, held=True)[0]
-        held = promised > tuning.tolerance
-        estimate, gain = infer_noise(self.chain, linear, noise, prior, theta, here.movement, self.tuning.noise, held)
-        estimate = solvable(linear, estimate)
-        # whether it has settled
-        away = theta - here.estimate_theta
-        moved = float(away @ eliminate_states(linear, estimate).precision @ away) / len(theta)
-        enough = max(tuning.settled, tuning.settled_each * float(linear.observed.sum()))
-        settled = here.estimates > 0 and gain < enough and moved < tuning.still
-        value = evidence(self.problem, here, linear, estimate, settled=False)
-        if value > state.best_evidence - settled * tuning.as_good or here.estimates == 0:
-            optimum = optimum_at(self.problem, state, linear, estimate, value, settled)
-            optimum = replace(optimum, theta_step=here.theta_step, state_step=here.state_step)
-            state = state.with_optimum(optimum)
-        noise = replace(here.noise, sd=estimate.sd, process=estimate.process)
-        estimates, ends = here.estimates + 1, settled or here.estimates + 1 >= tuning.most_estimates
-        here = replace(here, phase=Phase.SMOOTH, noise=noise, estimates=estimates, steps=0, estimate_theta=theta)
-        return state.at(here), estimate, ends
-
-    def _with_differences(
-        self, state: KnownStartState, linear: ChainLinearisation, noise: ChainNoise
-    ) -> KnownStartState:
-        """With the lengths of the next differences: the sds of theta and of the states, within limits."""
-        here, tuning = state.here, self.tuning.known_starts
-        solved = eliminate_states(linear, noise)
-        variance = np.einsum("kdd->kd", solved.covariances()[0])
-        _, covariance = self.problem.normal(here.theta, solved.precision, solved.gradient)
-        longest = np.maximum(tuning.most_state_step * here.movement, tuning.least_state_step)
-        theta_step = np.clip(np.sqrt(np.diag(covariance)), tuning.least_theta_step, tuning.most_theta_step)
-        state_step = np.clip(np.sqrt(variance), tuning.least_state_step, longest)
-        return state.at(replace(here, theta_step=theta_step, state_step=state_step))
+        return self.with_differences(state.with_optimum(optimum), linear, noise)

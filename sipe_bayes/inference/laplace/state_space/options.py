@@ -54,8 +54,8 @@ class SmoothingTuning(Options):
 
 
 @dataclass(frozen=True)
-class KnownStartTuning(Options):
-    """How the search from known first states goes; see ``known_starts``."""
+class WideTuning(Options):
+    """How steps by differences as long as the posterior is wide go; see ``posterior_linearisation``."""
 
     tolerance: float = option(0.5, "nats that a step must promise; less does not show in an interval", "nats", above=0)
     steps: int = option(3, "steps between estimates of the noise", least=1)
@@ -87,7 +87,7 @@ class HorizonTuning(Options):
 
 @dataclass(frozen=True)
 class ShootingTuning(Options):
-    """How windows grow where the smoother's optimum is not the posterior's; see ``shooting``."""
+    """When windows grow beside the smoother's search, and how; see ``shooting``."""
 
     shots: int = option(2, "how often it is tried, the budget allowing", least=0)
     window: int = option(8, "control steps of the first windows: hardly more than one impact", least=2)
@@ -95,6 +95,9 @@ class ShootingTuning(Options):
     follows: float = option(3.0, "residual up to which longer windows count as following", "noise sds", above=0)
     steps: int = option(15, "of the smoother for which it leaves room in the budget", least=1)
     process: float = option(0.01, "process noise of the smoother that goes on from there", "of the movement", above=0)
+    absorbed: float = option(
+        0.1, "share of the samples that process noise explains, through contact, with which it is tried", above=0
+    )
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,6 @@ class ChainTuning(Options):
     noise: NoiseTuning = option(NoiseTuning(), "how noise is guessed and estimated")
     outliers: OutlierTuning = option(OutlierTuning(), "which jumps become outliers")
     smoothing: SmoothingTuning = option(SmoothingTuning(), "the search from measured states")
-    known_starts: KnownStartTuning = option(KnownStartTuning(), "the search from known first states")
+    wide: WideTuning = option(WideTuning(), "steps by differences as long as the posterior is wide")
     horizon: HorizonTuning = option(HorizonTuning(), "how its starting points are found")
     shooting: ShootingTuning = option(ShootingTuning(), "how a trajectory through contacts is found otherwise")

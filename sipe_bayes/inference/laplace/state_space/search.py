@@ -8,9 +8,10 @@
    logs (``kalman_filter``), and the search goes on from its states where that ends lower.
 4. At an optimum, or where the noise does not settle, jumps that stand out become outliers (``outlying_jumps``) and the
    search goes on; from the optimum without them the filter tries to make do without outliers, and where that is
-   likelier the search goes on from there. It turns to the next starting point once it comes to nothing likelier.
-
-5. Where draws find that the best optimum is not the posterior's (``inference.importance.judged``), windows of the logs
+   likelier the search goes on from there, until it comes to nothing likelier.
+5. WIDEN: from the likeliest optimum on by differences as long as the posterior is wide (``posterior_linearisation``);
+   what these end in takes its place. Then the next starting point.
+6. Where draws find that the best optimum is not the posterior's (``inference.importance.judged``), windows of the logs
    that grow (``shooting``) lead to further starting points.
 
 Of each starting point the likeliest optimum is kept: its normal in theta, with the states integrated out, is what
@@ -35,13 +36,12 @@ from sipe_bayes.inference.laplace.state_space.noise import (
     roughness,
 )
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import needed, outstanding
+from sipe_bayes.inference.laplace.state_space.posterior_linearisation import WidePosition, WideSearch
 from sipe_bayes.inference.laplace.state_space.shooting import shot
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
-    ChainSearch,
     ChainState,
     Phase,
-    Position,
     evidence,
     optimum_at,
     screened,
@@ -53,7 +53,7 @@ from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, 
 
 
 @dataclass(frozen=True)
-class SmoothingPosition(Position):
+class SmoothingPosition(WidePosition):
     """Where the search from one starting point stands.
 
     Args:
@@ -88,7 +88,7 @@ class _Filtered:
     energy: float
 
 
-class StateSpaceSearch(ChainSearch[StateSpaceState]):
+class StateSpaceSearch(WideSearch[StateSpaceState]):
     """The ``Strategy`` for a ``StateSpace``."""
 
     @property
@@ -111,18 +111,22 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
             Phase.FOLLOW: self._follow,
             Phase.SMOOTH: self._smooth,
             Phase.NOISE: self._noise,
+            Phase.WIDEN: self._widen,
         }
 
-    def _linearised(self, here: SmoothingPosition) -> ChainLinearisation | None:
-        """By short differences, by theta alone for the regression."""
-        return linearise(self.chain, here.theta, here.states, with_states=here.phase is not Phase.REGRESS)
+    def _linearised(self, here: WidePosition) -> ChainLinearisation | None:
+        """By short differences until there is an optimum, by theta alone for the regression."""
+        if here.phase is Phase.REGRESS:
+            return linearise(self.chain, here.theta, here.states, with_states=False)
+        return super()._linearised(here)
 
     def _begin(self, theta: FloatArray) -> SmoothingPosition:
         """At a starting point (N,)."""
         chain = self.chain
         phase, ones = Phase.REGRESS if chain.determined.all() else Phase.FOLLOW, np.ones(chain.num_start)
         none, damping = np.zeros(len(chain.linked), bool), self.tuning.damping.first
-        return SmoothingPosition(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
+        here = SmoothingPosition(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
+        return replace(here, theta_step=np.zeros(chain.num_theta), state_step=np.zeros(chain.prior_precision.shape))
 
     def shoot(self, state: StateSpaceState) -> StateSpaceState:
         """A finished search, once more from where windows of the logs end; as it was where they lead nowhere.
@@ -140,12 +144,9 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
             return replace(state, uncounted=chain.uncounted)
         movement, fixed = chain.movement(end.states), chain.fixed_sd
         sd = np.where(np.isnan(fixed), np.maximum(roughness(chain), chain.least[0]), fixed)
-        process = np.maximum(tuning.process * movement, chain.least[1])
-        here = replace(self._begin(end.theta), states=end.states, movement=movement, phase=Phase.NOISE)
-        here = replace(here, noise=self._guessed(ChainNoise(sd, process), movement))
-        here = replace(
-            here, estimates=self.tuning.smoothing.most_filters
-        )  # whose states would be lost for the filter's
+        noise = ChainNoise(sd, np.maximum(tuning.process * movement, chain.least[1]))
+        here = replace(self._begin(end.theta), states=end.states, movement=movement, phase=Phase.WIDEN)
+        here = replace(here, noise=self._guessed(noise, movement), estimate_theta=end.theta)
         points = np.concatenate([state.points, end.theta[None]])
         return replace(state, points=points, point=len(points) - 1, here=here, done=False, uncounted=chain.uncounted)
 
@@ -179,6 +180,8 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
 
     def _smooth(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """A step of theta and all states; where none gains anything, an estimate of the noise at once."""
+        if state.here.is_wide:
+            return self.wide_smooth(state, linear)
         tuning, here = self.tuning.smoothing, replace(state.here, iteration=state.here.iteration + 1)
         here = replace(here, steps=here.steps + 1)
         prior, tolerance = self.problem.quadratic_prior, tuning.tolerance
@@ -191,6 +194,8 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
 
     def _noise(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """An estimate of the noise, and a step."""
+        if state.here.is_wide:
+            return self.wide_noise(state, linear)
         here = replace(state.here, iteration=state.here.iteration + 1, steps=state.here.steps + 1)
         return self._estimated(state.at(here), linear, still=False)
 
@@ -267,7 +272,7 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
                 return state.at(replace(here, phase=Phase.SMOOTH, steps=0))
         value = evidence(self.problem, here, linear, noise, settled)
         if value <= worthwhile:
-            return state.next_point(self._begin)
+            return self._widened(state)
         state = state.at(here)
         state = state.with_optimum(optimum_at(self.problem, state, linear, noise, value, settled))
         # then from the optimum: without any outlier, or with those that stand out now
@@ -275,15 +280,29 @@ class StateSpaceSearch(ChainSearch[StateSpaceState]):
         if outliers.any():
             other = self._without_outliers(here, linear, noise)
             if other is None or other[1] <= value + tuning.smoothing.settled:
-                return state.next_point(self._begin)
+                return self._widened(state)
             end, _ = other
             again = replace(again, theta=end.point.theta, states=end.point.states, damping=end.damping)
             return state.at(replace(again, noise=replace(here.noise, outliers=np.zeros_like(outliers))))
         proposed = self._candidates(here, linear, noise)
         if not proposed.any():
-            return state.next_point(self._begin)
+            return self._widened(state)
         noise = replace(here.noise, outliers=proposed)
         return state.at(replace(again, noise=noise, proposals=here.proposals + 1))
+
+    def _widened(self, state: StateSpaceState) -> StateSpaceState:
+        """From this starting point's optimum on with wide differences; or the next one where it has none."""
+        optimum = next((one for one in state.optima if one.point == state.point), None)
+        if optimum is None:
+            return state.next_point(self._begin)
+        here = replace(state.here, phase=Phase.WIDEN, theta=optimum.theta, states=optimum.states, noise=optimum.noise)
+        damping = self.tuning.damping.first
+        return state.at(replace(here, damping=damping, estimates=0, steps=0, estimate_theta=optimum.theta))
+
+    def _widen(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
+        """The lengths of the first wide differences."""
+        noise = solvable(linear, state.here.noise)
+        return self.with_differences(state.at(replace(state.here, phase=Phase.NOISE)), linear, noise)
 
     def _candidates(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> BoolArray:
         """Jumps (K-1,) to propose: none that turned out to be no outlier, and none after a few times."""

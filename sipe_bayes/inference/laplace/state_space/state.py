@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum, auto
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 import torch
+from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.state_space.noise import jump_scale, process_penalty
 from sipe_bayes.inference.laplace.state_space.options import ChainTuning
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import rarity
@@ -34,6 +36,8 @@ class Phase(StrEnum):
     """A step of theta and all states."""
     NOISE = auto()
     """The noise is estimated anew before the step."""
+    WIDEN = auto()
+    """From an optimum by short differences on with wide ones."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,8 @@ class ChainOptimum(Optimum):
         state_step: (K, D).
         settled: whether the noise had.
         point: number of the starting point.
+        absorbed: squares of the jumps over their variance: numbers of the log that process noise explains.
+        rough: whether some step jumps by more than its process noise within the differences.
     """
 
     states: FloatArray
@@ -93,6 +99,8 @@ class ChainOptimum(Optimum):
     state_step: FloatArray
     settled: bool
     point: int
+    absorbed: float = 0.0
+    rough: bool = False
 
     @property
     def noise(self) -> ChainNoise:
@@ -106,6 +114,20 @@ class ChainOptimum(Optimum):
             "movement": self.movement.tolist(),
             "outliers": np.flatnonzero(self.outliers).tolist(),
         }
+
+
+def contradiction(optima: Sequence[ChainOptimum]) -> float | None:
+    """How far, in sds, an optimum lies from the likeliest that another start ended in and that might as well be right.
+
+    None where none excludes it: seen from the wider of the two, further off than one in a thousand would be. What is
+    less likely by more than the likeliest one's process noise takes, in nats, is no alternative: the right trajectory
+    would need none, and gain that much at most.
+    """
+    best = max(optima, key=lambda one: one.evidence)
+    least = best.evidence - max(10.0, 0.5 * best.absorbed)
+    distances = [min(best.distance(one), one.distance(best)) for one in optima if one.evidence > least]
+    furthest = max(distances)
+    return furthest if chi2.sf(furthest**2, len(best.mean)) < THRESHOLDS.contradiction else None
 
 
 P = TypeVar("P", bound=Position)
@@ -259,4 +281,6 @@ def optimum_at(
         state_step=np.zeros_like(linear.offset),
         settled=settled,
         point=state.point,
+        absorbed=float((linear.jump**2 / linear.jump_variance(noise))[linear.linked].sum()),
+        rough=bool((linear.error > noise.jump_sd**2)[linear.linked].any()),
     )

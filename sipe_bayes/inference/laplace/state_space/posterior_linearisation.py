@@ -1,0 +1,127 @@
+"""Steps of a smoother whose differences are as long as the posterior is wide, and what both searches make of them.
+
+A control step jumps where a contact opens or closes. A short difference across such a jump is a slope of jump by
+length: one of them in a log outweighs all that the other steps say of a parameter, and its interval is a hundredth of
+what it should be. Differences as long as what is still open, with a variance for what no line can follow
+(``likelihood.state_space.differences``), do not see it. A search over a chain of states ends with them, whichever way
+it came to its optimum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.inference.laplace.state_space.noise import infer_noise
+from sipe_bayes.inference.laplace.state_space.smoother import border, smooth, solvable
+from sipe_bayes.inference.laplace.state_space.state import (
+    ChainSearch,
+    ChainState,
+    Phase,
+    Position,
+    evidence,
+    optimum_at,
+)
+from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood.state_space.differences import linearise_by
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
+
+
+@dataclass(frozen=True)
+class WidePosition(Position):
+    """Where the search from one starting point stands.
+
+    Args:
+        theta_step: (N,), of the next differences; short ones where all are zero.
+        state_step: (K, D).
+        estimate_theta: (N,), where the noise was estimated last.
+    """
+
+    theta_step: FloatArray = field(default_factory=lambda: np.zeros(0))
+    state_step: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    estimate_theta: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether differences have the posterior's lengths."""
+        return bool(self.state_step.any())
+
+
+S = TypeVar("S", bound=ChainState[Any])
+
+
+class WideSearch(ChainSearch[S]):
+    """A search with steps by such differences."""
+
+    def _linearised(self, here: WidePosition) -> ChainLinearisation | None:
+        """Over the surroundings that are open, after short differences first."""
+        return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
+
+    def wide_smooth(self, state: S, linear: ChainLinearisation) -> S:
+        """A step of theta and all states."""
+        return self._stepped(state, linear, solvable(linear, state.here.noise))
+
+    def wide_noise(self, state: S, linear: ChainLinearisation) -> S:
+        """An estimate of the noise, which may be worth recording, and a step."""
+        state, noise, ends = self.estimated(state, linear)
+        if ends:
+            return state.next_point(self._begin)
+        try:
+            return self._stepped(state, linear, noise)
+        except BudgetExhausted:
+            return state  # what was recorded is kept, and the next step ends the search
+
+    def _stepped(self, state: S, linear: ChainLinearisation, noise: ChainNoise) -> S:
+        """Where a step leads, and how long the differences are there."""
+        here, tuning = state.here, self.tuning.wide
+        prior = self.problem.quadratic_prior
+        point, fit = smooth(self.chain, linear, noise, prior, here.point, here.damping, tuning.tolerance, self.tuning)
+        steps = tuning.steps if fit.point is None else here.steps + 1
+        phase = Phase.NOISE if steps >= tuning.steps else Phase.SMOOTH
+        here = replace(here, phase=phase, theta=point.theta, states=point.states, damping=fit.damping)
+        state = state.at(replace(here, steps=steps, iteration=here.iteration + 1))
+        return self.with_differences(state, linear, noise)
+
+    def estimated(self, state: S, linear: ChainLinearisation) -> tuple[S, ChainNoise, bool]:
+        """Estimate the noise anew.
+
+        Returns:
+            The state with the noise, and with the optimum if it is worth recording; the noise that a step is made for;
+            and whether the search from this starting point ends.
+        """
+        here, prior, tuning = state.here, self.problem.quadratic_prior, self.tuning.wide
+        theta, noise = here.theta, solvable(linear, here.noise)
+        # whether a step not yet taken is to be credited
+        hold = border(prior, theta, eliminate_states(linear, noise).gradient)
+        promised = restricted(linear, noise, hold)[0] - restricted(linear, noise, hold, held=True)[0]
+        held = promised > tuning.tolerance
+        estimate, gain = infer_noise(self.chain, linear, noise, prior, theta, here.movement, self.tuning.noise, held)
+        estimate = solvable(linear, estimate)
+        # whether it has settled
+        away = theta - here.estimate_theta
+        moved = float(away @ eliminate_states(linear, estimate).precision @ away) / len(theta)
+        enough = max(tuning.settled, tuning.settled_each * float(linear.observed.sum()))
+        settled = here.estimates > 0 and gain < enough and moved < tuning.still
+        value = evidence(self.problem, here, linear, estimate, settled=False)
+        if value > state.best_evidence - settled * tuning.as_good or here.estimates == 0:
+            optimum = optimum_at(self.problem, state, linear, estimate, value, settled)
+            optimum = replace(optimum, theta_step=here.theta_step, state_step=here.state_step)
+            state = state.with_optimum(optimum)
+        noise = replace(here.noise, sd=estimate.sd, process=estimate.process)
+        estimates, ends = here.estimates + 1, settled or here.estimates + 1 >= tuning.most_estimates
+        here = replace(here, phase=Phase.SMOOTH, noise=noise, estimates=estimates, steps=0, estimate_theta=theta)
+        return state.at(here), estimate, ends
+
+    def with_differences(self, state: S, linear: ChainLinearisation, noise: ChainNoise) -> S:
+        """With the lengths of the next differences: the sds of theta and of the states, within limits."""
+        here, tuning = state.here, self.tuning.wide
+        solved = eliminate_states(linear, noise)
+        variance = np.einsum("kdd->kd", solved.covariances()[0])
+        _, covariance = self.problem.normal(here.theta, solved.precision, solved.gradient)
+        longest = np.maximum(tuning.most_state_step * here.movement, tuning.least_state_step)
+        theta_step = np.clip(np.sqrt(np.diag(covariance)), tuning.least_theta_step, tuning.most_theta_step)
+        state_step = np.clip(np.sqrt(variance), tuning.least_state_step, longest)
+        return state.at(replace(here, theta_step=theta_step, state_step=state_step))
