@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt
 
-.PHONY: demo test bench studies docs wheel-check clean
+.PHONY: demo test fuzz bench studies docs wheel-check clean
 .DEFAULT_GOAL := test
 
 $(READY): pyproject.toml constraints.txt
@@ -27,6 +27,10 @@ test: $(READY)
 	$(BIN)/mypy
 	$(BIN)/python -c "import arviz" # writes its note of the day, which two processes at once can not
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --dist loadfile # a process for each core, one thread each
+
+# changed files and odd options: 100,000 cases; FUZZ=--target for some, --seed N for one that failed
+fuzz: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run $(FUZZ)
 
 bench: $(READY)
 	$(BIN)/python tests/bench/bench.py

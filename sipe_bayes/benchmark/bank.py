@@ -8,7 +8,6 @@ beside the blocks says what a shard cost.
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,10 +15,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from sipe_bayes.benchmark.executors.work import Done, Unit
 from sipe_bayes.benchmark.log import recorded
-from sipe_bayes.core.files import to_json
+from sipe_bayes.core.files import FileError, read_arrays, read_json, reading, to_json
 from sipe_bayes.core.validation import whole
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Variant
@@ -45,6 +45,21 @@ class Bank:
     def id(self) -> str:
         """Such as ``Door/in_distribution/seed0/100``."""
         return f"{self.task}/{self.variant}/seed{self.seed}/{self.steps}"
+
+
+@dataclass(frozen=True)
+class _Shard:
+    """What the file beside a shard's blocks says of them."""
+
+    bank: str
+    cpu_seconds: float
+
+
+def _shard(path: Path) -> _Shard:
+    what, remedy = "the note of a shard", "delete its folder, and it is simulated again"
+    plain = read_json(path, what, remedy)
+    with reading(path, what, remedy):
+        return TypeAdapter(_Shard).validate_python(plain)
 
 
 class _Blocks(Cache):
@@ -82,7 +97,7 @@ def known_place(bank: Bank, folder: Path) -> Path | None:
         None where there are none, or those of several logs.
     """
     notes = (folder / FOLDER).glob("*/shard-*.json")
-    folders = {path.parent for path in notes if json.loads(path.read_text(encoding="utf-8"))["bank"] == bank.id}
+    folders = {path.parent for path in notes if _shard(path).bank == bank.id}
     return folders.pop() if len(folders) == 1 else None
 
 
@@ -116,9 +131,9 @@ def _left_out(bank: Bank, blocks: list[tuple[int, int]], why: str) -> Done:
 def _rows(path: Path) -> int:
     """Rows of a block's file, 0 where it is missing or broken."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return len(data["valid"])
-    except Exception:  # whatever a broken file raises: it is made again
+        with reading(path, "simulations", "simulate again"):
+            return len(read_arrays(path)["valid"])
+    except FileError:
         return 0
 
 
@@ -139,9 +154,7 @@ def _simulate(bank: Bank, blocks: list[tuple[int, int]]) -> Done:
 
 def cost(folder: Path, key: str) -> float:
     """CPU seconds that a bank took, as far as its shards are there."""
-    return float(
-        sum(json.loads(p.read_text(encoding="utf-8"))["cpu_seconds"] for p in (folder / key).glob("shard-*.json"))
-    )
+    return float(sum(_shard(path).cpu_seconds for path in (folder / key).glob("shard-*.json")))
 
 
 def verify(bank: Bank, budget: int, folder: Path, again: int = 1) -> list[str]:

@@ -7,17 +7,16 @@ what is missing can be said.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import ClassVar, Literal, Self, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from sipe_bayes.benchmark.cells import Value
-from sipe_bayes.core.files import OutputError, to_json, write_text
+from sipe_bayes.core.files import OutputError, read_json, reading, to_json, write_text
 from sipe_bayes.diagnostics.scores import Scores
 
 RECORDS = "records"
@@ -156,22 +155,15 @@ class Record:
         Raises:
             RecordError: for a file that is no such record.
         """
-        try:
-            plain = json.loads(path.read_text(encoding="utf-8"))
+        what, remedy = "a record", "delete it, and the cell runs again"
+        plain = read_json(path, what, remedy, RecordError)
+        with reading(path, what, remedy, RecordError):
             unknown = sorted(set(plain) - {f.name for f in fields(cls)})
             if unknown:
                 raise ValueError(f"unknown entry {unknown[0]!r}")
             # what is missing of a failed cell is an empty mapping in earlier files
             given = {k: v for k, v in plain.items() if v != {} or k in _MAPPINGS}
             return _reader(cls).validate_python(given)  # type: ignore[arg-type]
-        except (OSError, ValueError, TypeError) as error:
-            what = error
-            if isinstance(error, ValidationError):
-                first = error.errors()[0]
-                what = ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
-            raise RecordError(
-                f"{path}: cannot be read as a record ({what}); delete it, and the cell runs again"
-            ) from None
 
     @classmethod
     def all_in(cls, folder: Path) -> list[Self]:
@@ -282,7 +274,7 @@ def mixed(records: Sequence[Record]) -> list[str]:
         if record.done and record.log != "policy":
             sweep = "/sweep" * (record.setting == "sweep")
             logs.setdefault(f"{record.task}/{record.variant}/seed{record.seed}{sweep}", set()).add(
-                record.checksums["log"]
+                record.checksums.get("log", "")
             )
     return [group for group, checksums in logs.items() if len(checksums) > 1]
 
@@ -292,10 +284,10 @@ def planned(folder: Path) -> list[str]:
     path = folder / PLAN
     if not path.is_file():
         return []
-    try:
-        return [str(cell) for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RecordError(f"{path}: cannot be read ({error}); delete it and run the suite again") from None
+    what, remedy = "a plan", "delete it and run the suite again"
+    plain = read_json(path, what, remedy, RecordError)
+    with reading(path, what, remedy, RecordError):
+        return TypeAdapter(list[str]).validate_python(plain["cells"])
 
 
 def plan(folder: Path, cells: Sequence[str]) -> None:

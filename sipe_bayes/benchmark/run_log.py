@@ -5,7 +5,6 @@ How each estimate went, look by look, stands in ``looks.csv`` and in a TensorBoa
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
@@ -14,7 +13,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from sipe_bayes.benchmark.records import Look, Record
-from sipe_bayes.core.files import OutputError, to_json, write_text
+from sipe_bayes.core.files import OutputError, read_json, reading, to_json, write_text
 from sipe_bayes.rl.train import write_table
 
 RUNS, LOOKS = "runs.json", "looks.csv"
@@ -111,11 +110,11 @@ def read_runs(folder: Path) -> list[Run]:
         OutputError: for a file that cannot be read.
     """
     path = folder / RUNS
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["runs"] if path.is_file() else []
-        return TypeAdapter(list[Run]).validate_python(rows)
-    except (ValueError, KeyError) as error:
-        raise OutputError(f"{path}: cannot be read ({' '.join(str(error).split())}); delete it") from None
+    if not path.is_file():
+        return []
+    plain = read_json(path, "what runs took", "delete it", OutputError)
+    with reading(path, "what runs took", "delete it", OutputError):
+        return TypeAdapter(list[Run]).validate_python(plain["runs"])
 
 
 def write_runs(folder: Path, runs: Sequence[Run]) -> None:

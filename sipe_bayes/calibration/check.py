@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import time
 import warnings
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ import torch
 from sipe_bayes.calibration.output import claim
 from sipe_bayes.calibration.study import Study
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import replacing, to_json, write_bytes, write_text
+from sipe_bayes.core.files import FileError, read_arrays, reading, replacing, to_json, write_bytes, write_text
 from sipe_bayes.core.findings import Finding, Severity
 from sipe_bayes.core.seeding import seed_integer, torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -76,11 +76,12 @@ class Fit:
     def load(cls, path: Path) -> Fit | None:
         """None where there is none or it cannot be read: it is then done again."""
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with reading(path, "a fit", "delete it"):
+                data: dict[str, Any] = read_arrays(path)
                 rollouts, seconds = data["numbers"].tolist()
                 error, warned = str(data["error"]), tuple(map(str, data["warned"]))
                 return cls(data["truth"], data["draws"], int(rollouts), seconds, error, warned)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        except FileError:
             return None
 
 

@@ -16,10 +16,12 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, PrivateAttr, Strict, ValidationError, model_validator
 
 from sipe_bayes.calibration.config_fields import (
+    Budget,
     ConfigError,
     EstimatorName,
     Location,
     Table,
+    Use,
     Window,
     nearest_file,
     one_line,
@@ -37,10 +39,11 @@ from sipe_bayes.calibration.config_tables import (
     Resample,
     Search,
     Structure,
-    Use,
 )
 from sipe_bayes.calibration.readers.many import episodes_of
+from sipe_bayes.core.files import read_text, reading
 from sipe_bayes.core.units import find_unit
+from sipe_bayes.core.validation import MOST
 
 
 class Config(Table):
@@ -59,9 +62,9 @@ class Config(Table):
     window: Window = None
     """length in seconds of the windows that a log is cut into, each with a start of its own; `"log"` for whole
     logs; to be given with `"segments"`"""
-    seed: Annotated[int, Strict(), Field(ge=0)] = 0
+    seed: Annotated[int, Strict(), Field(ge=0, le=MOST)] = 0
     """the same seed gives the same posterior"""
-    budget: Annotated[int, Strict(), Field(gt=0)] | None = None
+    budget: Budget | None = None
     """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
     afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
     search: Search = Search()
@@ -211,19 +214,19 @@ def load_config(path: str | Path) -> Config:
     """Read and check a configuration, a TOML file; raises ConfigError for one that cannot be used."""
     path = Path(path)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = read_text(path, "a configuration", "give a TOML file in UTF-8", ConfigError)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; {nearest_file(path)}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); give a TOML file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}; correct that line") from None
-    try:
-        config = Config.model_validate(data, context={"folder": path.parent})
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {one_line(error.errors()[0])}") from None
+    with reading(path, "a configuration", "correct it", ConfigError):
+        try:
+            data = tomllib.loads(text)
+            config = Config.model_validate(data, context={"folder": path.parent})
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(f"{path}: not valid TOML: {error}; correct that line") from None
+        except ValidationError as error:
+            raise ConfigError(f"{path}: {one_line(error.errors()[0])}") from None
     config = config.model_copy(update={"logs": _episodes(path, config)})
     config._path = path
     if not config.model.is_file():
-        raise ConfigError(f"{path}: key `model`: no such file, got {config.model}; {nearest_file(config.model)}")
+        raise ConfigError(f"{path}: key `model`: no such file, got {str(config.model)!r}; {nearest_file(config.model)}")
     return config

@@ -21,7 +21,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from sipe_bayes.core.units import find_unit
-from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.core.validation import MOST_ROLLOUTS, nearest_name
 from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.structure.registry import EXTENSIONS
 
@@ -176,6 +176,8 @@ def _target(word: str) -> str:
 Text = Annotated[str, Field(min_length=1), Strict()]
 ExtensionName = Annotated[Text, AfterValidator(_extension)]
 OwnExtension = Annotated[Text, AfterValidator(_own_extension)]
+Budget = Annotated[int, Strict(), Field(gt=0, le=MOST_ROLLOUTS)]
+Use = Literal["train", "holdout"]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
 Pair = tuple[Number, Number]

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, model_validator
 
 from sipe_bayes.calibration.config_fields import (
+    Budget,
     ExtensionName,
     Location,
     Number,
@@ -20,6 +21,7 @@ from sipe_bayes.calibration.config_fields import (
     Text,
     TimeWord,
     UnitWord,
+    Use,
     VoltageWord,
     Window,
     check_ordered,
@@ -29,8 +31,6 @@ from sipe_bayes.calibration.config_fields import (
 )
 from sipe_bayes.calibration.readers.many import matching, names_of
 from sipe_bayes.core.units import find_unit
-
-Use = Literal["train", "holdout"]
 
 
 class TimeColumn(Table):
@@ -368,9 +368,9 @@ class PriorSource(Table):
 class Search(Table):
     """How widely the optimum is looked for."""
 
-    restarts: Annotated[int, Strict(), Field(gt=0)] = 2
+    restarts: Annotated[int, Strict(), Field(gt=0, le=10_000)] = 2
     """of `laplace` and `mcmc`: starting points that the search follows"""
-    candidates: Annotated[int, Strict(), Field(ge=0)] = 8
+    candidates: Annotated[int, Strict(), Field(ge=0, le=1_000_000)] = 8
     """how many points are simulated to choose them from, besides the model as given. They are drawn from the
     prior; from 40 on, the later ones around the best so far"""
     start: dict[str, Number] | None = None
@@ -389,7 +389,7 @@ class Structure(Table):
     """extensions of your own beside them: `"path/to/file.py:Class"` or `"package.module:Class"`"""
     sites: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """joints, actuators and channels where extensions may be placed; default all"""
-    budget: Annotated[int, Strict(), Field(gt=0)] | None = None
+    budget: Budget | None = None
     """rollouts of all its fits; default 20,000"""
 
     @model_validator(mode="after")

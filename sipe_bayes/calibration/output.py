@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.calibration.problem import RUN, Problem
-from sipe_bayes.core.files import OutputError, installed_version, not_a_file, replacing, to_json, write_text
+from sipe_bayes.core.files import OutputError, installed_version, not_a_file, read_json, replacing, to_json, write_text
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
@@ -82,10 +82,7 @@ def claim(
     not_a_file(folder)
     record, content = folder / file, to_json(own, indent=2)
     if record.is_file():
-        try:
-            present = json.loads(record.read_text(encoding="utf-8"))
-        except (OSError, json.JSONDecodeError) as error:
-            raise OutputError(f"--out {folder}: its {file} cannot be read ({error}); choose another folder") from None
+        present = read_json(record, f"the record of a {what}", "choose another --out", OutputError)
         mine = json.loads(content)
         differing = ", ".join(key.removesuffix("_sha256") for key in keys if present.get(key) != mine[key])
         if differing:

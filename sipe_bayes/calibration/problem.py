@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 
 from sipe_bayes.calibration.config import Config, check_dimensions, load_config
 from sipe_bayes.calibration.config_fields import ConfigError, overlap
 from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.files import read_json, reading
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
@@ -239,7 +240,10 @@ def _of_earlier(source: Path, earlier: Posterior, train: Sequence[LogReport]) ->
         noticed.append(finding(Code.PRIOR_OF_MIXTURE, components=len(earlier.means)))
     record = source.parent / RUN
     if record.is_file():
-        before = set(json.loads(record.read_text(encoding="utf-8")).get("logs_sha256", {}).values())
+        remedy = "calibrate again, or give a copy of the posterior alone"
+        plain = read_json(record, "the record of a run", remedy)
+        with reading(record, "the record of a run", remedy):
+            before = set(TypeAdapter(dict[str, str]).validate_python(plain.get("logs_sha256", {})).values())
         again = [report.name for report in train if report.sha256 in before]
         if again:
             noticed.append(finding(Code.PRIOR_COUNTED_TWICE, logs=", ".join(again)))

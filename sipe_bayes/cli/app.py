@@ -20,7 +20,7 @@ from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
-from sipe_bayes.cli.errors import check_least, exit_on_error
+from sipe_bayes.cli.errors import check_least, check_words, exit_on_error
 from sipe_bayes.cli.examples import give_examples
 from sipe_bayes.core import __version__
 from sipe_bayes.inference.progress_bar import ProgressBar
@@ -54,7 +54,11 @@ _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 def main() -> None:
     """Entry point: input errors are one line on standard error and exit code 2."""
     try:
+        with exit_on_error():
+            check_words(sys.argv[1:])
         code = app(standalone_mode=False)
+    except typer.Exit as ended:
+        code = ended.exit_code
     except typer.Abort:
         code = 1
     except _REFUSED as error:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import errno
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import typer
 
+from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
+
 BAD_INPUT = 2
 """Exit code where input is at fault."""
+_LONGEST = 1000  # characters of a word of the command line
 _INTERRUPTED = 130  # exit code, as shells have it for SIGINT
 _REMEDIES = {
     errno.EACCES: "make it writable, or choose another folder",
@@ -39,6 +42,9 @@ def exit_on_error(then: str = "") -> Iterator[None]:
             raise
         print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
+    except MemoryError:
+        print("sipe: more memory is asked for than there is; ask for less, or use a larger machine", file=sys.stderr)
+        raise typer.Exit(BAD_INPUT) from None
     except KeyboardInterrupt:
         print(f"sipe: interrupted{then}", file=sys.stderr)
         raise typer.Exit(_INTERRUPTED) from None
@@ -51,12 +57,32 @@ def _text(error: Exception) -> str:
     return str(error)
 
 
+def check_words(words: Sequence[str]) -> None:
+    """See that no word of a command line is empty or holds what no terminal shows, which no name is meant to.
+
+    Raises:
+        ValueError: for such a word; the message shows it escaped.
+    """
+    for word in words:
+        name, equals, value = word.partition("=")
+        empty = not word.strip() or (name.startswith("--") and equals and not value.strip())
+        if empty:
+            raise ValueError(f"{word!r}: expected a value, got nothing; give one, or leave the option out")
+        if len(word) > _LONGEST:
+            raise ValueError(f"{word[:20]!r}...: has {len(word)} characters, the most is {_LONGEST}; shorten it")
+        if not word.isprintable():
+            raise ValueError(f"{word!r}: holds characters that cannot be printed; write it without them")
+
+
 def check_least(least: int, **options: float | None) -> None:
-    """See that options, named with ``_`` for ``-``, are large enough; one that is left out is."""
+    """See that options, named with ``_`` for ``-``, are large enough, and not beyond sense; one that is left out is."""
+    most = {"threads": most_threads(), "jobs": most_threads(), "seed": MOST}
     for name, value in options.items():
-        if value is not None and value < least:
-            option = name.replace("_", "-")
+        option = name.replace("_", "-")
+        if value is not None and not value >= least:
             raise ValueError(f"--{option} {value}: expected at least {least}; raise it or leave it out")
+        if value is not None and value > most.get(name, MOST_ROLLOUTS):
+            raise ValueError(f"--{option} {value:.4g}: expected at most {most.get(name, MOST_ROLLOUTS)}; lower it")
 
 
 def check_one_of(option: str, value: str, known: tuple[str, ...]) -> None:

@@ -97,8 +97,9 @@ def _known(problem: Problem, path: Path | None) -> Posterior:
 
 def _noise(problem: Problem, path: Path | None) -> Noise:
     """Of the fitted channels: as the run beside the posterior found it, else by a fit."""
-    import json
+    from pydantic import TypeAdapter
 
+    from sipe_bayes.core.files import read_json, reading
     from sipe_bayes.inference.log_noise import fitted_noise
     from sipe_bayes.likelihood.noise import Noise
 
@@ -106,9 +107,12 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
     fitted = list(problem.segments.fit or channels)
     record = None if path is None else path.parent / "result.json"
     if record is not None and record.is_file():
-        noise = json.loads(record.read_text(encoding="utf-8"))["noise"]
-        if set(fitted) <= set(noise):
-            return Noise(*(np.array([noise[c][what] for c in fitted]) for what in ("sd", "tau")))
+        remedy = "calibrate again, or give a copy of the posterior alone"
+        plain = read_json(record, "the result of a run", remedy)
+        with reading(record, "the result of a run", remedy):
+            noise = TypeAdapter(dict[str, dict[str, float | None]]).validate_python(plain["noise"])
+            if set(fitted) <= set(noise):
+                return Noise(*(np.array([noise[c][what] for c in fitted], float) for what in ("sd", "tau")))
     every = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior).noise
     chosen = [channels.index(c) for c in fitted]
     return Noise(every.sd[chosen], every.tau[chosen])

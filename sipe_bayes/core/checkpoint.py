@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import hashlib
 import json
 import time
 import types
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
+from numpy.typing import NDArray
+from safetensors import safe_open
 from safetensors.numpy import save
 from torch import Tensor, from_numpy
 
-from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.files import reading, write_bytes
 from sipe_bayes.core.findings import Finding
 
 
@@ -64,7 +67,9 @@ def save_state(path: Path, state: object, fingerprint: str) -> None:
     arrays: dict[str, Any] = {}
     plain = _flattened("", state, arrays)
     arrays.setdefault("_", np.zeros(1))  # safetensors wants at least one
-    write_bytes(path, save(arrays, metadata={"plain": json.dumps(plain), "fingerprint": fingerprint}))
+    text = json.dumps(plain)
+    metadata = {"plain": text, "fingerprint": fingerprint, "sha256": checksum(arrays, text)}
+    write_bytes(path, save(arrays, metadata=metadata))
 
 
 class Stored(Generic[S]):
@@ -106,20 +111,26 @@ def load_state(path: Path, kind: type[S], fingerprint: str) -> S:
     Raises:
         CheckpointError: when it is corrupt, of another version, or belongs to another run.
     """
-    try:
+    remedy = "it is damaged or of another version of sipe_bayes: delete it to start again"
+    with reading(path, "a checkpoint", remedy, CheckpointError):
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata()
-            arrays = {k: file.get_tensor(k) for k in file.keys() if k != "_"}  # noqa: SIM118
+            arrays = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
         if metadata["fingerprint"] != fingerprint:
             raise CheckpointError(f"checkpoint {path}: belongs to another run; choose another folder or delete it")
+        if metadata["sha256"] != checksum(arrays, metadata["plain"]):
+            raise ValueError("does not match its checksum")
+        arrays.pop("_", None)
         return typing.cast(S, _restored("", json.loads(metadata["plain"]), kind, arrays))
-    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(
-            f"checkpoint {path}: cannot be read ({error}); it is damaged or of another version of sipe_bayes: delete "
-            "it to start again"
-        ) from None
+
+
+def checksum(arrays: Mapping[str, NDArray[np.generic]], text: str) -> str:
+    """Of what a checkpoint holds: its arrays by name, and the JSON beside them."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
 
 
 def _flattened(name: str, value: Any, arrays: dict[str, Any]) -> Any:
@@ -165,6 +176,8 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
         return origin(_restored(f"{name}.{k}", v, items[k], arrays) for k, v in enumerate(plain))
     if origin is dict:
         return {k: _restored(f"{name}.{k}", v, arguments[1], arrays) for k, v in plain.items()}
+    if kind in (bool, int, float, str) and not isinstance(plain, (int, float) if kind is float else kind):
+        raise ValueError(f"{name.lstrip('.')}: expected {kind.__name__}, got a {type(plain).__name__}")
     return plain
 
 

@@ -1,4 +1,8 @@
-"""Files appear whole or not at all: written in the same folder under a name of their own, then renamed."""
+"""Files appear whole or not at all, and are read through one door.
+
+Written in the same folder under a name of their own, then renamed. Read within ``reading``, which turns whatever a file
+can cause into one line, and bounded before anything is allocated for what a file claims.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,21 @@ import json
 import math
 import os
 import uuid
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+LOG_GIB, MODEL_GIB, MODEL_SECONDS = "SIPE_LOG_GIB", "SIPE_MODEL_GIB", "SIPE_MODEL_SECONDS"
+_LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 60.0}
+_LONGEST_TEXT = 2**25  # bytes of JSON or TOML: what it becomes in memory is twenty times as much
+_WORDS = 200  # characters of what a library says
 
 
 @contextmanager
@@ -38,6 +52,142 @@ def write_text(path: Path, text: str) -> None:
     """Write a whole file of UTF-8."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+class FileError(ValueError):
+    """A file that cannot be used; the message is one line with the file, what is wrong and the remedy."""
+
+
+@contextmanager
+def reading(path: object, what: str, remedy: str, kind: type[ValueError] = FileError) -> Iterator[None]:
+    """Whatever a file causes while it is decoded and held against what it should say becomes one line.
+
+    Only what decodes or checks stands within: a mistake of this package there would be blamed on the file. What was
+    raised stays attached as the cause.
+
+    Args:
+        path: what the line names.
+        what: it was expected to be.
+        remedy: what to do about it.
+        kind: of the error; one of its kind, which has its line already, passes.
+
+    Raises:
+        ValueError: of the kind.
+    """
+    try:
+        yield
+    except (kind, FileError, ModuleNotFoundError):
+        raise
+    except Exception as error:
+        if isinstance(error, FileNotFoundError) and error.errno is None:  # in our words
+            raise
+        raise kind(f"{path}: cannot be read as {what} ({reason(error)}); {remedy}") from error
+
+
+def reason(error: Exception) -> str:
+    """One line of an exception, which may have no words of its own."""
+    if isinstance(error, MemoryError):
+        return "more than the memory holds"
+    if isinstance(error, RecursionError):
+        return "nested too deep"
+    several = getattr(error, "errors", None)  # of pydantic, which has a paragraph for each
+    first = next(iter(several()), None) if callable(several) else None
+    text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}" if first else str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror
+    text = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    short = text if len(text) <= _WORDS else f"{text[: _WORDS - 3]}..."
+    return short if short and isinstance(error, OSError | ValueError | EOFError) else f"{type(error).__name__} {short}"
+
+
+def limit(name: str) -> float:
+    """A limit on what files may ask for: the environment variable of that name, which no file can set, or its default.
+
+    Raises:
+        FileError: for a variable that is no positive number.
+    """
+    given = os.environ.get(name, "")
+    try:
+        value = float(given) if given else _LIMITS[name]
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise FileError(f"{name}={given}: expected a number above 0; {_LIMITS[name]:g} is the default")
+    return value
+
+
+def read_text(path: Path, what: str, remedy: str, kind: type[ValueError] = FileError) -> str:
+    """A file of UTF-8, of a size that is bounded; FileNotFoundError where it is missing, else as ``reading``."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file; expected {what}")
+    with reading(path, what, remedy, kind):
+        if not path.is_file():
+            raise ValueError("is no plain file")
+        if path.stat().st_size > _LONGEST_TEXT:
+            raise ValueError(f"has {path.stat().st_size} bytes, the most is {_LONGEST_TEXT}")
+        return path.read_text(encoding="utf-8")
+
+
+def read_json(path: Path, what: str, remedy: str, kind: type[ValueError] = FileError) -> dict[str, object]:
+    """The object that a JSON file holds; errors as those of ``read_text``."""
+    text = read_text(path, what, remedy, kind)
+    with reading(path, what, remedy, kind):
+        plain = json.loads(text, parse_int=_whole)
+        if not isinstance(plain, dict):
+            raise ValueError(f"expected an object of JSON, got a {type(plain).__name__}")
+        return plain
+
+
+def _whole(digits: str) -> int:
+    """A whole number of JSON; what no array holds is refused where it stands, not where it is used."""
+    number = int(digits)
+    if abs(number) >= 2**63:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return number
+
+
+def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[np.generic]]:
+    """The arrays of an npz, each checked against what its member holds before it is read; nothing is unpickled.
+
+    To be called within ``reading``: what it raises has no file's name.
+
+    Raises:
+        ValueError: for what is no array of numbers or text, or claims more than it holds, or than ``SIPE_LOG_GIB``
+            and more than the file itself.
+    """
+    with zipfile.ZipFile(source) as archive:
+        members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+        total, there = sum(member.file_size for member in members), archive.fp.seek(0, os.SEEK_END) if archive.fp else 0
+        if total > max(limit(LOG_GIB) * 2**30, there):
+            raise ValueError(f"claims {total / 2**30:.3g} GiB of arrays, the most is {limit(LOG_GIB):g} ({LOG_GIB})")
+        return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[np.generic]:
+    import numpy as np
+
+    name = f"array {member.filename.removesuffix('.npy')!r}"
+    if member.flag_bits & 1:
+        raise ValueError(f"{name} is encrypted, save it without a password")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # what NumPy writes
+        raise ValueError(f"{name} is compressed in a way that npz has not, save it with numpy.savez_compressed")
+    headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    with archive.open(member) as file:
+        header = headers.get(np.lib.format.read_magic(file))
+        if header is None:
+            raise ValueError(f"{name} has field names beyond ASCII, save each field as an array of its own")
+        shape, by_columns, dtype = header(file)
+        if dtype.hasobject:
+            raise ValueError(f"{name} holds Python objects, which are not read, save it as numbers")
+        size = math.prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or size > member.file_size:
+            raise ValueError(f"{name} claims the shape {shape}, more than its {member.file_size} bytes")
+        data = bytearray(file.read(size))
+    if len(data) < size:
+        raise ValueError(f"{name} ends after {len(data)} of {size} bytes")
+    if not size:
+        return np.zeros(shape, dtype)
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
 
 
 class OutputError(ValueError):

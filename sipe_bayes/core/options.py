@@ -24,7 +24,7 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.core.validation import MOST, nearest_name
 
 T = TypeVar("T")
 
@@ -175,6 +175,8 @@ def _sequence(name: str, value: Any, kinds: tuple[Any, ...], limits: Limits) -> 
 
 
 def _number(name: str, value: Any, kind: type, limits: Limits) -> Any:
+    if isinstance(value, Integral) and abs(int(value)) > MOST:
+        raise ValueError(f"{name}: expected at most {MOST}, got more; lower it")
     whole = isinstance(value, Integral) or (isinstance(value, Real) and float(value).is_integer())
     if kind is int and (isinstance(value, bool) or not whole):
         least = max(limits.least or 1, 1)

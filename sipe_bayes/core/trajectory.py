@@ -7,7 +7,6 @@ masked, never invented.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, overload
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.core.files import replacing
+from sipe_bayes.core.files import read_arrays, reading, replacing
 from sipe_bayes.core.html import html_table
 
 
@@ -243,12 +242,35 @@ class Trajectories(Sequence[Trajectory]):
     def load(cls, path: str | Path) -> Trajectories:
         """Read what ``save`` wrote; runs no code from the file. Raises ValueError for another file."""
         needed = {f.name for f in fields(cls)} - {"states", "rewards"}
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {key: data[key] for key in data.files}
-        except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as error:
-            raise ValueError(f"{path}: expected an npz file of trajectories, got {error}") from None
-        if arrays.keys() - {"states", "rewards"} != needed:
-            raise ValueError(f"{path}: expected the arrays {sorted(needed)}, got {sorted(arrays)}")
-        names, channels = (tuple(str(s) for s in arrays.pop(key)) for key in ("names", "channels"))
-        return cls(**arrays, names=names, channels=channels)
+        if not Path(path).exists():
+            raise FileNotFoundError(f"{path}: no such file; expected trajectories")
+        with reading(path, "trajectories", "write them again with Trajectories.save"):
+            arrays: dict[str, Any] = read_arrays(Path(path))
+            if arrays.keys() - {"states", "rewards"} != needed:
+                raise ValueError(f"expected the arrays {sorted(needed)}, got {sorted(arrays)}")
+            names, channels = (tuple(str(s) for s in arrays.pop(key)) for key in ("names", "channels"))
+            batch = cls(**arrays, names=names, channels=channels)
+            batch.check()
+        return batch
+
+    def check(self) -> None:
+        """Raises ValueError for arrays whose shapes or types do not fit together, as those of a file may not."""
+        batch, samples, _ = self.observations.shape
+        expected = {
+            "actions": (batch, samples - 1, self.actions.shape[-1]),
+            "dt": (batch,),
+            "length": (batch,),
+            "valid": (batch, samples),
+            "states": None if self.states is None else (batch, samples, self.states.shape[-1]),
+            "rewards": None if self.rewards is None else (batch, samples - 1),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if shape is not None and (array.shape != shape or array.dtype.kind not in "fiub"):
+                raise ValueError(f"{name}: expected numbers of shape {shape}, got {array.dtype} of {array.shape}")
+        if not ((self.length >= 1) & (self.length < samples)).all() or self.length.dtype.kind != "i":
+            raise ValueError(f"length: expected whole numbers from 1 to {samples - 1}, got others")
+        if len(self.names) not in (0, batch) or len(self.channels) not in (0, self.observations.shape[2]):
+            raise ValueError("names, channels: expected one for each trajectory and channel, or none")
+        for _ in self:  # each of which checks itself
+            pass

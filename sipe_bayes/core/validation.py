@@ -9,8 +9,18 @@ from collections.abc import Iterable
 from numbers import Integral, Real
 from pathlib import Path
 
+MOST_ROLLOUTS = 10**9
+"""Of a budget: what takes weeks on any machine."""
+MOST = 2**63 - 1
+"""Of a whole number: what fits into one of 64 bits."""
 
-def whole(name: str, value: object, least: int = 1, unit: str = "") -> int:
+
+def most_threads() -> int:
+    """Native threads, or processes: beyond four times the processors they only wait for one another."""
+    return 4 * cores()
+
+
+def whole(name: str, value: object, least: int = 1, unit: str = "", most: int = MOST) -> int:
     """``value`` as a whole number; 1e3 is one, True and "3" are not.
 
     Args:
@@ -18,15 +28,21 @@ def whole(name: str, value: object, least: int = 1, unit: str = "") -> int:
         value: what was given.
         least: that it may be.
         unit: of it, for the message.
+        most: that it may be.
 
     Raises:
         ValueError: for anything else, as all checks here do.
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not float(value).is_integer():
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{name}: expected a whole number, got {_shown(value)}; give one, such as {max(least, 1)}")
-    if value < least:
+    number = int(value) if isinstance(value, Integral) else float(value)
+    if isinstance(number, float) and not number.is_integer():
+        raise ValueError(f"{name}: expected a whole number, got {_shown(value)}; give one, such as {max(least, 1)}")
+    if number < least:
         raise ValueError(f"{name}: expected at least {least}{unit and ' '}{unit}, got {value}")
-    return int(float(value)) if not isinstance(value, Integral) else int(value)
+    if number > most:
+        raise ValueError(f"{name}: expected at most {most}{unit and ' '}{unit}, got {number:.4g}")
+    return int(number)
 
 
 def at_least(name: str, value: object, least: float) -> float:

@@ -25,10 +25,8 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import os
 import platform
-import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -41,7 +39,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import to_json, write_bytes, write_text
+from sipe_bayes.core.files import read_arrays, read_json, reading, to_json, write_bytes, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
 from sipe_bayes.envs.task import VARIANTS, Variant
@@ -160,15 +158,12 @@ def manifest(folder: Path) -> dict[str, Entry]:
     path = folder / MANIFEST
     if not path.is_file():
         return {}
-    try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
-        sets = TypeAdapter(dict[str, Entry]).validate_python(plain["sets"])
-        good = plain["format"] == FORMAT
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        good = False
-    if not good:
-        raise TrajectorySetError(f"{path}: cannot be read as a manifest of {FORMAT}; {_REMEDY}")
-    return sets
+    what = f"a manifest of {FORMAT}"
+    plain = read_json(path, what, _REMEDY, TrajectorySetError)
+    with reading(path, what, _REMEDY, TrajectorySetError):
+        if plain["format"] != FORMAT:
+            raise ValueError(f"its format is {plain['format']!r}")
+        return TypeAdapter(dict[str, Entry]).validate_python(plain["sets"])
 
 
 def entry_of(folder: Path, name: SetName, simulator: Simulator) -> Entry | None:
@@ -328,12 +323,8 @@ def _arrays(folder: Path, file: str) -> dict[str, NDArray[Any]]:
         )
     if hashlib.sha256(content).hexdigest() != entry.sha256:
         raise TrajectorySetError(f"{path}: its SHA-256 is not the manifest's: corrupted or altered; {_REMEDY}")
-    stream = io.BytesIO(content)
-    try:
-        with np.load(stream, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-        raise TrajectorySetError(f"{path}: expected an npz file, got {error}; {_REMEDY}") from None
+    with reading(path, "an npz file", _REMEDY, TrajectorySetError):
+        arrays = read_arrays(io.BytesIO(content))
     missing = {"start", "states", "actions", "rewards", "dt"} - arrays.keys()
     if missing:
         raise TrajectorySetError(f"{path}: holds no {', '.join(sorted(missing))}; {_REMEDY}")

@@ -22,7 +22,7 @@ from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
 from sipe_bayes.core.findings import Code, Findings, Severity, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.core.validation import flag, path, whole
+from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.inference.arguments import check_simulator, stated_prior
 from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest
@@ -146,7 +146,7 @@ class Estimator(ABC, Generic[S]):
         check_simulator(simulator)
         self.simulator, self.space = simulator, simulator.space
         self.prior = stated_prior(prior, self.space)
-        self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollout")
+        self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
         self._own_budget = budget is None
         if not isinstance(likelihood, Segments | StateSpace | None):
             raise ValueError(

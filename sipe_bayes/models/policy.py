@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.numpy import save
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray
-from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.files import reading, write_bytes
 
 Controller = Callable[[FloatArray], FloatArray]
 """Actions (B, A) of observations (B, O)."""
@@ -126,12 +126,10 @@ def load_policy(path: str | os.PathLike[str], task: str | None = None) -> Policy
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such policy; train one with `sipe train`")
     header, arrays = _read(file)
-    try:
+    with reading(file, "a policy's header", "save the policy again", PolicyError):
         sizes, normalised = [int(n) for n in header["sizes"]], bool(header["normalised"])
         settings = {key: float(header[key]) for key in ("action_low", "action_high", "clip")}
         name, goal_size, checksum = str(header["task"]), int(header["goal_size"]), str(header["sha256"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise PolicyError(f"{file}: its header lacks or garbles {error}; save the policy again") from None
     _check_shapes(file, arrays, sizes, normalised)
     if _checksum(arrays) != checksum:
         raise PolicyError(f"{file}: does not match its checksum; it was altered, get it again")
@@ -143,16 +141,11 @@ def load_policy(path: str | os.PathLike[str], task: str | None = None) -> Policy
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, Float32Array]]:
-    try:
+    with reading(file, "a whole safetensors file", "get it again", PolicyError):
         with safe_open(file, framework="numpy") as content:
             metadata = content.metadata() or {}
             arrays = {key: content.get_tensor(key) for key in content.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
-        raise PolicyError(f"{file}: not a whole safetensors file ({error}); get it again") from None
-    try:
-        header = json.loads(metadata.get("policy", ""))
-    except ValueError:
-        header = None
+        header = json.loads(metadata.get("policy", "null"))
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise PolicyError(f"{file}: expected a policy of format {FORMAT!r}; save it again with policy.save(path)")
     return header, arrays

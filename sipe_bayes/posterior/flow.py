@@ -102,6 +102,11 @@ class Flow(Posterior):
             )
         self.architecture = {"transforms": int(transforms), "hidden": int(hidden), "bins": int(bins)}
         self.weights = {key: value.detach().clone() for key, value in weights.items()}
+        # each transform has weights of its own between the hidden layers, and from the last to the splines
+        least = int(transforms) * int(hidden) * (int(hidden) + int(bins))
+        numbers = sum(value.numel() for value in self.weights.values())
+        if min(int(transforms), int(hidden), int(bins)) < 1 or least > numbers:
+            raise ValueError(f"weights: expected those of the flow {self.architecture}, got {numbers} numbers")
         with torch.random.fork_rng(devices=[]):
             net = spline_flow(n, len(self.context), **self.architecture)
         try:

@@ -39,6 +39,7 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Numbers, Posterior, as_float64
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal, log_interval
 
+_ABOVE_ONE = 0.1  # of the log of a mass: what draws may estimate it too high by
 _MARGINAL_ERROR = 1e-9  # mass that a closed form may leave out
 
 
@@ -211,7 +212,9 @@ class GaussianMixture(Posterior):
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
         new = cls(tensors["log_weights"], tensors["means"], tensors["covariances"], space)
-        masses = (as_float64(key, tensors[key], (len(new.means),)) for key in ("log_masses", "log_mass_errors"))
+        masses = [as_float64(key, tensors[key], (len(new.means),)) for key in ("log_masses", "log_mass_errors")]
+        if not (masses[0] <= _ABOVE_ONE).all():
+            raise ValueError(f"log_masses: expected shares of at most 1, got {masses[0].max().exp():.4g}")
         new._known_masses = list(zip(*(mass.tolist() for mass in masses), strict=True))
         return new
 

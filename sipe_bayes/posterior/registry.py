@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from sipe_bayes.core.files import reading
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Posterior
 from sipe_bayes.posterior.dirac import Dirac
@@ -17,7 +18,7 @@ from sipe_bayes.posterior.flow import Flow
 from sipe_bayes.posterior.independent import IndependentPrior
 from sipe_bayes.posterior.mixture import GaussianMixture
 from sipe_bayes.posterior.particles import Particles
-from sipe_bayes.posterior.storage import read_pair
+from sipe_bayes.posterior.storage import SAVE_AGAIN, read_pair
 from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
 FAMILIES: dict[str, type[Posterior]] = {
@@ -32,13 +33,9 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
     Raises FileNotFoundError when one of the two files is missing and ValueError when they cannot be read.
     """
     header, tensors = read_pair(path)
-    try:
+    with reading(path, "a posterior", SAVE_AGAIN):
         space = ParameterSpace.from_dict(header["space"])
         return _restored(header["family"], space, tensors, header["settings"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(
-            f"{path}: not a posterior this version reads ({error}); save it again with posterior.save(path)"
-        ) from error
 
 
 def _restored(family: str, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Posterior:

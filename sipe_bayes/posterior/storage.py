@@ -16,14 +16,13 @@ from typing import Any, TypedDict, cast
 import numpy as np
 import safetensors.torch
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
 from torch import Tensor
 
-from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.files import FileError, read_json, reading, write_bytes
 from sipe_bayes.core.parameters import Plain
 
 FORMAT = "sipe_bayes.posterior/1"
-_SAVE_AGAIN = "save it again with posterior.save(path)"
+SAVE_AGAIN = "save it again with posterior.save(path)"
 
 
 class Header(TypedDict):
@@ -74,19 +73,14 @@ def read_pair(path: str | os.PathLike[str]) -> tuple[Header, dict[str, Tensor]]:
             raise FileNotFoundError(
                 f"{file}: no such file; a saved posterior is {tensor_path.name} beside {header_path.name}"
             )
-    content = tensor_path.read_bytes()
-    try:
-        header = json.loads(header_path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{header_path}: not JSON ({error}); {_SAVE_AGAIN}") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{header_path}: expected a posterior header of format {FORMAT!r}; {_SAVE_AGAIN}")
-    if header.get("sha256") != hashlib.sha256(content).hexdigest():
-        raise ValueError(f"{tensor_path}: does not match the checksum in {header_path.name}; {_SAVE_AGAIN}")
-    try:
+    header = read_json(header_path, "a posterior's header", SAVE_AGAIN)
+    if header.get("format") != FORMAT:
+        raise FileError(f"{header_path}: expected a posterior header of format {FORMAT!r}; {SAVE_AGAIN}")
+    with reading(tensor_path, "safetensors", SAVE_AGAIN):
+        content = tensor_path.read_bytes()
+        if header.get("sha256") != hashlib.sha256(content).hexdigest():
+            raise FileError(f"{tensor_path}: does not match the checksum in {header_path.name}; {SAVE_AGAIN}")
         return cast(Header, header), safetensors.torch.load(content)
-    except SafetensorError as error:
-        raise ValueError(f"{tensor_path}: not a safetensors file ({error}); {_SAVE_AGAIN}") from error
 
 
 def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tensor) -> dict[str, NDArray[np.generic]]:

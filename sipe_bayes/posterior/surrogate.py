@@ -32,7 +32,7 @@ from torch import Generator, Tensor
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.models.gaussian_process import GaussianProcess
-from sipe_bayes.posterior.base import Numbers, Posterior, as_theta
+from sipe_bayes.posterior.base import Numbers, Posterior, as_float64, as_theta
 from sipe_bayes.posterior.ensemble import (
     EnsembleOptions,
     draws_on_line,
@@ -152,7 +152,12 @@ class SurrogatePosterior(Posterior):
     @classmethod
     def _restore(cls, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Self:
         numbers = {name: float(settings[name]) for name in _OF_PROCESS}
-        process = GaussianProcess(tensors["x"], tensors["y"], tensors["lengthscale"], **numbers)
+        x = as_theta("x", tensors["x"], (None, len(space)))
+        y = as_float64("y", tensors["y"], (len(x),))
+        lengthscale = as_float64("lengthscale", tensors["lengthscale"], (len(space),))
+        if not len(x) or not (lengthscale > 0).all() or min(numbers["noise"], numbers["scale"]) <= 0:
+            raise ValueError("process: expected points, and positive lengthscale, noise and scale")
+        process = GaussianProcess(x, y, lengthscale, **numbers)
         own = {name: settings[name] for name in (*_OWN, "prior")}
         return cls(process, draws=tensors["draws"], **own)
 

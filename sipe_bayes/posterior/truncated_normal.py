@@ -207,6 +207,7 @@ class TruncatedNormal:
     most_points: ClassVar[int] = 2**13
     rejection_mass: ClassVar[float] = 0.05  # above it plain draws are thrown away until enough are inside
     least_acceptance: ClassVar[float] = 1e-6  # of tilted draws, below which drawing would take forever
+    most_tries: ClassVar[float] = 1e3  # times what a draw should take, before its mass is called wrong
 
     def __init__(self, mean: FloatArray, covariance: FloatArray, log_mass: tuple[float, float] | None = None) -> None:
         self.mean, self.covariance = mean, covariance
@@ -316,10 +317,13 @@ class TruncatedNormal:
 
     def _accepted(self, n: int, rate: float, draw: Draw, generator: Generator | None) -> FloatArray:
         accepted: list[FloatArray] = [np.empty((0, len(self.mean)))]
-        missing = n
+        missing, left = n, self.most_tries * (n / rate + self.most_tries)
         while missing > 0:
-            accepted.append(draw(min(int(1.1 * missing / rate) + 16, 2**16), generator)[:missing])
-            missing -= len(accepted[-1])
+            batch = min(int(1.1 * missing / rate) + 16, 2**16)
+            if left < 0:
+                raise ValueError("sample: far fewer draws lie in the cube than the stored mass says; save it again")
+            accepted.append(draw(batch, generator)[:missing])
+            missing, left = missing - len(accepted[-1]), left - batch
         return np.concatenate(accepted)
 
     def _plain_draws(self, n: int, generator: Generator | None) -> FloatArray:

@@ -7,7 +7,6 @@ how it was made and goes onto the card of an agent that learnt from it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray
-from sipe_bayes.core.files import to_json, write_text
+from sipe_bayes.core.files import read_json, to_json, write_text
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import whole
 from sipe_bayes.envs.registry import make_task
@@ -119,15 +118,9 @@ def facts_of(path: Path) -> dict[str, object]:
         ValueError: for a file beside it that cannot be read.
     """
     beside = path.with_suffix(".json")
-    try:
-        plain = json.loads(beside.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not beside.exists():
         return {"file": path.name}
-    except ValueError as error:
-        raise ValueError(
-            f"--demonstrations {beside}: cannot be read ({error}); make them again, or delete it"
-        ) from None
-    return {"file": path.name, **plain}
+    return {"file": path.name, **read_json(beside, "facts of demonstrations", "make them again, or delete it")}
 
 
 def demonstrate(

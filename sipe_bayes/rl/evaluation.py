@@ -7,7 +7,6 @@ acts at random.
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +17,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import replacing, to_json, write_text
+from sipe_bayes.core.files import read_json, reading, replacing, to_json, write_text
 from sipe_bayes.core.validation import whole
 from sipe_bayes.datasets import acting
 from sipe_bayes.datasets.demonstrations import AGENT_FILES
@@ -195,12 +194,10 @@ def write_card(
 
 def read_card(path: Path) -> Evaluation:
     """The evaluation on the card beside an agent's file; raises ValueError for one that is missing or damaged."""
-    try:
-        card = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-        return TypeAdapter(Evaluation).validate_python(card["evaluation"])
-    except (OSError, ValueError, KeyError) as error:
-        why = " ".join(str(error).split())
-        raise ValueError(f"{path}: its card {path.stem}.json cannot be read ({why}); make it again") from None
+    card, what, remedy = path.with_suffix(".json"), f"the card of {path.name}", "make it again"
+    plain = read_json(card, what, remedy)
+    with reading(card, what, remedy):
+        return TypeAdapter(Evaluation).validate_python(plain["evaluation"])
 
 
 def install(folder: Path, into: Path = AGENT_FILES) -> list[Path]:

@@ -30,6 +30,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.files import read_json, reading
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.core.validation import whole
@@ -132,13 +133,12 @@ def load_randomization(path: str | os.PathLike[str]) -> Randomization:
         ValueError: for a file that says something else.
     """
     file = Path(path)
-    try:
-        plain = json.loads(file.read_text(encoding="utf-8"))
+    what, remedy = "a domain randomisation", "export it with `sipe calibrate`"
+    plain: dict[str, Any] = read_json(file, what, remedy)
+    with reading(file, what, remedy):
         more = {name: plain[name] for name in ("observation_noise", "action_delay") if name in plain}
         posterior = load_posterior(file.parent / str(plain["posterior"])) if "posterior" in plain else _normal(plain)
         return Randomization(posterior, **more)
-    except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{file}: not a domain randomisation ({error!r}); export it with `sipe calibrate`") from None
 
 
 def _normal(plain: dict[str, Any]) -> GaussianMixture:

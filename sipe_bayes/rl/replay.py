@@ -17,16 +17,15 @@ for the policy having changed since.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
-from sipe_bayes.core.files import replacing
+from sipe_bayes.core.files import read_arrays, reading, replacing
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.simulation.episodes import Step
 
@@ -209,21 +208,19 @@ class Replay:
 
     def load(self, path: Path) -> None:
         """Read what ``save`` wrote into a buffer of the same shape; raises ReplayError for anything else."""
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files}
+        with reading(path, "a whole replay buffer", "start training again", ReplayError):
+            arrays: dict[str, Any] = read_arrays(path)
             head, rows = int(arrays["head"]), int(arrays["rows"])
             stored = {name: arrays[name] for name in _STORED}
             starts, over = arrays["starts"], arrays["over"]
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            raise ReplayError(f"{path}: not a whole replay buffer ({error}); start training again") from None
-        used = min(head + 1, self.rows)
-        for name, value in stored.items():
-            expected = (used, *getattr(self, name).shape[1:])
-            if rows != self.rows or value.shape != expected:
-                raise ReplayError(
-                    f"{path}: {name}: expected {expected} of {self.rows} rows, got {value.shape} of {rows}"
-                )
+            used = min(head + 1, self.rows)
+            shapes = {name: (used, *getattr(self, name).shape[1:]) for name in _STORED}
+            shapes |= {"starts": self._starts.shape, "over": self._over.shape}
+            for name, expected in shapes.items():
+                if rows != self.rows or arrays[name].shape != expected or arrays[name].dtype.kind not in "fiub":
+                    raise ValueError(
+                        f"{name}: expected {expected} of {self.rows} rows, got {arrays[name].shape} of {rows}"
+                    )
         for name, value in stored.items():
             getattr(self, name)[:used] = value
         self.head, self._starts, self._over = head, starts.copy(), over.copy()

@@ -30,7 +30,7 @@ from pydantic import TypeAdapter
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import load_state, save_state
-from sipe_bayes.core.files import replacing, to_json, write_text
+from sipe_bayes.core.files import read_json, read_text, reading, replacing, to_json, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.envs.registry import make_task
@@ -263,9 +263,11 @@ class _Log:
                 path.unlink()
 
     def load(self, trainer: Trainer, fingerprint: str) -> None:
-        state = load_state(self._folder / CHECKPOINT, RunState, fingerprint)
+        path = self._folder / CHECKPOINT
+        state = load_state(path, RunState, fingerprint)
         trainer.replay.load(self._kept / Path(state.replay).name)
-        trainer.restore(state.trainer)
+        with reading(path, "a checkpoint of this training", "delete it to start again"):
+            trainer.restore(state.trainer)
         self._curve, self._spent = list(state.curve), state.seconds
         self._write_curve()
 
@@ -313,14 +315,19 @@ def choose(curve: Sequence[CurvePoint], steps: int) -> dict[str, int]:
 
 def read_curve(folder: Path) -> list[CurvePoint]:
     """The learning curve of a finished run."""
-    with (folder / "curve.csv").open(encoding="utf-8", newline="") as file:
-        rows = [{key: value or None for key, value in row.items()} for row in csv.DictReader(file)]
-    return TypeAdapter(list[CurvePoint]).validate_python(rows)
+    path, what, remedy = folder / "curve.csv", "a learning curve", "train again"
+    text = read_text(path, what, remedy)
+    with reading(path, what, remedy):
+        rows = [{key: value or None for key, value in row.items()} for row in csv.DictReader(text.splitlines())]
+        return TypeAdapter(list[CurvePoint]).validate_python(rows)
 
 
 def read_counts(folder: Path) -> Counts:
     """What a finished run came to; raises OSError or ValueError where it is not finished."""
-    return TypeAdapter(Counts).validate_json((folder / COUNTS).read_bytes())
+    path, what, remedy = folder / COUNTS, "what a training came to", "train again"
+    plain = read_json(path, what, remedy)
+    with reading(path, what, remedy):
+        return TypeAdapter(Counts).validate_python(plain)
 
 
 def checksum(given: Trajectories | None) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
-from sipe_bayes.core.validation import cores, whole
+from sipe_bayes.core.validation import cores, most_threads, whole
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.engine import Engine
@@ -29,7 +29,7 @@ class Simulated:
             hint = f"sipe.make_task({environment!r})" if isinstance(environment, str) else "one of sipe.make_task(name)"
             raise ValueError(f"environment: expected an Environment, got {environment!r}; give {hint}")
         self.environment = environment
-        self.num_threads = cores() if num_threads is None else whole("num_threads", num_threads)
+        self.num_threads = cores() if num_threads is None else whole("num_threads", num_threads, most=most_threads())
         self.model = environment.compile()
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show

@@ -12,7 +12,7 @@ import numpy as np
 
 from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.core.validation import cores, nearest_name, whole
+from sipe_bayes.core.validation import MOST_ROLLOUTS, cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.likelihood.settings import Segments
@@ -179,7 +179,9 @@ def _search(
         simulator.num_threads or cores(),
     )
     extensions = [get_extension(name) for name in restriction.names]
-    return StructureSearch(fitting, extensions, restriction.sites, options, whole("budget", budget, 1, "rollout"))
+    return StructureSearch(
+        fitting, extensions, restriction.sites, options, whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
+    )
 
 
 def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:

@@ -56,7 +56,7 @@ def test_cards_are_checked(tmp_path: Path) -> None:
     (row,) = check_agents(tmp_path, episodes=20)
     assert not row.agrees
     path.with_suffix(".json").unlink()
-    with pytest.raises(ValueError, match=r"card Pendulum-expert\.json cannot be read"):
+    with pytest.raises(FileNotFoundError, match=r"Pendulum-expert\.json: no such file; expected the card of Pend"):
         list(check_agents(tmp_path))
     with pytest.raises(FileNotFoundError, match="no agents"):
         list(check_agents(tmp_path / "nowhere"))

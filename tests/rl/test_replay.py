@@ -191,7 +191,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ReplayError, match="rows"):
         Replay(4, 1, 500).load(path)
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ReplayError, match=r"replay\.npz: not a whole replay buffer"):
+    with pytest.raises(ReplayError, match=r"replay\.npz: cannot be read as a whole replay buffer"):
         Replay(4, 1, 1000).load(path)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sipe_bayes.calibration.config import Config
-from sipe_bayes.calibration.config_tables import Use
+from sipe_bayes.calibration.config_fields import Use
 from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.tables import Clock
 

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.core.files import LOG_GIB, limit
+
 if TYPE_CHECKING:
     import pandas
 
 Columns = dict[str, NDArray[np.generic]]
-
-LARGEST = 2**30
-"""Bytes of a log's columns together: a header that claims more is not believed, and nothing is allocated for it."""
 
 WIDEST = 512
 """Columns of one array: a wider one is a picture or a map, which is no column of a log."""
@@ -69,11 +68,16 @@ class Format:
     remedy: str = "write it anew"
 
 
+def largest() -> int:
+    """Bytes of a log's columns together: a header that claims more is not believed, and nothing is allocated for it."""
+    return int(limit(LOG_GIB) * 2**30)
+
+
 def check_size(path: Path, size: int) -> None:
-    """Refuse a file whose columns would be larger than ``LARGEST``; size in bytes, as it claims them."""
-    if size > LARGEST:
-        claims = f"claims {size / 2**30:.3g} GiB of columns, the most is {LARGEST / 2**30:g}"
-        raise LogError(f"{path}: {claims}; cut it into shorter logs, or leave out what is not needed")
+    """Refuse a file whose columns would be larger than ``largest``; size in bytes, as it claims them."""
+    if size > largest():
+        claims = f"claims {size / 2**30:.3g} GiB of columns, the most is {limit(LOG_GIB):g}"
+        raise LogError(f"{path}: {claims}; cut it into shorter logs, leave out what is not needed, or set {LOG_GIB}")
 
 
 def spread(name: str, values: NDArray[np.generic], labels: Sequence[str] = ()) -> Columns:

@@ -6,22 +6,19 @@ https://huggingface.co/docs/lerobot/lerobot-dataset-v3
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from sipe_bayes.calibration.readers.base import Columns, LogError, check_size
+from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.parquet_table import parquet_columns
+from sipe_bayes.core.files import read_json
 
 INFO = "meta/info.json"
 
 
 def read_lerobot(path: Path, wanted: Collection[str]) -> Columns:
     """The columns; those of a vector are called as its entries are: ``observation.state[shoulder]``."""
-    check_size(path, (path / INFO).stat().st_size)
-    info = json.loads((path / INFO).read_text(encoding="utf-8"))
-    if not isinstance(info, dict):
-        raise LogError(f"{path}: {INFO} holds no table; write the dataset anew")
+    info = read_json(path / INFO, "the description of a dataset", "write the dataset anew", LogError)
     version = str(info.get("codebase_version"))
     if not version.startswith(("v2", "v3")):
         raise LogError(f"{path}: expected a dataset of version v2 or v3, got {version!r}; convert it with lerobot")

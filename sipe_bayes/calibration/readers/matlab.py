@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.calibration.readers.base import LARGEST, Columns, LogError, check_size, spread
+from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, largest, spread
 
 _HEADER = 128  # bytes before the first element
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
@@ -82,8 +82,8 @@ def _variables(path: Path) -> Iterator[tuple[str, int]]:
             raise LogError(f"{path}: ends within a variable; save it anew")
         if kind == _COMPRESSED:
             stream = zlib.decompressobj()
-            body = stream.decompress(body, LARGEST)
-            total += LARGEST + 1 if stream.unconsumed_tail else len(body)
+            body = stream.decompress(body, largest())
+            total += largest() + 1 if stream.unconsumed_tail else len(body)
             check_size(path, total)
             kind, body = struct.unpack_from(f"{order}I", body)[0], body[8:]
         if kind == _MATRIX:
@@ -133,7 +133,7 @@ def _version_7_3(path: Path) -> Columns:
     import h5py
 
     columns: Columns = {}
-    room = LARGEST
+    room = largest()
 
     def put(name: str, item: object, depth: int) -> None:
         nonlocal room
@@ -147,7 +147,7 @@ def _version_7_3(path: Path) -> Columns:
         if not isinstance(item, h5py.Dataset) or item.shape is None or item.is_virtual or item.external:
             return
         room -= item.nbytes + _VISIT
-        check_size(path, LARGEST - room)
+        check_size(path, largest() - room)
         if h5py.check_ref_dtype(item.dtype) is h5py.Reference:
             for i, reference in enumerate(np.ravel(item[()], order="F")):
                 group, _, field = name.rpartition(".")

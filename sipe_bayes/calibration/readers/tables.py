@@ -17,6 +17,7 @@ from sipe_bayes.calibration.readers.numbered import gathered, starred
 from sipe_bayes.calibration.readers.parquet_table import read_parquet
 from sipe_bayes.calibration.readers.ros_bag import read_bag
 from sipe_bayes.calibration.readers.ulog import read_ulog
+from sipe_bayes.core.files import reading
 
 _HDF5 = Format(read_hdf5, "the path of the dataset: `robot/arm/state[0]`")
 _BAG = Format(
@@ -63,16 +64,12 @@ def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
     path = Path(path)
     kind = _kind(path)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), reading(path, kind, READERS[kind].remedy, LogError):
             warnings.simplefilter("ignore")
             columns = READERS[kind].read(path, wanted)
-    except LogError:
-        raise
     except ModuleNotFoundError as error:
         needs = f"needs the package {error.name}, which is not installed"
         raise LogError(f"{path}: {needs}: pip install 'sipe-bayes[{READERS[kind].extra}]'") from None
-    except Exception as error:  # whatever a library makes of a file that is not what it says
-        raise LogError(f"{path}: cannot be read as {kind} ({_reason(error)}); {READERS[kind].remedy}") from error
     if not columns or not max(len(values) for values in columns.values()):
         raise LogError(f"{path}: holds no samples; record the log again or drop it")
     for prefix in starred(wanted):
@@ -99,12 +96,3 @@ def _kind(path: Path) -> str:
 def _one_of(words: Iterable[str]) -> str:
     *others, last = words
     return f"{', '.join(others)} or {last}" if others else last
-
-
-def _reason(error: Exception) -> str:
-    """One line of an exception, which may have no words of its own."""
-    text = " ".join(str(error).split())
-    short = text if len(text) <= 200 else f"{text[:197]}..."
-    if isinstance(error, MemoryError):
-        return "more than the memory holds"
-    return short if short and isinstance(error, OSError | ValueError | EOFError) else f"{type(error).__name__} {short}"

@@ -9,17 +9,17 @@ that diverged stay: they are counted, marked and described.
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.core.files import replacing
+from sipe_bayes.core.files import FileError, read_arrays, reading, replacing
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -144,10 +144,12 @@ class Cache:
         """A block from disk; None where there is none or it cannot be read: it is then simulated again."""
         if self.folder is None:
             return None
+        path = self.folder / f"block-{block:06d}.npz"
         try:
-            with np.load(self.folder / f"block-{block:06d}.npz", allow_pickle=False) as data:
-                return Simulations(data["theta"], data["observations"], data["valid"])
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            with reading(path, "simulations", "simulate again"):
+                arrays: dict[str, Any] = read_arrays(path)
+                return Simulations(arrays["theta"], arrays["observations"], arrays["valid"])
+        except FileError:
             return None
 
 

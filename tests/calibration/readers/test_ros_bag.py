@@ -126,7 +126,7 @@ def test_a_chunk_that_unpacks_to_more_than_a_log_is_refused(
         bag.write(effort, START, command(np.ones(1)))
     path = tmp_path / "bag" / "bag.mcap" if single else tmp_path / "bag"
     assert read_table(path, ["/effort.data[0]"])["/effort.data[0]"].tolist() == [1.0]
-    monkeypatch.setattr("sipe_bayes.calibration.readers.base.LARGEST", 10**6)
+    monkeypatch.setenv("SIPE_LOG_GIB", str(10**6 / 2**30))
     with pytest.raises(LogError, match=r"claims 0.00373 GiB of columns, the most is 0.00093"):
         read_table(path, ["/effort.data[0]"])
 

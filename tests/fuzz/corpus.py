@@ -1,0 +1,36 @@
+"""Files that once broke a reader, by the reader's folder in ``tests/corpus``."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+FOLDER = Path(__file__).parents[1] / "corpus"
+CORPUS = sorted(path for path in FOLDER.glob("*/*") if not path.name.endswith(".safetensors"))
+
+
+def read(file: Path, folder: Path) -> object:
+    """Read a file of the corpus, from a copy in a folder."""
+    from sipe_bayes.benchmark.records import PLAN, Record, planned
+    from sipe_bayes.benchmark.run_log import RUNS, read_runs
+    from sipe_bayes.calibration.config import load_config
+    from sipe_bayes.calibration.readers.tables import read_table
+    from sipe_bayes.core.trajectory import Trajectories
+    from sipe_bayes.envs.mjcf import MjcfEnvironment
+    from sipe_bayes.posterior import load_posterior
+    from sipe_bayes.rl.randomization import load_randomization
+
+    readers = {
+        "configurations": load_config,
+        "logs": read_table,
+        "models": lambda path: MjcfEnvironment.build(path, [], [], []),
+        "posteriors": load_posterior,
+        "randomizations": load_randomization,
+        "records": Record.read,
+        "trajectories": Trajectories.load,
+    }
+    for one in file.parent.glob(f"{file.stem}.*"):
+        shutil.copy(one, folder)
+    if file.name in (PLAN, RUNS):
+        return planned(folder) if file.name == PLAN else read_runs(folder)
+    return readers[file.parent.name](folder / file.name)
