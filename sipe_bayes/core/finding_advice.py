@@ -29,6 +29,12 @@ ADVICE: dict[Code, str] = {
         "Particles of a search gather where the search went; they may do as a point. For an interval take a method "
         "with a likelihood, or recalibrate."
     ),
+    Code.ON_PROCESSOR: "Nothing is wrong. Leave `device` out for this method, or take `npe` or `cem` on a GPU.",
+    Code.FLOAT32_AGREES: "Nothing: float32 is as good as float64 for these logs and this model.",
+    Code.FLOAT32_DIFFERS: (
+        "Where contacts make a motion chaotic, rounding grows like any small difference. Compare shorter pieces "
+        "(`window`), or leave `device` out."
+    ),
     Code.PRIOR_HARDLY_USED: (
         "An informative prior does not change this method's answer: take `laplace`, `mcmc`, `npe` or `bayesopt` if "
         "it should."

@@ -72,6 +72,21 @@ class Code(Enum):
         "sipe.Recalibrated"
     )
 
+    # another device than the processor
+    ON_PROCESSOR = note(
+        "{method} takes finite differences, which float32 is too coarse for: it simulated on the processor in float64, "
+        "not on {device}"
+    )
+    FLOAT32_AGREES = note(
+        "{count} of {rollouts} rollouts were simulated again in float64: they differ by at most {percent:.2g} % of "
+        "what a channel varies by"
+    )
+    FLOAT32_DIFFERS = caution(
+        "{count} of the {audited} rollouts that were simulated again in float64 differ by more than {tolerance:g} % of "
+        "what a channel varies by, the first {steps} control steps ({seconds:.3g} s) after its start: shorter windows, "
+        "or the processor"
+    )
+
     # searches and Bayesian optimisation
     PRIOR_HARDLY_USED = caution("{method} searches within the bounds and {use}; bayesopt and npe count it")
     DIVERGED_COUNT_AS_WORST = caution(

@@ -128,6 +128,11 @@ class Thresholds(Options):
     )
     rough_density: float = option(0.2, "a larger standard error of log Z moves a density by a fifth", "nats")
 
+    # a GPU's simulations
+    float32_difference: float = option(
+        0.01, "where float32 and float64 differ by more, rounding shows beside what parameters do", "of a spread"
+    )
+
     # recalibration
     refits_lost: float = option(0.1, "more refits that fail leave out a part of the prior", "of the refits")
     refits_odd: float = option(0.01, "false alarms of estimates that scatter normally about a line", "p-value")

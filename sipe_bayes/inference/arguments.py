@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
@@ -15,6 +16,29 @@ def check_simulator(given: object) -> None:
         raise ValueError(
             f"simulator: expected a Simulator or a CallableSimulator, got {given!r}; sipe.get_estimator takes "
             "the name of an environment as well"
+        )
+
+
+def check_comparison(simulator: object, likelihood: object, progress: object, name: str, searches: bool) -> None:
+    """Raise ValueError for a likelihood that the method called ``name`` does not take, or no function of progress."""
+    if searches and isinstance(simulator, CallableSimulator) and simulator.noise_sd is None:
+        raise ValueError(
+            f"likelihood: {name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
+        )
+    if not isinstance(likelihood, Segments | StateSpace | None):
+        raise ValueError(f"likelihood: expected sipe.Segments(...), got {likelihood!r}; or give sipe.StateSpace(...)")
+    if isinstance(likelihood, StateSpace) and not searches:
+        raise ValueError(f"likelihood: StateSpace is for laplace and mcmc; give {name} sipe.Segments(...)")
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress: expected a function (what, rollouts, budget), got {progress!r}")
+
+
+def check_named(simulator: Simulator | CallableSimulator, name: str, given: object) -> None:
+    """Raise ValueError where the argument ``name`` gives a path for a function without a name of its own."""
+    if given is not None and isinstance(simulator, CallableSimulator) and not simulator.name:
+        raise ValueError(
+            f"name: {name}= needs one to tell functions apart, and {simulator.fn!r} has none of its own; make "
+            'CallableSimulator(fn, space, name="...")'
         )
 
 

@@ -10,21 +10,25 @@ import copy
 import hashlib
 import inspect
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
 from sipe_bayes.core.findings import Code, Findings, Severity, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
-from sipe_bayes.inference.arguments import check_simulator, stated_prior
+from sipe_bayes.inference.arguments import check_comparison, check_named, check_simulator, stated_prior
+from sipe_bayes.inference.device_findings import device_findings, differentiable
 from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest
 from sipe_bayes.likelihood.binding import bind, default_likelihood
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
@@ -113,7 +117,8 @@ class Estimator(ABC, Generic[S]):
 
     - ``uses_prior = False``: the prior plays no part, or only at the beginning.
     - ``uncertain = False``: the spread is that of a search, not an uncertainty.
-    - ``searches = True``: it looks for optima of a likelihood: takes ``StateSpace``, ``restarts`` and ``candidates``.
+    - ``searches = True``: it looks for optima of a likelihood: takes ``StateSpace``, ``restarts`` and ``candidates``,
+      and simulates in float64 on the processor.
     - ``amortised = True``: what one fit learned serves another; ``goes_on = True``: a larger budget goes on where a
       smaller one ended; ``default_budget``: rollouts.
     """
@@ -144,18 +149,12 @@ class Estimator(ABC, Generic[S]):
     ) -> None:
         self.options = self.options_type.of(options, self.name)
         check_simulator(simulator)
-        self.simulator, self.space = simulator, simulator.space
+        self.simulator, self.space = differentiable(simulator) if self.searches else simulator, simulator.space
+        self._given_simulator = simulator
         self.prior = stated_prior(prior, self.space)
         self.budget = self.default_budget if budget is None else whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
         self._own_budget = budget is None
-        if not isinstance(likelihood, Segments | StateSpace | None):
-            raise ValueError(
-                f"likelihood: expected sipe.Segments(...), got {likelihood!r}; or give sipe.StateSpace(...)"
-            )
-        if isinstance(likelihood, StateSpace) and not self.searches:
-            raise ValueError(f"likelihood: StateSpace is for laplace and mcmc; give {self.name} sipe.Segments(...)")
-        if progress is not None and not callable(progress):
-            raise ValueError(f"progress: expected a function (what, rollouts, budget), got {progress!r}")
+        check_comparison(simulator, likelihood, progress, self.name, self.searches)
         self.seed = whole("seed", seed, 0)
         self.likelihood: Segments | StateSpace = likelihood or default_likelihood(simulator)  # the latter for searches
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
@@ -166,11 +165,6 @@ class Estimator(ABC, Generic[S]):
         self._bound: tuple[Trajectories, Windows | Chain] | None = None
         self._given = Given()
         self._observed: Trajectory | None = None
-        if self.searches and isinstance(simulator, CallableSimulator) and simulator.noise_sd is None:
-            raise ValueError(
-                f"likelihood: {self.name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or "
-                "use npe"
-            )
         self.prepare()
 
     def prepare(self) -> None:
@@ -182,11 +176,7 @@ class Estimator(ABC, Generic[S]):
 
     def stored(self, name: str, given: object) -> Path | None:
         """The path that an argument gives; raises ValueError for a simulator that others there cannot be told from."""
-        if given is not None and isinstance(self.simulator, CallableSimulator) and not self.simulator.name:
-            raise ValueError(
-                f"name: {name}= needs one to tell functions apart, and {self.simulator.fn!r} has none of its own; make "
-                'CallableSimulator(fn, space, name="...")'
-            )
+        check_named(self.simulator, name, given)
         return path(name, given)
 
     def __init_subclass__(cls) -> None:
@@ -291,10 +281,18 @@ class Estimator(ABC, Generic[S]):
     def _finished(self, state: S, trajectories: Trajectories) -> Posterior:
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
         posterior = self.posterior(state, trajectories)
-        at_bound = at_bounds(posterior, self.prior)
-        if at_bound:
+        if at_bound := at_bounds(posterior, self.prior):
             self.find(Code.AT_BOUND, parameters=at_bound)
+        self.findings.drop(Code.FLOAT32_AGREES, Code.FLOAT32_DIFFERS)  # of fewer rollouts
+        again = partial(self.simulate_again, posterior.mean.numpy()[None], trajectories)
+        self.findings.extend(device_findings(self.name, self._given_simulator, self.simulator, again))
         return posterior
+
+    def simulate_again(self, theta: FloatArray, trajectories: Trajectories) -> None:
+        """Simulate theta (n, N) as the method does, uncounted."""
+        windows = copy.copy(self.windows(trajectories))
+        windows.budget = math.inf
+        windows.predict(theta, np.tile(windows.no_starts(), (len(theta), 1, 1)))
 
     def _recorded(self, given: Recorded) -> Any:
         """``given``, or the trajectory that an observed x (D,) of a CallableSimulator stands for."""

@@ -56,7 +56,7 @@ class CallableWindows(Windows):
         """The starts (..., W, 0) themselves."""
         return starts
 
-    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def predict(self, theta: FloatArray, starts: FloatArray, in_float64: bool = False) -> tuple[FloatArray, BoolArray]:
         """As of ``Windows``: what ``fn`` gives as the second sample."""
         batch, count = len(theta), len(self.trajectories)
         self.spend(batch)

@@ -260,12 +260,13 @@ class Windows:
             return np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
         return moved(self.simulator.model, self.reference, starts)
 
-    def predict(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def predict(self, theta: FloatArray, starts: FloatArray, in_float64: bool = False) -> tuple[FloatArray, BoolArray]:
         """Simulate every window.
 
         Args:
             theta: (B, N).
             starts: (B, W, D).
+            in_float64: on the processor, whatever the simulator's device.
 
         Returns:
             Predictions (B, W, L, C), NaN from the sample on at which a window diverged, rotation vectors written near
@@ -281,7 +282,8 @@ class Windows:
         actions = np.tile(self.actions, (batch, 1, 1))
         goals = None if self.goals is None else np.tile(self.goals, (batch, 1))
         dt, names = np.tile(self.dt, batch), self.names * batch
-        result = self.simulator.rollout(thetas, actions, states, dt, names, goals=goals)
+        simulator = self.simulator.on_processor if in_float64 else self.simulator
+        result = simulator.rollout(thetas, actions, states, dt, names, goals=goals)
         shape = (batch, self.num_windows)
         good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
@@ -326,7 +328,7 @@ class Windows:
         residual: FloatArray | None = None,
         theta_step: float | FloatArray | None = None,
     ) -> Linearisation:
-        """Residual and Jacobian: one batch of N + D + 1 simulations of the logs.
+        """Residual and Jacobian: one batch of N + D + 1 simulations of the logs, in float64.
 
         Args:
             theta: (N,), where.
@@ -350,10 +352,10 @@ class Windows:
         for j in range(d):
             all_starts[n + 1 + j, :, j] += STATE_STEP
         if residual is None:
-            predicted, valid = self.predict(thetas, all_starts)
+            predicted, valid = self.predict(thetas, all_starts, True)
         else:
             here = np.where(self.observed, self.measured - residual, np.nan)
-            predicted, valid = self.predict(thetas[1:], all_starts[1:])
+            predicted, valid = self.predict(thetas[1:], all_starts[1:], True)
             predicted, valid = np.concatenate([here[None], predicted]), np.append(True, valid)
         wrong = [j for j in range(n) if not valid[j + 1]]
         # a step across a physical limit: look the other way
@@ -362,7 +364,9 @@ class Windows:
             again = np.tile(theta, (len(wrong), 1))
             again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
             inside = np.clip(again, 0, 1)
-            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(inside, all_starts[: len(wrong)])
+            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(
+                inside, all_starts[: len(wrong)], True
+            )
         predicted[1:] = self._continued(predicted[1:], predicted[0])
         scale = np.concatenate([sign[:n] * size[:n], np.full(d, STATE_STEP)])
         with np.errstate(invalid="ignore"):

@@ -38,7 +38,7 @@ class Simulated:
         self.diverged = 0
         self.control_steps = 0
 
-    def __reduce__(self) -> tuple[type[Self], tuple[Environment, int]]:
+    def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
         return type(self), (self.environment, self.num_threads)
 
     @property

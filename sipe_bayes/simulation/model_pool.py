@@ -16,7 +16,7 @@ from sipe_bayes.envs.sensing import Sensing
 
 
 @dataclass
-class _Slot:
+class Slot:
     """A model of the pool, and what it holds: ``key`` tells theta, timestep and log; what its O sensors do."""
 
     model: mujoco.MjModel
@@ -36,7 +36,7 @@ class ModelPool:
 
     environment: Environment
     model: mujoco.MjModel
-    slots: list[_Slot] = field(default_factory=list)
+    slots: list[Slot] = field(default_factory=list)
 
     def take(self, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None], own: bool = False) -> IntArray:
         """Write what B simulations need; those that follow their like cost nothing.
@@ -63,6 +63,13 @@ class ModelPool:
                 self._fill(index[key], key, theta[at], timestep, log)
             slots[i] = index[key]
         return np.repeat(slots, np.diff(first, append=len(theta)))
+
+    def fresh(self) -> mujoco.MjModel:
+        """The model of a new slot."""
+        return copy.copy(self.model)
+
+    def keep(self, index: int) -> None:
+        """What is done with the model of a slot that has been written."""
 
     def models(self, slots: IntArray) -> list[mujoco.MjModel]:
         """The models of ``slots`` (B,)."""
@@ -101,13 +108,14 @@ class ModelPool:
 
     def _fill(self, index: int, key: bytes, theta: FloatArray, timestep: float, log: str | None) -> None:
         if index == len(self.slots):
-            self.slots.append(_Slot(copy.copy(self.model), Sensing.of_bias(np.zeros(len(self.environment.channels)))))
+            self.slots.append(Slot(self.fresh(), Sensing.of_bias(np.zeros(len(self.environment.channels)))))
         slot = self.slots[index]
         if slot.key == key:
             return
         slot.key = b""
         slot.physical = self._write(slot.model, theta, timestep, log)
         slot.sensing = self.environment.sensing(self._values(theta), log)
+        self.keep(index)
         slot.key = key
 
     def _values(self, theta: FloatArray) -> FloatArray:

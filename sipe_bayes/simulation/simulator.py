@@ -10,31 +10,25 @@ nothing on the terminal, no MUJOCO_LOG.TXT; ``Simulator.diverged`` counts.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
-import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.html import html_table
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task
+from sipe_bayes.simulation.audit import Audit
 from sipe_bayes.simulation.base import Simulated
-from sipe_bayes.simulation.engine import HUGE, Run, quiet
+from sipe_bayes.simulation.device import Batch, Device, Processor
+from sipe_bayes.simulation.engine import HUGE, Engine, quiet
 from sipe_bayes.simulation.episodes import Episodes, Step
-
-
-@dataclass(frozen=True)
-class Memory:
-    """What a rollout may hold at once."""
-
-    numbers: int = 2**24  # of state and sensor output, 128 MiB
-    model_bytes: int = 2**29  # of written models
-
-
-MEMORY = Memory()
 
 
 class Simulator(Simulated):
@@ -45,12 +39,35 @@ class Simulator(Simulated):
     Args:
         environment: what is simulated.
         num_threads: native threads; default the processor's cores.
+        device: "cpu" for MuJoCo itself, in float64; "cuda" or "cuda:1" for a GPU, in float32 by mujoco-warp (``docs/
+            gpu.md``); "warp:cpu" runs the GPU's code on the processor, slowly, for tests.
 
     Raises:
-        ValueError: for anything but an Environment, or no whole number of threads.
+        ValueError: for anything but an Environment, no whole number of threads, another device, or a model that the
+            device can not simulate.
     """
 
     episodes: Episodes | None = None
+
+    def __init__(self, environment: Environment, num_threads: int | None = None, device: str = "cpu") -> None:
+        super().__init__(environment, num_threads)
+        self.device = device
+        self.runs: Device = Processor(self.engine, self.pool) if device == "cpu" else on_gpu(self.engine, device)
+        self.audit = None if device == "cpu" else Audit()
+
+    def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
+        return type(self), (self.environment, self.num_threads, self.device)
+
+    @cached_property
+    def on_processor(self) -> Simulator:
+        """The same in float64 on the processor."""
+        return self if self.device == "cpu" else Simulator(self.environment, self.num_threads)
+
+    def checksum(self) -> str:
+        """That of the compiled default model, and of the device where it is not the processor."""
+        model = super().checksum()
+        kind = self.device.partition(":")[0]
+        return model if kind == "cpu" else hashlib.sha256(f"{model} {kind}".encode()).hexdigest()
 
     def _repr_html_(self) -> str:
         model = self.model
@@ -103,11 +120,12 @@ class Simulator(Simulated):
         motion = _Recorded.empty(batch, horizon, self)
         with quiet:
             for skip, chunk in self._chunks(steps, horizon):
-                slots = self.pool.take(
-                    theta[chunk], timesteps[chunk], [names[i] for i in chunk], self.engine.own_models
+                slots = self.runs.pool.take(
+                    theta[chunk], timesteps[chunk], [names[i] for i in chunk], self.runs.own_slots
                 )
                 targets = None if goals is None else goals[chunk]
-                self._run(motion, chunk, skip, slots, timesteps[chunk], actions[chunk], initial_state[chunk], targets)
+                given = Batch(slots, skip, timesteps[chunk], actions[chunk], initial_state[chunk])
+                self._run(motion, chunk, given, targets)
         valid = np.logical_and.accumulate(motion.valid, axis=1)
         self.diverged += int((~valid[:, -1]).sum())
         self.control_steps += batch * horizon
@@ -115,7 +133,15 @@ class Simulator(Simulated):
         rewards = self.environment.rewards(motion.states, motion.derived, actions, goals)
         rewards = None if rewards is None else np.where(valid[:, 1:], rewards, 0.0)
         channels = self.environment.channels
-        return Trajectories(motion.observations, actions, dts, length, valid, motion.states, (), channels, rewards)
+        made = Trajectories(motion.observations, actions, dts, length, valid, motion.states, (), channels, rewards)
+        if self.audit is not None and len(again := self.audit.chosen(batch)):
+            named = [names[i] for i in again]
+            aims = None if goals is None else goals[again]
+            exact = self.on_processor.rollout(
+                theta[again], actions[again], initial_state[again], dts[again], named, True, aims
+            )
+            self.audit.compare(made, again, exact)
+        return made
 
     def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:
         """The recorded actions from the recorded starting states, for every theta.
@@ -174,8 +200,12 @@ class Simulator(Simulated):
             allow_outside: whether theta may leave [0, 1].
 
         Raises:
-            ValueError: for a count that is not theta's, or wrong theta.
+            ValueError: for a count that is not theta's, wrong theta, or another device than the processor.
         """
+        if self.device != "cpu":
+            raise ValueError(
+                f"device: closed loop is stepped on the processor, not on {self.device!r}; use simulator.on_processor"
+            )
         space = self.space
         given = space.default_theta if theta is None else space.check_shape(theta)
         num_envs = (1 if given.ndim == 1 else len(given)) if count is None else count
@@ -248,37 +278,35 @@ class Simulator(Simulated):
         """Simulations with as many physics ``steps`` (B,) per control step, no more than the memory holds."""
         for skip in np.unique(steps).tolist():
             group = np.flatnonzero(steps == skip)
-            rows = horizon * (1 if self.environment.data_fields else skip) + 1
-            width = rows * (self.state_size + self.engine.derived_size + self.model.nu)
-            held = min(MEMORY.numbers // width, MEMORY.model_bytes // mujoco.mj_sizeModel(self.model))
-            for chunk in np.array_split(group, math.ceil(len(group) / max(self.num_threads, held))):
+            for chunk in np.array_split(group, math.ceil(len(group) / self.runs.most(horizon, skip))):
                 yield skip, chunk
 
-    def _run(
-        self,
-        motion: _Recorded,
-        chunk: IntArray,
-        skip: int,
-        slots: IntArray,
-        timesteps: FloatArray,
-        actions: FloatArray,
-        initial_state: FloatArray,
-        goals: FloatArray | None,
-    ) -> None:
-        """Simulate ``chunk``, which all take ``skip`` physics steps a control step, into ``motion``."""
-        run = self.pool.physical(slots) & np.isfinite(initial_state).all(1)
+    def _run(self, motion: _Recorded, chunk: IntArray, batch: Batch, goals: FloatArray | None) -> None:
+        """Simulate ``chunk`` into ``motion``."""
+        pool = self.runs.pool
+        run = pool.physical(batch.slots) & np.isfinite(batch.start).all(1)
         if not run.any():
             return
-        models, at = self.pool.models(slots[run]), chunk[run]
-        states, derived, valid = self.engine.advance(
-            Run(skip, models, timesteps[run], actions[run], initial_state[run])
-        )
+        at, skip, slots, timesteps = chunk[run], batch.skip, batch.slots[run], batch.timesteps[run]
+        states, derived, valid = self.runs.advance(Batch(slots, skip, timesteps, batch.actions[run], batch.start[run]))
         targets = None if goals is None else goals[run, None]
         observations = self.environment.observe(self.model, states, derived, targets)
-        seen = self.pool.sensing(slots[run]).seen(observations, skip * timesteps[run])
+        seen = pool.sensing(slots).seen(observations, skip * timesteps)
         motion.states[at], motion.observations[at], motion.valid[at] = states, seen, valid
         if derived is not None and motion.derived is not None:
             motion.derived[at] = derived
+
+
+def on_gpu(engine: Engine, device: str) -> Device:
+    """The engine of a GPU; raises ValueError without the packages, the device or what the model needs."""
+    try:
+        from sipe_bayes.simulation.gpu.devices import warp_name
+
+        name = warp_name(device)
+        from sipe_bayes.simulation.gpu.engine import GpuEngine
+    except ModuleNotFoundError as error:
+        raise ValueError(f"device: {error.name} is not installed; `pip install 'sipe-bayes[gpu]'`") from None
+    return GpuEngine(engine, name)
 
 
 @dataclass(frozen=True)

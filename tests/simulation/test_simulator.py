@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.simulation.simulator import Memory, Simulator
+from sipe_bayes.simulation.device import Memory
+from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.small_models import ARM, CASES, FULL, HINGE, HORIZON, PENDULUM, draw, p, plain
 
 
@@ -66,7 +67,7 @@ def test_many_chunks_are_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator, theta, actions, starts = draw(CASES["arm"])
     whole = simulator.rollout(theta, actions, starts)
     room = Memory(model_bytes=3 * mujoco.mj_sizeModel(simulator.model))
-    monkeypatch.setattr("sipe_bayes.simulation.simulator.MEMORY", room)
+    monkeypatch.setattr("sipe_bayes.simulation.device.MEMORY", room)
     small = Simulator(simulator.environment, 1)
     cut = small.rollout(theta, actions, starts)
     np.testing.assert_array_equal(cut.observations, whole.observations)

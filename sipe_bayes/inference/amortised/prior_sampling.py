@@ -253,6 +253,10 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         """Simulations of theta (n, N), which need not come from the prior, with noise; the caller counts them."""
         return self._noisy(self.prior_simulations(trajectories).simulate(theta), trajectories, rng)
 
+    def simulate_again(self, theta: FloatArray, trajectories: Trajectories) -> None:
+        """See ``Estimator``."""
+        self.prior_simulations(trajectories).simulate(theta)
+
     def simulations(self, state: S, trajectories: Trajectories) -> Simulations:
         """The valid simulations so far, with noise."""
         made = self.prior_simulations(trajectories).first(state.simulated)

@@ -59,6 +59,7 @@ class Chain:
     """
 
     def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
+        simulator = simulator.on_processor  # one-step differences are below float32's rounding
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
         self.rollouts, self.uncounted, self.budget, self.short = 0, 0.0, math.inf, False
         self.channels = chosen_channels(simulator, trajectories, settings.fit)

@@ -1,0 +1,166 @@
+"""The engine of a GPU, run on Warp's own processor device: as MuJoCo in float64, or said where it is not.
+
+Warp compiles what the arm needs once, for 20 s on one core, and keeps it; one model serves all of these tests. The
+other environments are in ``examples/studies/gpu_agreement.py``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sipe_bayes as sipe
+from sipe_bayes.core.findings import Code
+from sipe_bayes.inference.registry import get_estimator
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.simulation.audit import spread
+from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.small_models import CASES, HINGE, PENDULUM, Case, draw, p
+
+BOUND = 1e-4  # of what a channel varies by, over 8 steps of 4 ms; the largest of these is 1e-5
+DEVICE = "warp:cpu"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_fast() -> Iterator[None]:
+    warp = pytest.importorskip("warp")
+    pytest.importorskip("mujoco_warp")
+    before, warp.config.optimization_level = warp.config.optimization_level, 0
+    yield
+    warp.config.optimization_level = before
+
+
+@pytest.fixture(scope="module")
+def arm(_compiled_fast: None) -> Simulator:
+    return Simulator(CASES["arm"].environment(), 1, DEVICE)
+
+
+def drawn(batch: int) -> tuple[Simulator, Any, Any, Any]:
+    """As ``draw``, of 8 control steps: launching kernels one by one takes 10 ms a step."""
+    exact, theta, actions, starts = draw(CASES["arm"], batch)
+    return exact, theta, actions[:, :8], starts
+
+
+def error(single: Any, double: Any) -> Any:
+    """(B, T+1, O), in what a channel varies by."""
+    return np.abs(single.observations - double.observations) / spread(double.observations, double.valid)
+
+
+def test_it_is_mujoco_in_float32_and_the_same_twice(arm: Simulator) -> None:
+    exact, theta, actions, starts = drawn(4)
+    again = arm.rollout(theta, actions, starts)
+    double, single = exact.rollout(theta, actions, starts), arm.rollout(theta, actions, starts)
+    np.testing.assert_array_equal(single.observations, again.observations)
+    assert single.valid.all()
+    assert single.observations.dtype == single.states.dtype == np.float64
+    np.testing.assert_allclose(single.states[..., 0], double.states[..., 0], rtol=1e-12)
+    assert 0 < error(single, double).max() < BOUND
+
+
+@pytest.mark.parametrize("name", [q.name for q in CASES["arm"].parameters])
+def test_every_parameter_does_what_it_does_on_the_processor(arm: Simulator, name: str) -> None:
+    exact, _, actions, starts = drawn(1)
+    theta = np.full((2, len(arm.space)), 0.5)
+    theta[:, arm.space.index(name)] = 0.1, 0.9
+    if name == "slip":  # a box that slides
+        starts[:, 1 + exact.model.nq + 2] = 2.0
+    single, double = arm.rollout(theta, actions, starts), exact.rollout(theta, actions, starts)
+    moved = [np.abs(np.diff(run.observations, axis=0)).max() for run in (single, double)]
+    assert moved[1] > 1e-4
+    assert moved[0] == pytest.approx(moved[1], rel=1e-2)
+
+
+def test_batches_of_any_size_and_of_several_timesteps_are_as_alone(arm: Simulator) -> None:
+    exact, theta, actions, starts = drawn(3)
+    dt = np.array([0.004, 0.008, 0.005])
+    whole = arm.rollout(theta, actions, starts, dt)
+    assert error(whole, exact.rollout(theta, actions, starts, dt)).max() < BOUND
+    alone = arm.rollout(theta[1], actions[1], starts[1], dt[1])
+    np.testing.assert_array_equal(alone.observations[0], whole.observations[1])
+
+
+def test_what_diverges_or_is_unphysical_is_flagged_and_touches_no_other(arm: Simulator) -> None:
+    exact, theta, actions, starts = drawn(4)
+    starts[1, 1 + exact.model.nq] = 3e9
+    theta[2, 0] = -2.0  # a mass below zero
+    single, double = (s.rollout(theta, actions, starts, allow_outside=True) for s in (arm, exact))
+    np.testing.assert_array_equal(single.valid[[0, 2, 3]], double.valid[[0, 2, 3]])
+    assert not single.valid[1, -1]
+    assert not single.valid[2].any()
+    assert np.isnan(single.observations[2]).all()
+    alone = arm.rollout(theta[[0, 3]], actions[[0, 3]], starts[[0, 3]])
+    np.testing.assert_array_equal(single.observations[[0, 3]], alone.observations)
+
+
+def test_more_contacts_than_there_is_room_for(arm: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, theta, actions, starts = drawn(2)
+    whole = arm.rollout(theta, actions, starts)
+    small = Simulator(arm.environment, 1, DEVICE)
+    small.runs.capacity = small.runs.capacity._replace(contacts=1)  # type: ignore[attr-defined]
+    monkeypatch.setattr("sipe_bayes.simulation.gpu.engine._LARGEST", 1)
+    assert not small.rollout(theta, actions, starts).valid[:, -1].any()
+    assert small.diverged == 2
+    monkeypatch.undo()
+    np.testing.assert_array_equal(small.rollout(theta, actions, starts).observations, whole.observations)
+    assert small.runs.capacity.contacts > 1  # type: ignore[attr-defined]
+
+
+def test_an_estimator_takes_either_engine_and_says_how_far_they_agree(arm: Simulator) -> None:
+    exact, _, actions, starts = drawn(1)
+    log = exact.rollout(np.full((1, 4), 0.4), actions, starts)
+    means = []
+    for simulator in (exact, arm):
+        estimator = get_estimator(simulator, "cem", budget=64, seed=1, likelihood=Segments(None, starts="recorded"))
+        means.append(estimator.fit(log).mean.numpy())
+    np.testing.assert_allclose(means[1], means[0], atol=1e-2)
+    (said,) = estimator.findings.of(Code.FLOAT32_AGREES, Code.FLOAT32_DIFFERS)
+    assert said.code is Code.FLOAT32_AGREES
+
+
+def test_what_differentiates_stays_in_float64(arm: Simulator) -> None:
+    exact, _, actions, starts = drawn(1)
+    log = exact.rollout(np.full((1, 4), 0.4), actions, starts)
+    fits = [get_estimator(s, "laplace", budget=60, likelihood=Segments(None, starts="recorded")) for s in (exact, arm)]
+    alone, on_gpu = (fit.fit(log).mean.numpy() for fit in fits)
+    np.testing.assert_array_equal(alone, on_gpu)
+    assert Code.ON_PROCESSOR in fits[1].findings
+    assert Code.ON_PROCESSOR not in fits[0].findings
+
+
+PID = PENDULUM.replace("<motor", "<pid input='pos' kp='3' kv='1'")
+SOLVER = PENDULUM.replace("<option", '<option solver="PGS"')
+LAW = Case(PENDULUM, (p("stribeck", 0, 1, "joint:hinge.stribeck"),), ("motor",), HINGE)
+
+
+@pytest.mark.parametrize(
+    ("case", "what"),
+    [
+        (Case(PID, (p("m", 0.5, 2, "body:rod.mass"),), ("motor",), HINGE), "pid actuators, and 'motor' is one"),
+        (Case(SOLVER, (p("m", 0.5, 2, "body:rod.mass"),), ("motor",), HINGE), "PGS"),
+    ],
+)
+def test_what_it_can_not_simulate_is_refused_by_name(case: Case, what: str) -> None:
+    with pytest.raises(ValueError, match=f"^device: .*{what}.*leave device out"):
+        Simulator(case.environment(), 1, DEVICE)
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda:x", "warp:cuda", 3])
+def test_no_such_device(device: Any) -> None:
+    with pytest.raises(ValueError, match="device: expected 'cpu', 'cuda'"):
+        Simulator(CASES["pendulum"].environment(), 1, device)
+
+
+def test_closed_loop_is_refused(arm: Simulator) -> None:
+    task = sipe.make_task("Pendulum")
+    with pytest.raises(ValueError, match="on_processor"):
+        Simulator(task, 1, DEVICE).reset()
+
+
+def test_nothing_of_warp_is_imported_on_the_processor() -> None:
+    code = "import sys, sipe_bayes as s; s.Simulator(s.make_task('Pendulum')); assert 'warp' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
