@@ -23,6 +23,7 @@ from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claim, describe_
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import Disagreement, disagreement, linear_estimates, log_estimates, parts_of
 from sipe_bayes.diagnostics.bands import band_coverage, predictive_bands
@@ -292,6 +293,10 @@ def _residuals(
     windows, theta, noise, starts = fit.windows, fit.theta, fit.noise, fit.starts
     if {Code.SCATTER, Code.SCATTER_UNKNOWN} & {item.code for item in method.findings}:
         unknown.append(finding(Code.MISFIT_NOT_ASKED))
+        return None, fitted_residuals(windows, theta, noise, starts)
+    left = float(np.max(noise.sd / np.maximum(windows.spread, np.finfo(float).tiny)))
+    if left < THRESHOLDS.rounding:
+        unknown.append(finding(Code.NOISE_FREE, share=left))
         return None, fitted_residuals(windows, theta, noise, starts)
     try:
         probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(problem.prior), fit.lin)

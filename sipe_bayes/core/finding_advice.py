@@ -129,6 +129,7 @@ ADVICE: dict[Code, str] = {
     Code.MISFIT: _REMEDY_LACKING,
     Code.MISFIT_SHIFTS: f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong.",
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
+    Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",

@@ -227,6 +227,10 @@ class Code(Enum):
     MISFIT_NOT_ASKED = note(
         "whether the residuals are noise is not asked: through impacts no linearisation says what other physics does"
     )
+    NOISE_FREE = note(
+        "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
+        "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"
+    )
     MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
     CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
