@@ -41,9 +41,11 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import CheckpointError, Snapshot
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.experiment import Experiment, Looks, measured
+from sipe_bayes.inference.amortised.held_back import HeldBack
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
@@ -71,12 +73,14 @@ class Learned(Generic[L]):
         experiment: what its simulations replayed.
         looks: what tells a log from its simulations.
         log: digest of the trajectories that were in hand.
+        held_back: what simulations that were not trained on say of the posteriors; None without.
     """
 
     content: L
     experiment: Experiment
     looks: Looks
     log: str
+    held_back: HeldBack | None = None
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,9 @@ class PriorSamplingOptions(Options):
     cache: Path | None = option(
         None,
         "folder for simulations, shared between estimators of one seed; default beside the checkpoint, else in memory",
+    )
+    calibration: float = option(
+        0.0, "share of the simulations that is not trained on and mends the posteriors' widths", least=0, below=1
     )
 
 
@@ -184,7 +191,10 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         self.diagnostics["unlikeness"] = unlikeness
         if unlikeness > THRESHOLDS.unlike:
             self.find(Code.UNLIKE_SIMULATIONS)
-        return self.infer(learned.content, trajectories)
+        inferred = self.infer(learned.content, trajectories)
+        if learned.held_back is None:
+            return inferred
+        return learned.held_back.mended(inferred, torch_generator([self.seed, 6]))
 
     def describe(self, state: S) -> str:
         """What is being done, for the progress bar."""
@@ -327,10 +337,33 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         simulations = self.simulations(state, trajectories)
         self._check_units(simulations)
         looks = self._looks(simulations.observations[-_SEEN:], trajectories)
-        content = self.train(simulations, trajectories)
+        kept, held_back = len(simulations) - self._held_back(simulations), None
+        content = self.train(simulations[:kept], trajectories)
+        if kept < len(simulations):
+            held_back = self._scored(content, simulations[kept:], trajectories)
         noise, first = noise_level(trajectories, self.likelihood), simulations.observations[:, :, 0]
         experiment = Experiment.of(self.simulator, trajectories, noise, first)
-        return replace(state, learned=Learned(content, experiment, looks, digest(trajectories)))
+        return replace(state, learned=Learned(content, experiment, looks, digest(trajectories), held_back))
+
+    def _held_back(self, simulations: Simulations) -> int:
+        """Simulations that are not trained on; raises ValueError where they are too few to say anything."""
+        count = int(self.options.calibration * len(simulations))
+        if self.options.calibration and count < THRESHOLDS.few_valid:
+            raise ValueError(
+                f"calibration: {self.options.calibration:g} of {len(simulations)} simulations are {count}, "
+                f"{THRESHOLDS.few_valid} are the least; raise it, or the budget"
+            )
+        return count
+
+    def _scored(self, content: L, held_back: Simulations, trajectories: Trajectories) -> HeldBack:
+        """What simulations say of the posteriors that a training came to."""
+        seen = np.isfinite(trajectories.observations)
+
+        def inferred(number: int) -> Posterior:
+            observations = np.where(seen, held_back.observations[number].astype(float), np.nan)
+            return self.infer(content, replace(trajectories, observations=observations))
+
+        return HeldBack.of(inferred, held_back.theta, torch_generator([self.seed, 5]))
 
     def _check_units(self, simulations: Simulations) -> None:
         """A finding where a function's outputs vary by less than networks take for rounding."""
