@@ -22,7 +22,7 @@ Deviations:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -30,6 +30,9 @@ import torch
 from scipy.special import ndtr, ndtri
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.flow import to_line
 
@@ -89,6 +92,34 @@ class HeldBack:
         further = (weight**2).sum() / weight.sum()  # of one more simulation
         place = (np.cumsum(weight) - 0.5 * weight + 0.5 * further) / (weight.sum() + further)
         return ndtri(place), self.scores[order, parameter]
+
+
+def parted(simulations: Simulations, share: float) -> tuple[Simulations, Simulations]:
+    """Those to train on and those that are held back; raises ValueError where the latter are too few."""
+    count = int(share * len(simulations))
+    if share and count < THRESHOLDS.few_valid:
+        raise ValueError(
+            f"calibration: {share:g} of {len(simulations)} simulations are {count}, {THRESHOLDS.few_valid} are the "
+            "least; raise it, or the budget"
+        )
+    kept = len(simulations) - count
+    return simulations[:kept], simulations[kept:]
+
+
+def scored(
+    infer: Callable[[Trajectories], Posterior],
+    simulations: Simulations,
+    trajectories: Trajectories,
+    generator: torch.Generator,
+) -> HeldBack | None:
+    """What simulations, as the log would have recorded them, say of the posteriors; None where there are none."""
+    seen = np.isfinite(trajectories.observations)
+
+    def inferred(number: int) -> Posterior:
+        observations = np.where(seen, simulations.observations[number].astype(float), np.nan)
+        return infer(replace(trajectories, observations=observations))
+
+    return HeldBack.of(inferred, simulations.theta, generator) if len(simulations) else None
 
 
 def _quantiles(theta: torch.Tensor) -> FloatArray:

@@ -30,6 +30,7 @@ from __future__ import annotations
 import hashlib
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
@@ -45,7 +46,7 @@ from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.experiment import Experiment, Looks, measured
-from sipe_bayes.inference.amortised.held_back import HeldBack
+from sipe_bayes.inference.amortised.held_back import HeldBack, parted, scored
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
@@ -337,33 +338,12 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         simulations = self.simulations(state, trajectories)
         self._check_units(simulations)
         looks = self._looks(simulations.observations[-_SEEN:], trajectories)
-        kept, held_back = len(simulations) - self._held_back(simulations), None
-        content = self.train(simulations[:kept], trajectories)
-        if kept < len(simulations):
-            held_back = self._scored(content, simulations[kept:], trajectories)
+        simulations, kept_back = parted(simulations, self.options.calibration)
+        content = self.train(simulations, trajectories)
+        held_back = scored(partial(self.infer, content), kept_back, trajectories, torch_generator([self.seed, 5]))
         noise, first = noise_level(trajectories, self.likelihood), simulations.observations[:, :, 0]
         experiment = Experiment.of(self.simulator, trajectories, noise, first)
         return replace(state, learned=Learned(content, experiment, looks, digest(trajectories), held_back))
-
-    def _held_back(self, simulations: Simulations) -> int:
-        """Simulations that are not trained on; raises ValueError where they are too few to say anything."""
-        count = int(self.options.calibration * len(simulations))
-        if self.options.calibration and count < THRESHOLDS.few_valid:
-            raise ValueError(
-                f"calibration: {self.options.calibration:g} of {len(simulations)} simulations are {count}, "
-                f"{THRESHOLDS.few_valid} are the least; raise it, or the budget"
-            )
-        return count
-
-    def _scored(self, content: L, held_back: Simulations, trajectories: Trajectories) -> HeldBack:
-        """What simulations say of the posteriors that a training came to."""
-        seen = np.isfinite(trajectories.observations)
-
-        def inferred(number: int) -> Posterior:
-            observations = np.where(seen, held_back.observations[number].astype(float), np.nan)
-            return self.infer(content, replace(trajectories, observations=observations))
-
-        return HeldBack.of(inferred, held_back.theta, torch_generator([self.seed, 5]))
 
     def _check_units(self, simulations: Simulations) -> None:
         """A finding where a function's outputs vary by less than networks take for rounding."""
