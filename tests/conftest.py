@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 os.environ["MUJOCO_GL"] = "disabled"  # nothing is rendered but where a test asks for it
+os.environ["SIPE_TRUST_MODELS"] = "1"  # a process for each model takes half a second; its own tests unset it
 
 
 @pytest.fixture

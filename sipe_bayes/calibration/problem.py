@@ -23,8 +23,9 @@ from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.foreign.load import ModelError
 from sipe_bayes.envs.laws.firmware import Firmware
-from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.target import TargetError
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator

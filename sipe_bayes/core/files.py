@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LOG_GIB, MODEL_GIB, MODEL_SECONDS = "SIPE_LOG_GIB", "SIPE_MODEL_GIB", "SIPE_MODEL_SECONDS"
-_LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 60.0}
+_LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 20.0}
 _LONGEST_TEXT = 2**25  # bytes of JSON or TOML: what it becomes in memory is twenty times as much
 _WORDS = 200  # characters of what a library says
 

@@ -31,6 +31,7 @@ from sipe_bayes.envs.channels import (
     rotation_triples,
     state_column,
 )
+from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
 from sipe_bayes.envs.internal.states import filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
@@ -53,31 +54,6 @@ class Edit(Protocol):
 
     def __call__(self, spec: mujoco.MjSpec) -> None:
         """Change the spec in place."""
-
-
-class ModelError(ValueError):
-    """An MJCF that does not compile."""
-
-
-def load_spec(source: str) -> mujoco.MjSpec:
-    """MjSpec of a path or of MJCF text; raises ModelError with MuJoCo's first line."""
-    text = source.lstrip().startswith("<")
-    if not text and not Path(source).is_file():
-        raise ModelError(f"model: no file {source!r}; give the path of an MJCF file, or the MJCF text itself")
-    try:
-        return mujoco.MjSpec.from_string(source) if text else mujoco.MjSpec.from_file(source)
-    except ValueError as error:
-        where = "the MJCF text" if text else source
-        raise ModelError(f"model: {where} is not valid MJCF: {' '.join(str(error).split())}; correct it") from None
-
-
-def compile_spec(spec: mujoco.MjSpec, source: str) -> mujoco.MjModel:
-    """MjModel of a spec; raises ModelError with MuJoCo's first line."""
-    try:
-        return spec.compile()
-    except ValueError as error:
-        where = "the MJCF text" if source.lstrip().startswith("<") else source
-        raise ModelError(f"model: {where} does not compile: {' '.join(str(error).split())}; correct it") from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,8 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import write_text
 from sipe_bayes.envs.export import NO_NUMBERS, number_fields
-from sipe_bayes.envs.mjcf import MjcfEnvironment, compile_spec, load_spec
+from sipe_bayes.envs.foreign.load import compile_spec, load_spec
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
 
 _SIZES = ("nbody", "njnt", "nv", "nu", "ngeom")

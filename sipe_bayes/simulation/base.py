@@ -18,6 +18,9 @@ from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.engine import Engine
 from sipe_bayes.simulation.model_pool import ModelPool
 
+MOST_STEPS = 10_000
+"""Physics steps of a control step: beyond, nobody waits for a fit."""
+
 
 class Simulated:
     """An environment, compiled; see ``Simulator``, which is what it is made for."""
@@ -91,8 +94,13 @@ class Simulated:
         Returns:
             How many physics steps it has, and the seconds of each: never longer than the model's own.
         """
-        steps = max(1, math.ceil(dt / self.model.opt.timestep - 1e-3))
         own = float(self.model.opt.timestep)
+        if not dt / own < MOST_STEPS:
+            raise ValueError(
+                f"dt: a control step of {dt:g} s has more than {MOST_STEPS} physics steps of {own:g} s; raise the "
+                "model's timestep, or the logs' rate"
+            )
+        steps = max(1, math.ceil(dt / own - 1e-3))
         return steps, own if math.isclose(dt, steps * own, rel_tol=1e-12) else dt / steps
 
     def check_theta(self, theta: FloatArray, allow_outside: bool, num_envs: int | None = None) -> FloatArray:

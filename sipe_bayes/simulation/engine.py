@@ -7,7 +7,6 @@ own messages are held back meanwhile: nothing on the terminal, no MUJOCO_LOG.TXT
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.simulation.firmware_steps import FirmwareSteps
 from sipe_bayes.simulation.law_steps import LawSteps
 from sipe_bayes.simulation.mjdata import Fields
@@ -57,30 +57,6 @@ class Motion(NamedTuple):
     states: FloatArray
     derived: FloatArray | None
     valid: BoolArray
-
-
-class _Quiet:
-    """Holds MuJoCo's process-wide log back while any thread is inside; no callback, so no wait for the GIL."""
-
-    def __init__(self) -> None:
-        self._lock, self._inside, self._before = threading.Lock(), 0, mujoco.MjLogConfig.get()
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._inside:
-                self._before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-                silent.logto_console = silent.logto_file = False
-                silent.set()
-            self._inside += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if not self._inside:
-                self._before.set()
-
-
-quiet = _Quiet()
 
 
 class Engine:

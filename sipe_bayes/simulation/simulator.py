@@ -23,11 +23,12 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.html import html_table
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.base import Environment
+from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.audit import Audit
 from sipe_bayes.simulation.base import Simulated
 from sipe_bayes.simulation.device import Batch, Device, Processor
-from sipe_bayes.simulation.engine import HUGE, Engine, quiet
+from sipe_bayes.simulation.engine import HUGE, Engine
 from sipe_bayes.simulation.episodes import Episodes, Step
 
 

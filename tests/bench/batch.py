@@ -18,8 +18,8 @@ import mujoco.rollout
 import numpy as np
 
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.simulation.engine import quiet
 from sipe_bayes.simulation.simulator import Simulator
 
 STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)

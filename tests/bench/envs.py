@@ -27,9 +27,9 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
+from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Task
-from sipe_bayes.simulation.engine import quiet
 from sipe_bayes.simulation.simulator import Simulator
 
 NUM_ENVS, STEPS, THREADS = 64, 200, 2

@@ -12,7 +12,8 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.channels import Channel
-from sipe_bayes.envs.mjcf import MjcfEnvironment, ModelError
+from sipe_bayes.envs.foreign.load import ModelError
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.target import TargetError
 from sipe_bayes.simulation.simulator import Simulator
 

@@ -16,14 +16,14 @@ def read(file: Path, folder: Path) -> object:
     from sipe_bayes.calibration.config import load_config
     from sipe_bayes.calibration.readers.tables import read_table
     from sipe_bayes.core.trajectory import Trajectories
-    from sipe_bayes.envs.mjcf import MjcfEnvironment
+    from sipe_bayes.envs.foreign.load import compile_spec, load_spec
     from sipe_bayes.posterior import load_posterior
     from sipe_bayes.rl.randomization import load_randomization
 
     readers = {
         "configurations": load_config,
         "logs": read_table,
-        "models": lambda path: MjcfEnvironment.build(path, [], [], []),
+        "models": lambda path: compile_spec(load_spec(str(path)), str(path)),
         "posteriors": load_posterior,
         "randomizations": load_randomization,
         "records": Record.read,

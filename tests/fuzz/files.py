@@ -123,17 +123,62 @@ def problems(folder: Path) -> Change:
     return change
 
 
+RICH = """\
+<mujoco>
+  <compiler angle="radian" boundmass="0.001" boundinertia="0.001"/>
+  <size memory="1M" nuserdata="1" nkey="1" nuser_body="1" nuser_sensor="1"/>
+  <option timestep="0.002" iterations="10" ls_iterations="5" noslip_iterations="2" tolerance="1e-8" density="1"/>
+  <include file="part.xml"/>
+  <asset>
+    <texture name="t" type="2d" builtin="checker" width="8" height="8"/>
+    <hfield name="h" nrow="3" ncol="3" size="1 1 0.1 0.1"/>
+    <mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1" scale="1 1 1"/>
+  </asset>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <geom type="hfield" hfield="h" pos="0 0 -1"/>
+    <body name="b" pos="0 0 0.1"><joint name="j" range="-1 1" damping="0.1" stiffness="1"/><geom size="0.1" mass="1"/>
+      <body pos="0.3 0 0"><joint name="k" axis="0 1 0"/><geom type="mesh" mesh="m"/><site name="s"/></body>
+    </body>
+    <replicate count="2" offset="1 0 0"><geom type="box" size="0.1 0.1 0.1" pos="3 0 0"/></replicate>
+    <flexcomp name="f" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" dim="2" pos="0 0 3" mass="1"/>
+  </worldbody>
+  <tendon><fixed name="n" range="0 1"><joint joint="j" coef="1"/></fixed></tendon>
+  <equality><joint joint1="j" joint2="k" polycoef="0 1 0 0 0"/></equality>
+  <actuator><general name="a" joint="j" dyntype="integrator" dynprm="1" delay="0.01" nsample="8"/></actuator>
+  <sensor><rangefinder site="s" cutoff="1"/><jointpos joint="j" noise="0.1" delay="0.01" nsample="4"/></sensor>
+  <custom><numeric name="z" size="3" data="1 2 3"/></custom>
+  <keyframe><key time="0"/></keyframe>
+</mujoco>
+"""
+
+
 def models(folder: Path) -> Change:
     """MJCF of the examples, as they come, and with the values of one attribute for another's."""
-    from sipe_bayes.envs.mjcf import MjcfEnvironment
+    import mujoco
+
+    from sipe_bayes.envs.foreign.load import compile_spec, load_spec
+    from sipe_bayes.envs.foreign.quiet import quiet
 
     texts = [f.read_text(encoding="utf-8") for f in sorted(EXAMPLES.glob("*/*.xml"))]
-    texts.append(
-        '<mujoco><size nuserdata="1"/><option timestep="0.002"/><include file="part.xml"/><worldbody><body name="b">'
-        '<joint name="j" damping="0.1"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>'
-    )
+    texts += [RICH] * 5
     part = "<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
-    values = ("1000000000", "1e-9", "0", "-1", "nan", "1e300", "1e-300", "", "x", "0 0 0", "inf", "4294967297", "../x")
+    values = (
+        "1000000000",
+        "1e-9",
+        "0",
+        "-1",
+        "nan",
+        "1e300",
+        "1e-300",
+        "",
+        "x",
+        "0 0 0",
+        "inf",
+        "4294967297",
+        "../x",
+        "2147483647",
+    )
 
     def change(chance: random.Random) -> Read:
         text = chance.choice(texts)
@@ -147,12 +192,20 @@ def models(folder: Path) -> Change:
                 text = '"'.join(pieces)
         elif how < 0.8:
             (folder / "part.xml").write_bytes(mutations.of_bytes(part.encode(), chance))
-            text = texts[-1]
+            text = RICH
         else:
             text = mutations.of_bytes(text.encode(), chance).decode("utf-8", "ignore")
         path = folder / "model.xml"
         path.write_text(text, encoding="utf-8")
-        return lambda: MjcfEnvironment.build(path, [], [], [])
+
+        def read() -> None:
+            model = compile_spec(load_spec(str(path)), str(path))
+            data = mujoco.MjData(model)
+            with quiet:
+                for _ in range(3):
+                    mujoco.mj_step(model, data)
+
+        return read
 
     return change
 

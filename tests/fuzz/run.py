@@ -154,7 +154,7 @@ def _work(first: int, step: int, last: int, chosen: list[str], base: int, out: C
     silent = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # what native code prints, too
         os.dup2(silent, stream)
-    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ |= {"OMP_NUM_THREADS": "1", "SIPE_MODEL_SECONDS": "2", "SIPE_MODEL_GIB": "2"}
     known = targets()
     order = schedule({name: known[name] for name in chosen or known})
     with tempfile.TemporaryDirectory(prefix="sipe-fuzz-") as folder:

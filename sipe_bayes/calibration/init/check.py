@@ -33,7 +33,7 @@ from sipe_bayes.calibration.init.windows import (
     tried_part,
 )
 from sipe_bayes.calibration.readers.tables import read_table
-from sipe_bayes.envs.mjcf import compile_spec, load_spec
+from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 
 _LOGS = 3  # that are simulated
 _BETTER = np.log(1.5)  # of the logarithm of misses together, from which another reading is named

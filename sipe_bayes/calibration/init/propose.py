@@ -35,7 +35,7 @@ from sipe_bayes.calibration.readers.many import episodes_of, matching
 from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.envs.mjcf import compile_spec, load_spec
+from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.poses import has_pose
 from sipe_bayes.likelihood.starts import estimate_states
 

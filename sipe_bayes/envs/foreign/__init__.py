@@ -1,0 +1,1 @@
+"""Models of others: read, tried and compiled so that whatever they do is one line."""
