@@ -1,14 +1,17 @@
 """Coverage and silent misses of `laplace` on StateSpace through contact, and what draws from its normal say of it.
 
-The Hopper of the registry, and three models of `models/` that are in none: a planar quadruped, a biped and a box that
-is pushed. Truths uniform in [0.1, 0.9]^N, 200 control steps of 8 ms (`--steps`), sums of sines as commands, white noise
-of the given share of each channel's spread, states withheld and starts unknown. A silent miss is a fit with a parameter
-more than five of its sds off and no blocking finding; an alarm on a right fit is a blocking finding where all are
-within three.
+The environments of the registry, and three models of `models/` that are in none: a planar quadruped, a biped and a box
+that is pushed. Truths uniform in [0.1, 0.9]^N, 200 control steps of 8 ms (`--steps`), sums of sines as commands, white
+noise of the given share of each channel's spread, states withheld and starts unknown. A silent miss is a fit with a
+parameter more than five of its sds off and no blocking finding; an alarm on a right fit is a blocking finding where all
+are within three.
 
-    python examples/studies/contact.py --model Hopper --level 0.01 --seeds 0 16   # two minutes of a core each
+    python examples/studies/contact.py --list                                      # the cells
+    python examples/studies/contact.py --select 'Hopper/0.01' --seeds 0 16         # two minutes of a core each
+    python examples/studies/contact.py --select 'pushed/*' 'biped/0.05'
 
-Fits are kept in runs/contact and an interrupted study goes on; each run writes the summary of all there are.
+Fits are kept in runs/contact and an interrupted study goes on; each run writes the summary of all there are. Coverage
+is of determined parameters, whose sd is less than half of the prior's; its standard error is clustered by log.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from fnmatch import fnmatch
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,10 +32,11 @@ from sipe_bayes.core.files import write_text
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.datasets import acting
+from sipe_bayes.envs.registry import TASKS
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "contact"
-DT = 0.008
+DT, LEVELS = 0.008, (0.01, 0.05)
 LEGS = ("front_hip", "front_knee", "hind_hip", "hind_knee")
 WALKS = ("left_hip", "left_knee", "right_hip", "right_knee")
 JOINTS = {
@@ -115,48 +120,60 @@ def one_fit(name: str, level: float, seed: int, steps: int) -> dict[str, Any]:
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Of one cell."""
     covered, z = np.array([r["covered"] for r in rows], float), np.abs([r["z"] for r in rows]).max(1)
+    known = np.array([r["sd"] for r in rows]) < 0.5 / np.sqrt(12)
     blocked = np.array([bool(r["blocking"]) for r in rows])
-    spread = float(covered.mean(1).std(ddof=1) / np.sqrt(len(rows))) if len(rows) > 1 else None
+    held, count, logs = (covered * known).sum(1), known.sum(1), len(rows)
+    share = float(held.sum() / max(1, count.sum()))
+    spread = np.sqrt(logs / (logs - 1) * ((held - share * count) ** 2).sum()) / count.sum() if logs > 1 else None
+    silent = ~blocked
     return {
+        "logs": logs,
         "seeds": [r["seed"] for r in rows],
         "mean_error": round(float(np.mean([r["error"] for r in rows])), 5),
         "mean_sd": round(float(np.mean([r["sd"] for r in rows])), 5),
-        "coverage_90": round(float(covered.mean()), 3),
-        "standard_error": None if spread is None else round(spread, 3),
-        "coverage_90_without_blocking": round(float(covered[~blocked].mean()), 3) if (~blocked).any() else None,
+        "determined": round(float(known.mean()), 3),
+        "coverage_90": round(share, 3),
+        "standard_error": None if spread is None else round(float(spread), 3),
+        "coverage_90_without_blocking": round(float(held[silent].sum() / count[silent].sum()), 3)
+        if count[silent].any()
+        else None,
         "fits_with_blocking": int(blocked.sum()),
-        "silent_misses": int(((z > 5) & ~blocked).sum()),
+        "blocking": sorted({code for r in rows for code in r["blocking"]}),
+        "silent_misses": int(((z > 5) & silent).sum()),
         "misses": int((z > 5).sum()),
+        "worst_silent_z": round(float(z[silent].max()), 1) if silent.any() else None,
         "alarms_on_right_fits": f"{int(((z < 3) & blocked).sum())} of {int((z < 3).sum())}",
         "processor_seconds_median": float(np.median([r["processor_seconds"] for r in rows])),
     }
 
 
 def main() -> None:
+    cells = [f"{name}/{level:g}" for level in LEVELS for name in [*TASKS, *UNKNOWN]]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", nargs="*", default=["Hopper", *UNKNOWN])
-    parser.add_argument("--level", type=float, nargs="*", default=[0.01])
-    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 16])
+    parser.add_argument("--select", nargs="*", default=["*"], help="cells, with wildcards")
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 40])
     parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--list", action="store_true", help="print the cells that are selected")
     given = parser.parse_args()
+    chosen = [cell for cell in cells if any(fnmatch(cell, pattern) for pattern in given.select)]
+    if given.list or not chosen:
+        print("\n".join(chosen or cells))
+        return
     file = RUNS / "fits.jsonl"
     for seed in range(*given.seeds):
-        for name in given.model:
-            for level in given.level:
-                which = {"model": name, "level": level, "steps": given.steps, "seed": seed}
-                if not any(which.items() <= row.items() for row in fits(file)):
-                    print(
-                        json.dumps(keep(file, one_fit(**{"name" if k == "model" else k: v for k, v in which.items()})))
-                    )
-    cells: dict[str, list[dict[str, Any]]] = {}
+        for name, level in (cell.split("/") for cell in chosen):
+            which = {"model": name, "level": float(level), "steps": given.steps, "seed": seed}
+            if not any(which.items() <= row.items() for row in fits(file)):
+                print(json.dumps(keep(file, one_fit(name, float(level), seed, given.steps))), flush=True)
+    by_cell: dict[str, list[dict[str, Any]]] = {}
     for row in fits(file):
-        cells.setdefault(f"{row['model']}, {row['level']:.0%}, {row['steps']} steps", []).append(row)
-    found = {
-        "command": f"python examples/studies/contact.py --seeds {given.seeds[0]} {given.seeds[1]}",
+        by_cell.setdefault(f"{row['model']}, {row['level']:.0%}, {row['steps']} steps", []).append(row)
+    table = {
+        "command": "python examples/studies/contact.py --select CELL --seeds FIRST END, for the logs of each cell",
         "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
-        "cells": {cell: summary(rows) for cell, rows in cells.items()},
+        "cells": {cell: summary(rows) for cell, rows in sorted(by_cell.items())},
     }
-    write_text(HERE / "results" / "contact.json", json.dumps(found, indent=2) + "\n")
+    write_text(HERE / "results" / "contact.json", json.dumps(table, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -54,6 +54,15 @@ class Optimum:
         gap = other.mean - self.mean
         return float(np.sqrt(gap @ np.linalg.solve(self.covariance, gap)))
 
+    def resembles(self, mean: FloatArray, covariance: FloatArray, tolerance: float) -> bool:
+        """Whether a normal's mean (N,) is as near, in sds, and its sds in any direction, as logarithms."""
+        root = np.linalg.cholesky(self.covariance)
+        gap = np.linalg.solve(root, mean - self.mean)
+        ratios = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, covariance).T))
+        return bool(
+            np.linalg.norm(gap) < tolerance and np.abs(0.5 * np.log(np.maximum(ratios, 1e-12))).max() < tolerance
+        )
+
 
 @dataclass(frozen=True)
 class SearchProblem:

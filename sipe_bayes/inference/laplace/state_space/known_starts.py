@@ -52,7 +52,7 @@ class KnownStartSearch(WideSearch[KnownStartState]):
     @property
     def step_rollouts(self) -> int:
         """Rollouts that a step takes."""
-        return (2 * (self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
+        return self.wide_step_rollouts
 
     def start(self) -> KnownStartState:
         """The first state: at the first starting point."""

@@ -58,6 +58,7 @@ class WideTuning(Options):
     """How steps by differences as long as the posterior is wide go; see ``posterior_linearisation``."""
 
     tolerance: float = option(0.5, "nats that a step must promise; less does not show in an interval", "nats", above=0)
+    alike: float = option(0.3, "how far the mean, and logs of the sds, differ of normals that are alike", "sd", above=0)
     steps: int = option(3, "steps between estimates of the noise", least=1)
     most_estimates: int = option(8, "estimates of the noise", least=1)
     settled: float = option(2.0, "gain below which a new noise does not matter", "nats", above=0)
@@ -93,7 +94,7 @@ class ShootingTuning(Options):
     window: int = option(8, "control steps of the first windows: hardly more than one impact", least=2)
     first: int = option(4, "control steps of their first beginnings", least=2)
     follows: float = option(3.0, "residual up to which longer windows count as following", "noise sds", above=0)
-    steps: int = option(15, "of the smoother for which it leaves room in the budget", least=1)
+    steps: int = option(20, "wide ones for which it leaves room in the budget: few searches take more", least=1)
     process: float = option(0.01, "process noise of the smoother that goes on from there", "of the movement", above=0)
     absorbed: float = option(
         0.1, "share of the samples that process noise explains, through contact, with which it is tried", above=0

@@ -3,8 +3,8 @@
 A control step jumps where a contact opens or closes. A short difference across such a jump is a slope of jump by
 length: one of them in a log outweighs all that the other steps say of a parameter, and its interval is a hundredth of
 what it should be. Differences as long as what is still open, with a variance for what no line can follow
-(``likelihood.state_space.differences``), do not see it. A search over a chain of states ends with them, whichever way
-it came to its optimum.
+(``likelihood.state_space.differences``), do not see it. A search over a chain of states ends with them where they say
+something else than short ones.
 """
 
 from __future__ import annotations
@@ -55,6 +55,11 @@ S = TypeVar("S", bound=ChainState[Any])
 
 class WideSearch(ChainSearch[S]):
     """A search with steps by such differences."""
+
+    @property
+    def wide_step_rollouts(self) -> int:
+        """Rollouts that a step takes."""
+        return (2 * (self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
 
     def _linearised(self, here: WidePosition) -> ChainLinearisation | None:
         """Over the surroundings that are open, after short differences first."""

@@ -9,8 +9,9 @@
 4. At an optimum, or where the noise does not settle, jumps that stand out become outliers (``outlying_jumps``) and the
    search goes on; from the optimum without them the filter tries to make do without outliers, and where that is
    likelier the search goes on from there, until it comes to nothing likelier.
-5. WIDEN: from the likeliest optimum on by differences as long as the posterior is wide (``posterior_linearisation``);
-   what these end in takes its place. Then the next starting point.
+5. WIDEN: where differences as long as the posterior is wide (``posterior_linearisation``) say something else of it than
+   short ones did, the search goes on with them; what these end in takes the optimum's place. Then the next starting
+   point.
 6. Where draws find that the best optimum is not the posterior's (``inference.importance.judged``), windows of the logs
    that grow (``shooting``) lead to further starting points.
 
@@ -49,7 +50,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
 )
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.differences import linearise
-from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 
 
 @dataclass(frozen=True)
@@ -136,9 +137,8 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         chain, tuning = self.chain, self.tuning.shooting
         begin = max(state.optima, key=lambda one: one.evidence).theta if not state.shots else state.points[0]
         state = replace(state, shots=state.shots + 1)
-        room = tuning.steps * self.step_rollouts + self.problem.options.tuning.importance.judges * len(
-            chain.trajectories
-        )
+        judges = 2 * self.problem.options.tuning.importance.judges  # of two optima
+        room = tuning.steps * self.wide_step_rollouts + judges * len(chain.trajectories)
         end = shot(self.problem, chain, begin, chain.budget - chain.rollouts - room)
         if end is None:
             return replace(state, uncounted=chain.uncounted)
@@ -300,9 +300,16 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         return state.at(replace(here, damping=damping, estimates=0, steps=0, estimate_theta=optimum.theta))
 
     def _widen(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
-        """The lengths of the first wide differences."""
+        """The lengths of wide differences; then whether these say anything else than short ones did."""
         noise = solvable(linear, state.here.noise)
-        return self.with_differences(state.at(replace(state.here, phase=Phase.NOISE)), linear, noise)
+        if not state.here.is_wide:
+            return self.with_differences(state, linear, noise)
+        solved = eliminate_states(linear, noise)
+        mean, covariance = self.problem.normal(state.here.theta, solved.precision, solved.gradient)
+        short = next((one for one in state.optima if one.point == state.point), None)
+        if short is not None and short.resembles(mean, covariance, self.tuning.wide.alike):
+            return state.next_point(self._begin)
+        return self.wide_noise(state, linear)
 
     def _candidates(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> BoolArray:
         """Jumps (K-1,) to propose: none that turned out to be no outlier, and none after a few times."""

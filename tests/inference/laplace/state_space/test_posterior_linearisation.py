@@ -29,7 +29,7 @@ def fitted() -> tuple[ChainOptimum, float]:
 def test_a_jump_within_a_short_difference_leaves_the_interval_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """At step 30 a velocity jumps within 1e-4 of theta: by itself that slope would tell theta to a tenth of its sd."""
     plain, sd = fitted()
-    assert plain.state_step.any()
+    assert not plain.state_step.any()  # short ones say the same
     short = differences.linearise
 
     def torn(*of: Any, **more: Any) -> Any:
@@ -43,6 +43,7 @@ def test_a_jump_within_a_short_difference_leaves_the_interval_as_it_is(monkeypat
     monkeypatch.setattr(search, "linearise", torn)
     optimum, same = fitted()
     print(plain.theta, sd, optimum.theta, same)
+    assert optimum.state_step.any()
     assert same == pytest.approx(sd, rel=0.2)
     assert abs(optimum.mean[0] - plain.mean[0]) < 0.3 * sd
 

@@ -78,7 +78,7 @@ def test_a_jump_that_stands_out_is_an_outlier() -> None:
     assert none == []
     assert len(outliers) == 2
     assert np.abs(np.array(outliers) - [20, 121 + 20]).max() <= 2
-    assert sd < 2.5 * usual
+    assert sd < 2 * usual
     assert abs(mean - (12.0 - LOW) / (HIGH - LOW)) < 3 * sd
     chains = MCMC(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
     sampled = chains.fit(kicked_logs())
