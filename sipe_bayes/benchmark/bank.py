@@ -69,8 +69,9 @@ class _Blocks(Cache):
         """The first rows of a block, read or made."""
         self._blocks = [self._none()] * number
         self._blocks.append(self._read(number) or self._none())
-        made = self._blocks[number]
-        return made if len(made) >= rows else self._extended(number, rows)
+        if len(self._blocks[number]) < rows:
+            self._extend({number: rows})
+        return self._blocks[number]
 
     def path(self, number: int) -> str:
         """Of a block, in the folder of results."""

@@ -42,6 +42,7 @@ def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None
         "model_sha256": problem.simulator.checksum(),  # compiled: with included files and meshes
         "prior_sha256": _checksum(Path(f"{config.prior.source}.safetensors")) if config.prior else "",
         "logs_sha256": {report.name: report.sha256 for report in problem.reports},
+        "device": problem.simulator.device,
         "estimator": estimator,
         "seed": seed,
         "budget": budget,

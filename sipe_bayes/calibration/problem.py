@@ -88,12 +88,13 @@ class Problem:
         return Segments(_SCORED, "white", self.likelihood.fit, self.likelihood.noise_sd, windows)
 
 
-def prepare(config: Config | str | Path, num_threads: int | None = None) -> Problem:
+def prepare(config: Config | str | Path, num_threads: int | None = None, device: str = "cpu") -> Problem:
     """Read the model and the logs of a configuration.
 
     Args:
         config: or its file.
         num_threads: native ones of the simulator; default all cores.
+        device: that it simulates on, as ``Simulator`` has them.
 
     Raises:
         ConfigError: for a configuration that cannot be used.
@@ -123,7 +124,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None) -> Prob
     return Problem(
         config,
         environment,
-        Simulator(environment, num_threads),
+        Simulator(environment, num_threads, device),
         _likelihood(config),
         prior,
         Trajectories.stack(train),

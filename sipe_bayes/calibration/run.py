@@ -351,6 +351,7 @@ def run(
     out: Path | None = None,
     num_threads: int | None = None,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> Calibration:
     """What the command does: read, claim the output folder, fit with a checkpoint, write everything.
 
@@ -364,11 +365,12 @@ def run(
         out: folder of the results; default runs/NAME-ESTIMATOR.
         num_threads: native ones; default all cores.
         progress: called along the way.
+        device: that it simulates on, as ``Simulator`` has them.
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.
     """
-    problem = prepare(config, num_threads)
+    problem = prepare(config, num_threads, device)
     name = estimator or problem.config.estimator
     method_of(problem, name, seed, budget)
     bind(problem.likelihood, problem.simulator, problem.train)

@@ -89,6 +89,7 @@ def study_of_task(
     refits: int,
     seed: int,
     threads: int | None,
+    device: str = "cpu",
 ) -> Study:
     """A benchmark task: one demonstration's commands and start.
 
@@ -104,11 +105,12 @@ def study_of_task(
         refits: of ``Recalibrated``, or 0.
         seed: of log, truths, noise and fits.
         threads: native ones; default all cores.
+        device: that it simulates on, as ``Simulator`` has them.
     """
-    simulator = Simulator(make_task(name), threads)
+    simulator = Simulator(make_task(name), threads, device)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        log = demonstrations(simulator, count=1, seed=seed, steps=steps)
+        log = demonstrations(simulator.on_processor, count=1, seed=seed, steps=steps)
     sd = noise * log.observations[0].std(0)
     searches = estimator_class(estimator).searches
     likelihood: Segments | StateSpace
@@ -122,7 +124,14 @@ def study_of_task(
 
 
 def study_of_config(
-    path: Path, estimator: str, *, budget: int | None, refits: int, seed: int, threads: int | None
+    path: Path,
+    estimator: str,
+    *,
+    budget: int | None,
+    refits: int,
+    seed: int,
+    threads: int | None,
+    device: str = "cpu",
 ) -> Study:
     """The model, commands, starts and prior of a configuration, with the noise that ``laplace`` finds in its logs.
 
@@ -135,8 +144,9 @@ def study_of_config(
         refits: of ``Recalibrated``, or 0.
         seed: of truths, noise and fits.
         threads: native ones; default all cores.
+        device: that it simulates on, as ``Simulator`` has them.
     """
-    problem = prepare(path, threads)
+    problem = prepare(path, threads, device)
     method = method_of(problem, estimator, seed, budget)
     fitted = fitted_noise(problem.simulator, problem.likelihood, problem.train, problem.prior, budget=_NOISE_BUDGET)
     return Study(str(path), method, problem.train, fitted.noise, refits, seed, fitted.process)

@@ -20,6 +20,7 @@ from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
+from sipe_bayes.cli.check import SimulatedOn
 from sipe_bayes.cli.errors import check_least, check_words, exit_on_error
 from sipe_bayes.cli.examples import give_examples
 from sipe_bayes.core import __version__
@@ -99,6 +100,7 @@ def calibrate(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+    device: SimulatedOn = "cpu",
 ) -> None:
     """Posterior of a simulator's parameters from logs of the real machine."""
     from sipe_bayes.calibration.discover import run_discovery
@@ -108,7 +110,7 @@ def calibrate(
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        calibration = run(config, estimator, seed, budget, out, threads, progress)
+        calibration = run(config, estimator, seed, budget, out, threads, progress, device)
         discovery = None
         if discover:
             folder = Path(calibration.out) / "discover"

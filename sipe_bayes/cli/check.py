@@ -13,6 +13,10 @@ from sipe_bayes.cli.errors import exit_on_error
 from sipe_bayes.core.validation import at_least, whole
 from sipe_bayes.inference.registry import ESTIMATORS
 
+SimulatedOn = Annotated[
+    str, typer.Option("--device", help="cpu; or cuda, cuda:1: rollouts in float32 on a GPU, with the extra gpu.")
+]
+
 _TIMED = 3  # logs after which the time of all is told where there is no line that changes
 
 
@@ -31,6 +35,7 @@ def check(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+    device: SimulatedOn = "cpu",
 ) -> None:
     """Simulation-based calibration: do the estimator's intervals hold the truth on this model, noise and commands?
 
@@ -54,7 +59,7 @@ def check(
             if path.suffix == ".toml"
             else partial(study_of_task, target, steps=steps, noise=noise)
         )
-        study = make(estimator, budget=budget, refits=refits, seed=seed, threads=threads)
+        study = make(estimator, budget=budget, refits=refits, seed=seed, threads=threads, device=device)
         folder = out or Path("checks") / f"{run_name(path)}-{estimator}{f'-recalibrated{refits}' if refits else ''}"
         once, each = study.cost
         trained = f"one training of {once} rollouts, then " * bool(once)

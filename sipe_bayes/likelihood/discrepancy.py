@@ -69,6 +69,7 @@ def simulate(windows: Windows, theta: FloatArray) -> FloatArray:
     Raises:
         BudgetExhausted: instead of simulating beyond the budget.
     """
-    starts, batches = windows.no_starts(), np.split(theta, range(32, len(theta), 32))
+    together = max(32, windows.simulator.wave(windows.actions.shape[1]) // windows.num_windows)
+    starts, batches = windows.no_starts(), np.split(theta, range(together, len(theta), together))
     parts = [windows.predict(rows, np.broadcast_to(starts, (len(rows), *starts.shape)))[0] for rows in batches]
     return np.concatenate(parts)

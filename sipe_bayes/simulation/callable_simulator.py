@@ -125,6 +125,10 @@ class CallableSimulator:
             np.stack([np.zeros(size), values]), np.zeros((1, 0)), 1.0, name="x", channels=self.environment.channels
         )
 
+    def wave(self, horizon: int) -> int:
+        """As ``Simulator.wave``: it does not matter."""
+        return 1
+
     def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:
         """As ``Simulator.replay`` of theta (B, N) and R observed x: B * R trajectories of one step; no starts."""
         theta, count = np.atleast_2d(np.asarray(theta, float)), len(trajectories)

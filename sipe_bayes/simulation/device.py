@@ -52,6 +52,10 @@ class Device(Protocol):
     def own_slots(self) -> bool:
         """Whether each simulation needs a slot of the pool to itself."""
 
+    @property
+    def wave(self) -> int:
+        """How many simulations cost about as much as one, together."""
+
     def most(self, horizon: int, skip: int) -> int:
         """How many simulations of ``horizon`` control steps of ``skip`` physics steps memory holds at once."""
 
@@ -69,6 +73,8 @@ class Processor:
 
     def __init__(self, engine: Engine, pool: ModelPool) -> None:
         self.engine, self.pool = engine, pool
+
+    wave = 1
 
     @property
     def own_slots(self) -> bool:

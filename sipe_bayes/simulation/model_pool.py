@@ -94,7 +94,7 @@ class ModelPool:
         """``model``, or else a new copy, with theta (N,); raises ValueError for an unphysical one, nothing written."""
         self.check_physical(theta)
         model = copy.copy(self.model) if model is None else model
-        self._write(model, theta, float(self.model.opt.timestep), None)
+        self._write(model, self._values(theta), float(self.model.opt.timestep), None)
         return model
 
     @cached_property
@@ -113,8 +113,9 @@ class ModelPool:
         if slot.key == key:
             return
         slot.key = b""
-        slot.physical = self._write(slot.model, theta, timestep, log)
-        slot.sensing = self.environment.sensing(self._values(theta), log)
+        values = self._values(theta)
+        slot.physical = self._write(slot.model, values, timestep, log)
+        slot.sensing = self.environment.sensing(values, log)
         self.keep(index)
         slot.key = key
 
@@ -122,9 +123,9 @@ class ModelPool:
         # a number at a time: the last bit of a vectorised exponential may depend on the length of the batch
         return np.array([p.value(t) for p, t in zip(self.environment.space, theta.tolist(), strict=True)])
 
-    def _write(self, model: mujoco.MjModel, theta: FloatArray, timestep: float, log: str | None) -> bool:
-        """Write theta (N,) and return whether it is physical."""
-        physical = self.environment.write(model, self._values(theta), log)
+    def _write(self, model: mujoco.MjModel, values: FloatArray, timestep: float, log: str | None) -> bool:
+        """Write values (N,) and return whether they are physical."""
+        physical = self.environment.write(model, values, log)
         model.opt.timestep = timestep
         if physical and self.environment.needs_constants:
             mujoco.mj_setConst(model, self._scratch)

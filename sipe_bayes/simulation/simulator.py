@@ -31,6 +31,8 @@ from sipe_bayes.simulation.device import Batch, Device, Processor
 from sipe_bayes.simulation.engine import HUGE, Engine
 from sipe_bayes.simulation.episodes import Episodes, Step
 
+_WAVE_NUMBERS = 2**26  # of states and observations that are asked for at once, 512 MiB
+
 
 class Simulator(Simulated):
     """Simulates an Environment for batches of theta. Not for two Python threads at a time.
@@ -63,6 +65,11 @@ class Simulator(Simulated):
     def on_processor(self) -> Simulator:
         """The same in float64 on the processor."""
         return self if self.device == "cpu" else Simulator(self.environment, self.num_threads)
+
+    def wave(self, horizon: int) -> int:
+        """How many rollouts of ``horizon`` control steps it is best asked for at once; 1 where that does not matter."""
+        width = (horizon + 1) * (self.state_size + len(self.environment.channels))
+        return max(1, min(self.runs.wave, _WAVE_NUMBERS // width))
 
     def checksum(self) -> str:
         """That of the compiled default model, and of the device where it is not the processor."""

@@ -37,6 +37,7 @@ def nothing(folder: Path) -> None:
 # what is wrong: (change, more arguments, words of the one line: argument, value, remedy)
 WRONG: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
     "missing config": (gone("config.toml"), [], ["config.toml", "no such file", "correct the path"]),
+    "unknown device": (nothing, ["--device", "tpu"], ["device", "'cpu', 'cuda'", "got 'tpu'"]),
     "missing log": (gone("log.csv"), [], ["log 'log'", "log.csv: no such file", "correct the path"]),
     "misspelt log": (text('"log.csv"', '"lag.csv"'), [], ["lag.csv: no such file", "did you mean 'log.csv'?"]),
     "missing model": (text("pendulum.xml", "pendulm.xml"), [], ["key `model`", "did you mean 'pendulum.xml'?"]),

@@ -172,8 +172,9 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         most = self._affordable(trajectories, state.before)
         if state.simulated >= most:
             return replace(self._trained(state, trajectories), done=True)
-        count = min(state.simulated + BLOCK, most)
-        self.prior_simulations(trajectories).first(count)
+        cache = self.prior_simulations(trajectories)
+        count = min(state.simulated + max(BLOCK, cache.wave), most)
+        cache.first(count)
         self.rollouts = state.before + count * len(trajectories)
         return replace(state, simulated=count)
 

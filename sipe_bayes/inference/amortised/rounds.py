@@ -110,9 +110,10 @@ class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
             posterior = self.infer(state.learned.content, trajectories)  # type: ignore[union-attr]  # just trained
             return replace(state, round=state.round + 1, proposed=self._propose(posterior, state.round, wanted))
         # within a round: a block of the prior's simulations, or of what was proposed
-        count = min(BLOCK, until - state.simulated)
+        cache = self.prior_simulations(trajectories)
+        count = min(max(BLOCK, cache.wave), until - state.simulated)
         if state.proposed is None:
-            self.prior_simulations(trajectories).first(state.simulated + count)
+            cache.first(state.simulated + count)
         else:
             rng = np.random.default_rng([self.seed, 2, state.simulated])
             made = self.simulate(state.proposed[:count], trajectories, rng)

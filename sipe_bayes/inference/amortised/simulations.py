@@ -102,12 +102,12 @@ class Cache:
     def first(self, count: int) -> Simulations:
         """The first ``count`` rows, simulating what is not there yet."""
         blocks = (count + BLOCK - 1) // BLOCK
-        for k in range(blocks):
-            want = min(BLOCK, count - k * BLOCK)
-            if k == len(self._blocks):
-                self._blocks.append(self._read(k) or self._none())
-            if len(self._blocks[k]) < want:
-                self._blocks[k] = self._extended(k, want)
+        self._blocks += [self._read(k) or self._none() for k in range(len(self._blocks), blocks)]
+        rows = [(k, min(BLOCK, count - k * BLOCK)) for k in range(blocks)]
+        short = [(k, wanted) for k, wanted in rows if len(self._blocks[k]) < wanted]
+        together = max(1, self.wave // BLOCK)
+        for begin in range(0, len(short), together):
+            self._extend(dict(short[begin : begin + together]))
         return Simulations.joined(self._blocks[:blocks])[:count]
 
     def _none(self) -> Simulations:
@@ -119,11 +119,19 @@ class Cache:
         theta: FloatArray = self.prior.sample((BLOCK,), generator=torch_generator([self.seed, block])).numpy()
         return theta
 
-    def _extended(self, block: int, rows: int) -> Simulations:
-        old = self._blocks[block]
-        whole = Simulations.joined((old, self.simulate(self.drawn(block)[len(old) : rows])))
-        self._write(block, whole)
-        return whole
+    @property
+    def wave(self) -> int:
+        """Rows that are best simulated at once."""
+        return self.simulator.wave(self.trajectories.actions.shape[1]) // len(self.trajectories)
+
+    def _extend(self, blocks: dict[int, int]) -> None:
+        """Simulate what blocks lack of so many rows, together."""
+        lacking = [self.drawn(k)[len(self._blocks[k]) : wanted] for k, wanted in blocks.items()]
+        made = self.simulate(np.concatenate(lacking))
+        ends = np.cumsum([len(theta) for theta in lacking])
+        for k, theta, end in zip(blocks, lacking, ends.tolist(), strict=True):
+            self._blocks[k] = Simulations.joined((self._blocks[k], made[end - len(theta) : end]))
+            self._write(k, self._blocks[k])
 
     def simulate(self, theta: FloatArray) -> Simulations:
         """Simulations of any theta (n, N), which are not kept."""

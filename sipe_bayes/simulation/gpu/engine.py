@@ -31,6 +31,7 @@ _LARGEST = 4096  # contacts of a world, and rows of constraints
 _SIZES = 2  # numbers of worlds that stay on the device
 _SHARE, _HOST = 0.4, 2**30  # of the card's free memory, and bytes where the device is the processor
 _MOST = 2**16  # worlds
+_LEAST = 512  # worlds on a GPU, where fewer take as long
 
 
 class GpuEngine:
@@ -45,6 +46,7 @@ class GpuEngine:
     """
 
     own_slots = False
+    wave = 4096
 
     def __init__(self, engine: Engine, device: str) -> None:
         environment = engine.environment
@@ -74,7 +76,7 @@ class GpuEngine:
     def advance(self, batch: Batch) -> Motion:
         """See ``Device``; states are as they were last where a simulation is no longer valid."""
         start, commands = batch.start, self.environment.control(self.engine.model, batch.start, batch.actions)
-        count = padded(len(start))
+        count = padded(len(start), _LEAST if warp.get_device(self.device).is_cuda else 1)
         index = np.minimum(np.arange(count), len(start) - 1)
         rows = self.pool.rows(batch.slots[index])
         given = np.ascontiguousarray(commands[index].swapaxes(0, 1), np.float32)
@@ -126,10 +128,9 @@ class GpuEngine:
         return True
 
 
-def padded(count: int) -> int:
-    """The least of 1, 2, 3, 4, 6, 8, 12, 16, ... that holds ``count``."""
-    power = 1 << (count - 1).bit_length()
-    return 3 * power // 4 if power >= 4 and count <= 3 * power // 4 else power
+def padded(count: int, least: int) -> int:
+    """The smallest power of two that holds ``count``, and ``least``."""
+    return max(least, 1 << (count - 1).bit_length())
 
 
 def first_capacity(model: mujoco.MjModel) -> Capacity:

@@ -84,12 +84,13 @@ class FieldPool(ModelPool):
         different: dict[Field, None] = {}
         places: FloatArray | None = None
         for theta in _examples(len(self.environment.space)):
-            if not self._write(model, theta, float(self.model.opt.timestep), None):
+            values = self._values(theta)
+            if not self._write(model, values, float(self.model.opt.timestep), None):
                 continue
             if not first:
-                self._write(base, theta, float(self.model.opt.timestep), None)
+                self._write(base, values, float(self.model.opt.timestep), None)
                 first = {field: field.of(model).copy() for field in _fields(model)}
-            changed = [field for field, values in first.items() if not np.array_equal(values, field.of(model))]
+            changed = [field for field, own in first.items() if not np.array_equal(own, field.of(model))]
             different |= dict.fromkeys(changed)
             for field in changed:
                 _fill(base, field, model)
