@@ -56,6 +56,9 @@ class GpuEngine:
         names = tuple(environment.data_fields) if environment.data_fields else ("sensordata",)
         derived = names if environment.needs_derived else ()
         late = environment.derived_late or bool(environment.data_fields)
+        place = warp.get_device(device)
+        self._memory = int(_SHARE * place.free_memory) if place.is_cuda else _HOST
+        self._least = _LEAST if place.is_cuda else 1
         self.recipe = Recipe(self.pool.base, environment.control_spec, derived, late, bool(environment.data_fields))
         self.capacity = first_capacity(engine.model)
         self._worlds: OrderedDict[int, Worlds] = OrderedDict()
@@ -68,15 +71,13 @@ class GpuEngine:
 
     def most(self, horizon: int, skip: int) -> int:
         """See ``Device``."""
-        device = warp.get_device(self.device)
-        memory = int(_SHARE * device.free_memory) if device.is_cuda else _HOST
         state = self.engine.physics_size + self.engine.derived_size + int(self.engine.model.nu) + 1
-        return max(1, min(_MOST, memory // (_SIZES * (2 * self._bytes + 4 * (horizon + 1) * state))))
+        return max(1, min(_MOST, self._memory // (_SIZES * (2 * self._bytes + 4 * (horizon + 1) * state))))
 
     def advance(self, batch: Batch) -> Motion:
         """See ``Device``; states are as they were last where a simulation is no longer valid."""
         start, commands = batch.start, self.environment.control(self.engine.model, batch.start, batch.actions)
-        count = padded(len(start), _LEAST if warp.get_device(self.device).is_cuda else 1)
+        count = padded(len(start), self._least)
         index = np.minimum(np.arange(count), len(start) - 1)
         rows = self.pool.rows(batch.slots[index])
         given = np.ascontiguousarray(commands[index].swapaxes(0, 1), np.float32)
