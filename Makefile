@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt
 
-.PHONY: demo test fuzz bench studies docs wheel-check clean
+.PHONY: demo test fuzz faults bench studies docs wheel-check clean
 .DEFAULT_GOAL := test
 
 $(READY): pyproject.toml constraints.txt
@@ -31,6 +31,10 @@ test: $(READY)
 # changed files and odd options: 100,000 cases; FUZZ=--target for some, --seed N for one that failed
 fuzz: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run $(FUZZ)
+
+# commands that are killed, interrupted, left without disk or log: ten kills of each; FAULTS=--command for some
+faults: $(READY)
+	$(BIN)/python -m tests.fuzz.faults $(FAULTS)
 
 bench: $(READY)
 	$(BIN)/python tests/bench/bench.py

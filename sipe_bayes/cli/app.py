@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.check import SimulatedOn
-from sipe_bayes.cli.errors import check_least, check_words, exit_on_error
+from sipe_bayes.cli.errors import INTERRUPTED, check_least, check_words, exit_on_error, say_interrupted, was_said
 from sipe_bayes.cli.examples import give_examples
 from sipe_bayes.core import __version__
 from sipe_bayes.inference.progress_bar import ProgressBar
@@ -54,14 +55,16 @@ _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 def main() -> None:
     """Entry point: input errors are one line on standard error and exit code 2."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C, workers too
+    was_said()  # of an earlier call in this process
     try:
         with exit_on_error():
             check_words(sys.argv[1:])
         code = app(standalone_mode=False)
     except typer.Exit as ended:
         code = ended.exit_code
-    except typer.Abort:
-        code = 1
+    except (typer.Abort, KeyboardInterrupt):  # before or after what ``exit_on_error`` sees to
+        code = INTERRUPTED
     except _REFUSED as error:
         message = error.format_message()
         if not message or "\n" in message:  # the help, where a command was given nothing
@@ -69,6 +72,10 @@ def main() -> None:
         else:
             print(f"sipe: {message[:1].lower()}{message[1:].rstrip('.')}; see --help of the command", file=sys.stderr)
         code = error.exit_code
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    if code == INTERRUPTED and not was_said():
+        say_interrupted("; the same command begins again")
     sys.exit(code or 0)
 
 

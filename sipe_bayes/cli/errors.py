@@ -15,10 +15,15 @@ from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 BAD_INPUT = 2
 """Exit code where input is at fault."""
 _LONGEST = 1000  # characters of a word of the command line
-_INTERRUPTED = 130  # exit code, as shells have it for SIGINT
+_said: list[str] = []  # of an interruption
+INTERRUPTED = 130  # exit code, as shells have it for SIGINT
+_SPACE = "free some space, or raise the limit on the size of files, and the same command goes on"
 _REMEDIES = {
     errno.EACCES: "make it writable, or choose another folder",
-    errno.ENOSPC: "free some space, and the same command goes on",
+    errno.ENOSPC: _SPACE,
+    errno.EDQUOT: _SPACE,
+    errno.EFBIG: _SPACE,
+    errno.EIO: _SPACE,
     errno.ENOENT: "look at the name, or choose another folder",
 }
 
@@ -46,8 +51,21 @@ def exit_on_error(then: str = "") -> Iterator[None]:
         print("sipe: more memory is asked for than there is; ask for less, or use a larger machine", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
     except KeyboardInterrupt:
-        print(f"sipe: interrupted{then}", file=sys.stderr)
-        raise typer.Exit(_INTERRUPTED) from None
+        say_interrupted(then)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def say_interrupted(then: str) -> None:
+    """Say it, for ``was_said`` too."""
+    _said.append(then)
+    print(f"sipe: interrupted{then}", file=sys.stderr)
+
+
+def was_said() -> bool:
+    """Whether the command itself said that it was interrupted; it does not where it had not begun."""
+    said = bool(_said)
+    _said.clear()
+    return said
 
 
 def _text(error: Exception) -> str:

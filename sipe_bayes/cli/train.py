@@ -70,7 +70,7 @@ def train(
     **settings: object,
 ) -> None:
     """Train an agent by DDPG: expert, suboptimal agent and their cards, learning curve, checkpoint."""
-    with exit_on_error():
+    with exit_on_error("; with --resume the same command goes on"):
         import torch
 
         from sipe_bayes.core.trajectory import Trajectories

@@ -6,6 +6,7 @@ can cause into one line, and bounded before anything is allocated for what a fil
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -38,6 +39,10 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
