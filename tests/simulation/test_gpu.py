@@ -110,6 +110,17 @@ def test_more_contacts_than_there_is_room_for(arm: Simulator, monkeypatch: pytes
     assert small.runs.capacity.contacts > 1  # type: ignore[attr-defined]
 
 
+def test_bodies_that_a_constraint_joins() -> None:
+    """For such constraints mujoco-warp takes the velocities of the step before, unless it gets those of the state."""
+    simulator = Simulator(Case(JOINED, LIGHT, ("motor",), HINGE).environment(), 1, DEVICE)
+    start = simulator.default_state()
+    start[3:] = 4.0, 4.0
+    theta, actions = np.array([[0.2], [0.8]]), np.full((1, 4, 1), 0.3)
+    single, again, double = (s.rollout(theta, actions, start) for s in (simulator, simulator, simulator.on_processor))
+    np.testing.assert_array_equal(single.states, again.states)
+    assert error(single, double).max() < BOUND
+
+
 def test_an_estimator_takes_either_engine_and_says_how_far_they_agree(arm: Simulator) -> None:
     exact, _, actions, starts = drawn(1)
     log = exact.rollout(np.full((1, 4), 0.4), actions, starts)
@@ -132,6 +143,13 @@ def test_what_differentiates_stays_in_float64(arm: Simulator) -> None:
     assert Code.ON_PROCESSOR not in fits[0].findings
 
 
+JOINED = """<mujoco><option timestep="0.004"/><worldbody>
+  <body name="left"><joint name="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/>
+  </body><body name="right" pos=".2 0 0"><joint name="other" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/></body></worldbody>
+  <equality><connect body1="left" body2="right" anchor="0 0 -.4"/></equality>
+  <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+LIGHT = (p("mass", 0.5, 2, "body:left.mass"),)
 PID = PENDULUM.replace("<motor", "<pid input='pos' kp='3' kv='1'")
 SOLVER = PENDULUM.replace("<option", '<option solver="PGS"')
 LAW = Case(PENDULUM, (p("stribeck", 0, 1, "joint:hinge.stribeck"),), ("motor",), HINGE)
@@ -142,6 +160,7 @@ LAW = Case(PENDULUM, (p("stribeck", 0, 1, "joint:hinge.stribeck"),), ("motor",),
     [
         (Case(PID, (p("m", 0.5, 2, "body:rod.mass"),), ("motor",), HINGE), "pid actuators, and 'motor' is one"),
         (Case(SOLVER, (p("m", 0.5, 2, "body:rod.mass"),), ("motor",), HINGE), "PGS"),
+        (Case(JOINED.replace("<option", '<option integrator="RK4"'), LIGHT, ("motor",), HINGE), "Runge-Kutta"),
     ],
 )
 def test_what_it_can_not_simulate_is_refused_by_name(case: Case, what: str) -> None:

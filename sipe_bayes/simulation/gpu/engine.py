@@ -19,7 +19,7 @@ from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
 from sipe_bayes.simulation.device import Batch
 from sipe_bayes.simulation.engine import HUGE, Engine, Motion
 from sipe_bayes.simulation.gpu.fields import FieldPool
-from sipe_bayes.simulation.gpu.unsupported import Unsupported, check_supported
+from sipe_bayes.simulation.gpu.unsupported import Unsupported, check_supported, joined
 from sipe_bayes.simulation.gpu.worlds import Capacity, Recipe, Recording, Worlds, bytes_of_a_world
 
 _BITS = mujoco_warp.OverflowType
@@ -59,7 +59,9 @@ class GpuEngine:
         place = warp.get_device(device)
         self._memory = int(_SHARE * place.free_memory) if place.is_cuda else _HOST
         self._least = _LEAST if place.is_cuda else 1
-        self.recipe = Recipe(self.pool.base, environment.control_spec, derived, late, bool(environment.data_fields))
+        self.recipe = Recipe(
+            self.pool.base, joined(engine.model), environment.control_spec, derived, late, bool(environment.data_fields)
+        )
         self.capacity = first_capacity(engine.model)
         self._worlds: OrderedDict[int, Worlds] = OrderedDict()
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.simulation.engine import Engine
@@ -41,8 +42,19 @@ def check_supported(environment: Environment, engine: Engine) -> None:
         if int(model.actuator_gaintype[index]) == pid:
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, index) or str(index)
             raise Unsupported(f"mujoco-warp has no pid actuators, and {name!r} is one")
+    if joined(model) and int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4):
+        raise Unsupported(
+            "between the stages of a Runge-Kutta step mujoco-warp takes old velocities for connect and weld "
+            'constraints; or give the model integrator="implicitfast"'
+        )
     if int(model.opt.solver) == int(mujoco.mjtSolver.mjSOL_PGS):
         raise Unsupported('mujoco-warp has no PGS solver, which the model asks for; or give it solver="Newton"')
+
+
+def joined(model: mujoco.MjModel) -> bool:
+    """Whether the model has constraints that join bodies (connect, weld)."""
+    kinds = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+    return bool(np.isin(model.eq_type, [int(kind) for kind in kinds]).any())
 
 
 def _name(environment: Environment) -> str:

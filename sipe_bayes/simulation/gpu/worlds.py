@@ -44,6 +44,7 @@ class Recipe:
 
     Args:
         model: decides which terms there are.
+        joined: whether constraints join bodies, for which mujoco-warp takes velocities that it computes only later.
         controls: mjtState bits of the commands.
         derived: arrays of MjData that are recorded beside the state.
         late: whether they belong to the state before the last physics step, else before the first of the next.
@@ -51,6 +52,7 @@ class Recipe:
     """
 
     model: mujoco.MjModel
+    joined: bool
     controls: int
     derived: tuple[str, ...]
     late: bool
@@ -133,16 +135,14 @@ class Worlds:
             graph = self._graph(skip, start)
             self._commands[:horizon].assign(commands)
             if self.recipe.resting:
-                mujoco_warp.forward(self.model, self.data)
-                self._keep(self._derived, self._kept_derived, 0)
+                self._forward()
             for _ in range(horizon):
                 if graph is None:
                     self._control_step(skip)
                 else:
                     warp.capture_launch(graph)
             if self.recipe.derived and not self.recipe.late:
-                mujoco_warp.forward(self.model, self.data)
-                self._keep(self._derived, self._kept_derived, 0)
+                self._forward()
             recorded = (self._kept, self._kept_derived, self._flags)
             states, derived, flags = (kept[: horizon + 1].numpy() for kept in recorded)
         states[0] = start
@@ -195,11 +195,18 @@ class Worlds:
             self._begin(start)
         return self._graphs[skip]
 
+    def _forward(self) -> None:
+        """Record what is derived of the state, without a step."""
+        self._know_velocities()
+        mujoco_warp.forward(self.model, self.data)
+        self._keep(self._derived, self._kept_derived, 0)
+
     def _control_step(self, skip: int) -> None:
         late = self.recipe.late
         for part in self._command:
             self._launch(stream_in, part.values, self._moment, self._commands, part.first, part.values)
         for k in range(skip):
+            self._know_velocities()
             mujoco_warp.step(self.model, self.data)
             if k == 0 and not late:
                 self._keep(self._derived, self._kept_derived, 0)
@@ -213,6 +220,12 @@ class Worlds:
         self._keep(self._state, self._kept, 1)
         warp.launch(keep_flags, dim=self.count, inputs=[self._moment, self.data.overflow, self._flags])
         warp.launch(tick, dim=1, inputs=[self._moment])
+
+    def _know_velocities(self) -> None:
+        """Bodies' velocities as the state has them, where constraints between bodies take them before a step does."""
+        if self.recipe.joined:
+            for known in (mujoco_warp.kinematics, mujoco_warp.com_pos, mujoco_warp.com_vel):
+                known(self.model, self.data)
 
     def _keep(self, columns: list[_Columns], kept: warp.array, shift: int) -> None:
         for part in columns:
