@@ -10,6 +10,7 @@ import errno
 import json
 import math
 import os
+import re
 import uuid
 import zipfile
 from collections.abc import Iterator
@@ -87,6 +88,11 @@ def reading(path: object, what: str, remedy: str, kind: type[ValueError] = FileE
         if isinstance(error, FileNotFoundError) and error.errno is None:  # in our words
             raise
         raise kind(f"{path}: cannot be read as {what} ({reason(error)}); {remedy}") from error
+
+
+def shortened(text: str) -> str:
+    """A line in which no word is longer than anybody reads."""
+    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...", text)
 
 
 def reason(error: Exception) -> str:
