@@ -5,10 +5,11 @@
     python examples/studies/wrong_models.py --seeds 0             # the tables of what there is
 
 The machines of ``discover.py`` (a pendulum, a double pendulum, a slide; masses and damping unknown, truths drawn in
-.2 to .8 of their ranges), six logs of 5 s with commands of different sizes, .5 % noise. Planted at a joint, of a tenth
-of the joint's usual force: friction under load, a delay of two samples, dry friction that differs by direction, dry
-friction, backlash (3 % of what the joint moves) and compliance; and nothing. Each is fitted twice: with the library
-as it is, and without the planted extension in it (``unknown``), as where nobody has thought of what is missing.
+.2 to .8 of their ranges), six logs of 5 s with commands of different sizes, .5 % noise, as large in each. Planted at
+a joint, of a tenth of the joint's usual force: friction under load, a delay of two samples, dry friction that differs
+by direction, dry friction, backlash (3 % of what the joint moves) and compliance; and nothing. Each is fitted twice:
+with the library as it is, and without the planted extension in it (``unknown``), as where nobody has thought of what is
+missing.
 
 Coverage is that of 90 % intervals, pooled over parameters: plain ones, those for a further log from the spread between
 the logs alone, and those with what the model lacks, which stand first where the residuals raise an alarm or the logs
@@ -84,12 +85,12 @@ def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndar
         engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)
         own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine), strict=True)]
         theta, start = np.concatenate([truth, own]), engine.default_state()[None]
+    clean = [engine.rollout(theta[None], command[None], start, DT) for command in actions]
+    sd = 0.005 * np.sqrt(np.mean([(one.observations[0] ** 2).mean(0) for one in clean], axis=0))  # one sensor's
     logs = []
-    for k, command in enumerate(actions):
-        clean = engine.rollout(theta[None], command[None], start, DT)
-        sd = 0.005 * np.sqrt((clean.observations[0] ** 2).mean(0))
-        noisy = clean.observations[0] + sd * rng.standard_normal(clean.observations[0].shape)
-        logs.append(Trajectory(noisy, command, DT, name=f"log {k}", channels=clean.channels))
+    for k, (one, command) in enumerate(zip(clean, actions, strict=True)):
+        noisy = one.observations[0] + sd * rng.standard_normal(one.observations[0].shape)
+        logs.append(Trajectory(noisy, command, DT, name=f"log {k}", channels=one.channels))
     return simulator, truth, Trajectories.stack(logs)
 
 
