@@ -170,7 +170,7 @@ ROWS = {"task": (TASKS, agreement, "batch"), "target": (TARGETS, target, "batch"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=tuple(ROWS))
+    parser.add_argument("what", nargs="*", metavar=f"[{' | '.join(ROWS)}]", help="default all")
     parser.add_argument("--device", default="warp:cpu")
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--seeds", type=int, default=4)
@@ -179,14 +179,17 @@ def main() -> None:
     path = HERE / "results" / "gpu_agreement.json"
     kept = json.loads(path.read_text()) if path.exists() else {}
     here = kept.setdefault(given.device, {"versions": {p: version(p) for p in ("mujoco", "mujoco-warp", "warp-lang")}})
-    rows = here.setdefault(given.what, {})
-    names, row, size = ROWS[given.what]
-    for name in given.only or names:
-        if name in rows:
-            continue
-        rows[name] = row(name, given.device, vars(given)[size])
-        print(name, json.dumps(rows[name]), flush=True)
-        write_text(path, json.dumps(kept, indent=1) + "\n")
+    for what in given.what or ROWS:
+        if what not in ROWS:
+            parser.error(f"{what}: expected some of {', '.join(ROWS)}")
+        rows = here.setdefault(what, {})
+        names, row, size = ROWS[what]
+        for name in given.only or names:
+            if name in rows:
+                continue
+            rows[name] = row(name, given.device, vars(given)[size])
+            print(name, json.dumps(rows[name]), flush=True)
+            write_text(path, json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

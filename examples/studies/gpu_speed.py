@@ -130,6 +130,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="control steps")
     parser.add_argument("--million", type=int, nargs="?", const=1_000_000, default=0)
     given = parser.parse_args()
+    if given.device.startswith("cuda") and not warp.is_cuda_available():
+        print(f"{given.device}: there is no such GPU here, nothing is measured")
+        return
     kept = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     rows = kept.setdefault(given.device, {})
     if given.million:
