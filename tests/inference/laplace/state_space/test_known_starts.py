@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.core.findings import Code
@@ -109,15 +110,16 @@ def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
 
 
 def test_mcmc_agrees_with_laplace() -> None:
-    """Means to one sd and sds to a factor of 1.5, of what bounces, with the same Jacobians over wide differences."""
+    """Means to one sd and central 68 % to a factor of 1.5, of what bounces, by Jacobians over wide differences.
+
+    The chains have a longer tail, which a normal has not.
+    """
     theta = np.array([0.4, 0.6, 0.5])
     log = bouncing_log(theta, 5)
-    fitted = {}
-    for name in ("laplace", "mcmc"):
-        estimator = sipe.get_estimator(bouncing(), name, likelihood=KNOWN, seed=1)
-        posterior = estimator.fit(log)
-        fitted[name] = (posterior.mean.numpy()[:2], posterior.stddev.numpy()[:2])
-        print(name, *fitted[name], estimator.rollouts, estimator.warnings)
-    (mean, sd), (other, other_sd) = fitted.values()
-    assert (np.abs(mean - other) < sd).all()
-    assert (np.abs(np.log(other_sd / sd)) < np.log(1.5)).all()
+    laplace = sipe.get_estimator(bouncing(), "laplace", likelihood=KNOWN, seed=1).fit(log)
+    chains = sipe.get_estimator(bouncing(), "mcmc", likelihood=KNOWN, seed=1, mixed=1.05).fit(log)
+    levels = torch.tensor([0.16, 0.84], dtype=torch.float64)
+    width, other = (np.ptp(posterior.quantile(levels).numpy(), axis=0)[:2] / 2 for posterior in (laplace, chains))
+    gap = (laplace.mean - chains.mean).abs().numpy()[:2]
+    assert (gap < width).all()
+    assert (np.abs(np.log(other / width)) < np.log(1.5)).all()
