@@ -39,7 +39,8 @@ def whole(name: str, value: object, least: int = 1, unit: str = "", most: int = 
     if isinstance(number, float) and not number.is_integer():
         raise ValueError(f"{name}: expected a whole number, got {_shown(value)}; give one, such as {max(least, 1)}")
     if number < least:
-        raise ValueError(f"{name}: expected at least {least}{unit and ' '}{unit}, got {value}")
+        counted = unit.removesuffix("s") if least == 1 else unit
+        raise ValueError(f"{name}: expected at least {least}{unit and ' '}{counted}, got {value}")
     if number > most:
         raise ValueError(f"{name}: expected at most {most}{unit and ' '}{unit}, got {number:.4g}")
     return int(number)

@@ -17,8 +17,8 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.coverage import (
     LEVELS,
     CalibrationCheck,
-    _mass,
     check_calibration,
+    mass_below,
     tarp_values,
     uniformity,
 )
@@ -143,7 +143,7 @@ def test_ranks_are_those_of_sbi() -> None:
     truths, draws = rng.random((30, 2)), rng.random((200, 30, 2))
     theta, seen = torch.from_numpy(truths), torch.zeros(30, 1)
     counts = sbc._run_sbc(theta, seen, torch.from_numpy(draws), "marginals", show_progress_bar=False).numpy()
-    ours = np.stack([_mass(draws[:, i], truths[i], rng) for i in range(30)])
+    ours = np.stack([mass_below(draws[:, i], truths[i], rng) for i in range(30)])
     np.testing.assert_array_equal(np.floor(ours * 201), counts)
     p_values = sbc.check_uniformity_frequentist(torch.from_numpy(counts), 200).numpy()
     assert all((p > 0.01) == (uniformity(column).p > 0.01) for p, column in zip(p_values, ours.T, strict=True))

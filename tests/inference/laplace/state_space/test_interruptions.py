@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from sipe_bayes.core.checkpoint import CheckpointError
+from sipe_bayes.core.checkpoint import CheckpointError, checksum
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import StateSpace
 from tests.problems.hung import hung, hung_log
@@ -56,6 +56,8 @@ def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
         metadata = file.metadata()
     plain = json.loads(metadata["plain"])
     del plain["state"]["search"]["here"]["estimates"]
-    save_file(load_file(path), path, metadata={**metadata, "plain": json.dumps(plain)})
+    text = json.dumps(plain)
+    arrays = load_file(path)
+    save_file(arrays, path, metadata={**metadata, "plain": text, "sha256": checksum(arrays, text)})
     with pytest.raises(CheckpointError, match=r"'estimates'.*of another version.*delete it"):
         Laplace(hung(), likelihood=StateSpace(starts="recorded"), checkpoint=path).fit(logs)
