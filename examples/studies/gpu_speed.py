@@ -101,8 +101,8 @@ def measured(name: str, worlds: int, steps: int, device: str) -> dict[str, Any]:
 
 
 def memory(device: str) -> int:
-    found = warp.get_device(warp_name(device))
-    return int(found.free_memory) if found.is_cuda else 0
+    card = warp.get_device(warp_name(device))
+    return int(card.free_memory) if card.is_cuda else 0
 
 
 def million(device: str, rollouts: int, steps: int) -> dict[str, Any]:

@@ -108,8 +108,8 @@ def one(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -
     posterior = method.fit(log)
     noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
     windows = bind(method.likelihood, engine, Trajectories.stack(log))
-    found = misfit(ProbedLogs(windows, posterior.mode.numpy(), noise), seed=seed)
-    return {"seed": seed, "cpu_seconds": round(time.process_time() - began, 2), **asdict(found)}
+    result = misfit(ProbedLogs(windows, posterior.mode.numpy(), noise), seed=seed)
+    return {"seed": seed, "cpu_seconds": round(time.process_time() - began, 2), **asdict(result)}
 
 
 def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int) -> dict[str, Any]:
@@ -118,17 +118,17 @@ def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int
     rows = fits(kept)
     rows += [keep(kept, one(engine, cell, size, NOISES[noise], seed)) for seed in range(len(rows), seeds)]
     rows = rows[:seeds]
-    found = [row for row in rows if row["p"] <= THRESHOLDS.misfit]
-    causes = [row["cause"] for row in found]
-    right = [row for row in found if row["cause"] == cause_of(cell, row["seed"] % joints)]
-    channel = [row for row in found if row["channel"] == f"joint:hinge{1 + row['seed'] % joints}.position"]
+    alarms = [row for row in rows if row["p"] <= THRESHOLDS.misfit]
+    causes = [row["cause"] for row in alarms]
+    right = [row for row in alarms if row["cause"] == cause_of(cell, row["seed"] % joints)]
+    channel = [row for row in alarms if row["channel"] == f"joint:hinge{1 + row['seed'] % joints}.position"]
     return {
         "cell": cell,
         "joints": joints,
         "size": size,
         "noise": noise,
         "logs": len(rows),
-        "alarms": len(found),
+        "alarms": len(alarms),
         **({} if cell == "null" else {"right_cause_and_joint": len(right), "right_channel": len(channel)}),
         "causes": {cause: causes.count(cause) for cause in sorted(set(causes), key=lambda c: -causes.count(c))},
         "cpu_seconds": float(np.median([row["cpu_seconds"] for row in rows])),

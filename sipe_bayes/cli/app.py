@@ -22,7 +22,7 @@ from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.check import SimulatedOn
-from sipe_bayes.cli.errors import INTERRUPTED, check_least, check_words, exit_on_error, say_interrupted, was_said
+from sipe_bayes.cli.errors import INTERRUPTED, check_least, check_words, exit_on_error, say_interrupted, was_announced
 from sipe_bayes.cli.examples import give_examples
 from sipe_bayes.core import __version__
 from sipe_bayes.inference.progress_bar import ProgressBar
@@ -56,7 +56,7 @@ _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 def main() -> None:
     """Entry point: input errors are one line on standard error and exit code 2."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C, workers too
-    was_said()  # of an earlier call in this process
+    was_announced()  # of an earlier call in this process
     try:
         with exit_on_error():
             check_words(sys.argv[1:])
@@ -74,7 +74,7 @@ def main() -> None:
         code = error.exit_code
     finally:
         signal.signal(signal.SIGTERM, before)
-    if code == INTERRUPTED and not was_said():
+    if code == INTERRUPTED and not was_announced():
         say_interrupted("; the same command begins again")
     sys.exit(code or 0)
 

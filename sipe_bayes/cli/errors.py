@@ -15,7 +15,7 @@ from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 BAD_INPUT = 2
 """Exit code where input is at fault."""
 _LONGEST = 1000  # characters of a word of the command line
-_said: list[str] = []  # of an interruption
+_announced: list[str] = []  # interruptions that the command itself put into words
 INTERRUPTED = 130  # exit code, as shells have it for SIGINT
 _SPACE = "free some space, or raise the limit on the size of files, and the same command goes on"
 _REMEDIES = {
@@ -56,16 +56,16 @@ def exit_on_error(then: str = "") -> Iterator[None]:
 
 
 def say_interrupted(then: str) -> None:
-    """Say it, for ``was_said`` too."""
-    _said.append(then)
+    """Print it, and keep it for ``was_announced``."""
+    _announced.append(then)
     print(f"sipe: interrupted{then}", file=sys.stderr)
 
 
-def was_said() -> bool:
-    """Whether the command itself said that it was interrupted; it does not where it had not begun."""
-    said = bool(_said)
-    _said.clear()
-    return said
+def was_announced() -> bool:
+    """Whether the command itself printed that it was interrupted; it does not where it had not begun."""
+    interrupted = bool(_announced)
+    _announced.clear()
+    return interrupted
 
 
 def _text(error: Exception) -> str:

@@ -31,15 +31,15 @@ def test_planted_widths_are_seen_and_honest_ones_pass(
     The halved ones sooner, and the rest is spared.
     """
     result = call(config, estimator, "--truths", 40, "--out", tmp_path / "out", "--threads", 1, "--json")
-    found = json.loads(result.stdout)
-    print(found["verdict"], found["sharpness"])
-    assert verdict in {p["verdict"] for p in found["parameters"]}
-    assert (found["spared"] > 0) == (verdict == "too narrow")
+    summary = json.loads(result.stdout)
+    print(summary["verdict"], summary["sharpness"])
+    assert verdict in {p["verdict"] for p in summary["parameters"]}
+    assert (summary["spared"] > 0) == (verdict == "too narrow")
     assert result.exit_code == (0 if verdict == "calibrated" else 1)
-    assert found["truths"] == 40 - found["spared"]
+    assert summary["truths"] == 40 - summary["spared"]
     share = {"calibrated": (0.78, 0.98), "too narrow": (0.4, 0.75), "too wide": (0.96, 1.0)}[verdict]
-    assert share[0] <= found["coverage_90"] <= share[1]
-    assert {"calibrated": "no cause for alarm"}.get(verdict, verdict) in found["verdict"]
+    assert share[0] <= summary["coverage_90"] <= share[1]
+    assert {"calibrated": "no cause for alarm"}.get(verdict, verdict) in summary["verdict"]
     for name in ("ranks.png", "coverage.png"):
         assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
 
@@ -78,10 +78,10 @@ def test_an_amortised_estimator_is_trained_once(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(ABC, "train", lambda self, *given: (trained.append(1), train(self, *given))[1])
     arguments = ("Pendulum", "abc", "--truths", 20, "--budget", 200, "--steps", 20, "--threads", 1, "--json", "--out")
     result = call(*arguments, tmp_path / "plain")
-    found = json.loads(result.stdout)
-    assert found["truths"] == 20, result.output
+    summary = json.loads(result.stdout)
+    assert summary["truths"] == 20, result.output
     assert len(trained) == 1
-    assert found["rollouts"] == 200  # counted once
+    assert summary["rollouts"] == 200  # counted once
     again = json.loads(call("Pendulum", "abc", "--truths", 22, *arguments[4:], tmp_path / "plain").stdout)  # two more
     assert (again["truths"], again["rollouts"]) == (22, 200)
 

@@ -92,17 +92,17 @@ def commands() -> dict[str, Any]:
 
     from sipe_bayes.cli.app import app
 
-    found: dict[str, Any] = {}
+    commands: dict[str, Any] = {}
 
     def walk(words: str, group: Any) -> None:
         for name, command in group.commands.items():
             if hasattr(command, "commands"):
                 walk(f"{words}{name} ", command)
             else:
-                found[f"{words}{name}"] = command
+                commands[f"{words}{name}"] = command
 
     walk("", get_command(app))
-    return found
+    return commands
 
 
 def command_lines(folder: Path) -> Change:
@@ -137,14 +137,14 @@ def command_lines(folder: Path) -> Change:
         before = {path.relative_to(folder) for path in folder.rglob("*")}
 
         def read() -> None:
-            code, said = _call(words, case)
+            code, errors = _call(words, case)
             if code not in (0, 1, 2):
                 raise AssertionError(f"{words}: exit code {code}")
             if code == 2:
                 made = {path.relative_to(folder) for path in folder.rglob("*")} - before
                 if made:
                     raise AssertionError(f"{words}: refused, and made {made}")
-                raise files.FileError(said.removesuffix("\n"))
+                raise files.FileError(errors.removesuffix("\n"))
 
         return read
 

@@ -121,7 +121,7 @@ class Report:
     """What a fault came to; nothing wrong where all is well."""
 
     fault: str
-    said: str = ""
+    line: str = ""
     wrong: list[str] = field(default_factory=list)
 
 
@@ -135,11 +135,11 @@ class Case:
         write_case(folder / "sound")
         began = time.monotonic()
         process = self.start(self.fresh())
-        _, said = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE)
         self.seconds = time.monotonic() - began
         self.expected = self.digests(self.place)
         if process.returncode or not self.expected:
-            raise RuntimeError(f"undisturbed it ends with exit code {process.returncode}: {said[-500:]}")
+            raise RuntimeError(f"undisturbed it ends with exit code {process.returncode}: {errors[-500:]}")
 
     def fresh(self) -> Path:
         """A new folder with the sound files."""
@@ -172,14 +172,14 @@ class Case:
 
     def orphans(self) -> list[int]:
         """Processes of the last command that are still there."""
-        found = []
+        processes = []
         for entry in Path("/proc").glob("[0-9]*"):
             try:
                 if f"{MARK}={self.mark}".encode() in (entry / "environ").read_bytes():
-                    found.append(int(entry.name))
+                    processes.append(int(entry.name))
             except OSError:
                 continue
-        return found
+        return processes
 
     def digests(self, place: Path) -> dict[str, str]:
         """Of each result, without its times."""
@@ -196,9 +196,9 @@ class Case:
             for process in left:
                 os.kill(process, signal.SIGKILL)
         process = self.start(self.place, again)
-        _, said = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE)
         if process.returncode:
-            report.wrong.append(f"the run after it ends with exit code {process.returncode}: {said.strip()[-300:]}")
+            report.wrong.append(f"the run after it ends with exit code {process.returncode}: {errors.strip()[-300:]}")
         elif self.digests(self.place) != self.expected:
             now = self.digests(self.place)
             differing = [k for k in {*now, *self.expected} if now.get(k) != self.expected.get(k)]
@@ -211,9 +211,9 @@ class Case:
         process = self.start(self.fresh())
         time.sleep(chance.uniform(0.05, 0.95) * self.seconds)
         process.send_signal(number)
-        _, said = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE)
         if number != signal.SIGKILL and process.returncode:
-            check_line(report, said, "interrupted")
+            check_line(report, errors, "interrupted")
         return self.settle(report, again=(self.place / "out").is_dir())
 
     def full_disk(self, chance: random.Random) -> Report:
@@ -221,9 +221,9 @@ class Case:
         most = chance.choice([0, 500, 4_000, 20_000])
         report = Report(f"files of at most {most} bytes")
         process = self.start(self.fresh(), most=most)
-        _, said = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE)
         if process.returncode:
-            check_line(report, said, ";")
+            check_line(report, errors, ";")
         return self.settle(report, again=(self.place / "out").is_dir())
 
     def no_log(self, chance: random.Random) -> Report:
@@ -237,10 +237,10 @@ class Case:
         kept = log.read_bytes()
         log.unlink()
         process = self.start(self.place, again=True)
-        _, said = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE)
         if process.returncode != 2:
             report.wrong.append(f"without its log it ends with exit code {process.returncode}")
-        check_line(report, said, "no such file")
+        check_line(report, errors, "no such file")
         log.write_bytes(kept)
         return self.settle(report, again=True)
 
@@ -252,18 +252,18 @@ class Case:
         time.sleep(chance.uniform(0.0, 0.5) * self.seconds)
         other = self.start(place, again=bool(self.command.again))
         for process in (one, other):
-            _, said = process.communicate(timeout=PATIENCE)
+            _, errors = process.communicate(timeout=PATIENCE)
             if process.returncode:
-                check_line(report, said, ";")
+                check_line(report, errors, ";")
         return self.settle(report, again=True)
 
 
-def check_line(report: Report, said: str, word: str) -> None:
+def check_line(report: Report, errors: str, word: str) -> None:
     """One line that begins with the command's name; progress on standard error is drawn over itself."""
-    lines = [line for line in re.split(r"[\r\n]", said) if line.startswith("sipe: ")]
-    report.said = lines[-1] if lines else ""
-    if "Traceback" in said or not lines or word not in lines[-1]:
-        report.wrong.append(f"no line with {word!r}: {said.strip()[-400:]!r}")
+    lines = [line for line in re.split(r"[\r\n]", errors) if line.startswith("sipe: ")]
+    report.line = lines[-1] if lines else ""
+    if "Traceback" in errors or not lines or word not in lines[-1]:
+        report.wrong.append(f"no line with {word!r}: {errors.strip()[-400:]!r}")
 
 
 def digest(path: Path) -> str:
@@ -297,7 +297,7 @@ def faults(case: Case, times: int, seed: int = 0) -> list[Report]:
     for fault in kinds:
         report = fault()
         reports.append(report)
-        print(f"  {report.fault}: {'; '.join(report.wrong) or 'same bits'} [{report.said}]", flush=True)
+        print(f"  {report.fault}: {'; '.join(report.wrong) or 'same bits'} [{report.line}]", flush=True)
     return reports
 
 

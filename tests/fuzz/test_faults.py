@@ -43,9 +43,9 @@ def test_an_interrupted_command_says_so_once(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 130
-    said = capsys.readouterr().err
-    assert said.count("sipe: interrupted; the same command ") == 1
-    assert ("goes on" if begun else "begins again") in said
+    errors = capsys.readouterr().err
+    assert errors.count("sipe: interrupted; the same command ") == 1
+    assert ("goes on" if begun else "begins again") in errors
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -67,12 +67,12 @@ def test_times_are_no_bits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "wrong"),
+    ("errors", "wrong"),
     [("sipe: interrupted; again\n", 0), ("", 1), ("Traceback\nsipe: interrupted\n", 1), ("sipe: done\n", 1)],
 )
-def test_the_line_is_looked_for(said: str, wrong: int) -> None:
+def test_the_line_is_looked_for(errors: str, wrong: int) -> None:
     report = Report("SIGINT")
-    check_line(report, said, "interrupted")
+    check_line(report, errors, "interrupted")
     assert len(report.wrong) == wrong
 
 

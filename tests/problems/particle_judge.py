@@ -66,8 +66,8 @@ def advanced(
         cumulative /= cumulative[:, -1:]
         comb = (np.arange(particles) + rng.random((many, 1))) / particles
         row = np.arange(many)[:, None]
-        found = np.searchsorted((cumulative + row).ravel(), (comb + row).ravel()).reshape(many, particles)
-        ends = ends[row, np.clip(found - row * particles, 0, particles - 1)]
+        drawn = np.searchsorted((cumulative + row).ravel(), (comb + row).ravel()).reshape(many, particles)
+        ends = ends[row, np.clip(drawn - row * particles, 0, particles - 1)]
     if k + 1 < model.samples and model.begins(k + 1):
         return increment, model.first(k + 1, many * particles, rng).reshape(many, particles, size)
     return increment, model.scattered(ends.reshape(many * particles, -1), k, rng).reshape(many, particles, -1)

@@ -1,4 +1,4 @@
-"""What is simulated again in float64, and what is said of the difference."""
+"""What is simulated again in float64, and what is finding of the difference."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def test_a_difference_counts_against_what_its_channel_varies_by(error: float, co
     seen[2, 12:, 1] += error
     audit.chosen(4)
     audit.compare(replace(double, observations=seen), np.array([0, 2]), double[[0, 2]])
-    (said,) = audit.findings()
-    assert said.code is code
+    (finding,) = audit.findings()
+    assert finding.code is code
     assert [one.agreed for one in audit.compared] == [STEPS, agreed]
     if code is Code.FLOAT32_DIFFERS:
-        assert "1 of the 2" in said.text
-        assert "the first 11 control steps (1.1 s)" in said.text
+        assert "1 of the 2" in finding.text
+        assert "the first 11 control steps (1.1 s)" in finding.text
 
 
 def test_one_that_only_one_of_the_two_could_simulate_differs() -> None:

@@ -1,4 +1,4 @@
-"""The engine of a GPU, run on Warp's own processor device: as MuJoCo in float64, or said where it is not.
+"""The engine of a GPU, run on Warp's own processor device: as MuJoCo in float64, or finding where it is not.
 
 Warp compiles what the arm needs once, for 20 s on one core, and keeps it; one model serves all of these tests. The
 other environments are in ``examples/studies/gpu_agreement.py``.
@@ -129,8 +129,8 @@ def test_an_estimator_takes_either_engine_and_says_how_far_they_agree(arm: Simul
         estimator = get_estimator(simulator, "cem", budget=64, seed=1, likelihood=Segments(None, starts="recorded"))
         means.append(estimator.fit(log).mean.numpy())
     np.testing.assert_allclose(means[1], means[0], atol=1e-2)
-    (said,) = estimator.findings.of(Code.FLOAT32_AGREES, Code.FLOAT32_DIFFERS)
-    assert said.code is Code.FLOAT32_AGREES
+    (finding,) = estimator.findings.of(Code.FLOAT32_AGREES, Code.FLOAT32_DIFFERS)
+    assert finding.code is Code.FLOAT32_AGREES
 
 
 def test_what_differentiates_stays_in_float64(arm: Simulator) -> None:

@@ -101,15 +101,15 @@ def _tried(path: str, content: str, seconds: float, gib: float) -> str:
             )
         except subprocess.TimeoutExpired:
             return _slow(seconds)
-    said = done.stdout.decode(errors="replace").strip()
-    if done.returncode == 0 and said == "done":
+    outcome = done.stdout.decode(errors="replace").strip()
+    if done.returncode == 0 and outcome == "done":
         return ""
-    if said.startswith("error"):
-        why = " ".join(said.split()[1:])[:200]
+    if outcome.startswith("error"):
+        why = " ".join(outcome.split()[1:])[:200]
         return f"cannot be compiled by MuJoCo within {gib:g} GiB ({why}); make it smaller, or set {MODEL_GIB}"
-    if said == "memory":
+    if outcome == "memory":
         return f"takes more than {gib:g} GiB of memory; make it smaller, or set {MODEL_GIB}"
-    if said == "time" or -done.returncode in _TIME_SIGNALS:
+    if outcome == "time" or -done.returncode in _TIME_SIGNALS:
         return _slow(seconds)
     return f"crashes MuJoCo (exit code {done.returncode}); make it smaller or simpler until it does not"
 

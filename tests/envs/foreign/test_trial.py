@@ -26,7 +26,7 @@ def _limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SIPE_MODEL_GIB", "4")
 
 
-def said(path: Path) -> str:
+def refusal(path: Path) -> str:
     """What a model file ends in."""
     began = time.monotonic()
     with pytest.raises(ModelError) as caught:
@@ -52,7 +52,7 @@ def said(path: Path) -> str:
 )
 def test_a_model_that_breaks_mujoco_is_one_line(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "model.xml").write_text(f"<mujoco>{content}</mujoco>")
-    assert words in said(tmp_path / "model.xml")
+    assert words in refusal(tmp_path / "model.xml")
     assert [file.name for file in tmp_path.iterdir()] == ["model.xml"]  # no MUJOCO_LOG.TXT
 
 
@@ -66,7 +66,7 @@ def test_a_crash_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         return run([command[0], "-c", shot], **settings)  # type: ignore[call-overload]
 
     monkeypatch.setattr(subprocess, "run", crash)
-    assert "crashes MuJoCo (exit code -11); make it smaller or simpler" in said(tmp_path / "model.xml")
+    assert "crashes MuJoCo (exit code -11); make it smaller or simpler" in refusal(tmp_path / "model.xml")
 
 
 @pytest.mark.parametrize("name", ["../part.xml", "..&#47;part.xml", "{folder}/part.xml", "link.xml", "inner/up.xml"])
@@ -78,7 +78,7 @@ def test_includes_stay_in_the_folder(name: str, tmp_path: Path, monkeypatch: pyt
     (own / "inner" / "up.xml").write_text('<mujoco><include file="../../part.xml"/></mujoco>')
     path = own / "model.xml"
     path.write_text(f'<mujoco>{BODY}<include\n file = "{name.format(folder=tmp_path)}"/></mujoco>')
-    assert "from outside its folder" in said(path)
+    assert "from outside its folder" in refusal(path)
     if name == "../part.xml":
         monkeypatch.setenv(trial.TRUST, "1")
         load_spec(str(path))

@@ -1,4 +1,4 @@
-"""A pendulum swings as fast about either of two distances from its centre of mass: both are found, and no third one."""
+"""A pendulum swings as fast about either of two distances from its centre of mass: both are kept, and no third one."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def fitted(low: float, high: float, given: float, truth: float) -> Laplace:
 def test_both_are_found(given: float, truth: float) -> None:
     method = fitted(-0.5, -0.08, given, truth)
     assert method.state is not None
-    found = sorted(method.space.values(optimum.theta)[0] for optimum in method.state.search.optima)
-    np.testing.assert_allclose(found, sorted((truth, GYRATION**2 / truth)), rtol=0.1)
+    estimates = sorted(method.space.values(optimum.theta)[0] for optimum in method.state.search.optima)
+    np.testing.assert_allclose(estimates, sorted((truth, GYRATION**2 / truth)), rtol=0.1)
     assert Code.SEPARATE_OPTIMA in [item.code for item in method.findings]
 
 
