@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import digest
 from sipe_bayes.inference.registry import estimator_class, get_estimator
-from sipe_bayes.posterior import Dirac, Posterior, prior
+from sipe_bayes.posterior import Dirac, Posterior, prior, storage
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -175,15 +174,5 @@ def _with_policy(cell: Cell, record: Record, simulator: Simulator, folder: Path)
 
 
 def netcdf(posterior: Posterior, seed: int) -> bytes:
-    """A posterior's netCDF.
-
-    Returns:
-        The file's bytes, the same for the same posterior.
-    """
-    data = posterior.to_inference_data(generator=torch.Generator().manual_seed(seed))
-    for group in data.groups():
-        data[group].attrs.pop("created_at", None)
-    with tempfile.TemporaryDirectory() as made_in:
-        path = Path(made_in) / "posterior.nc"
-        data.to_netcdf(str(path), engine="h5netcdf")
-        return path.read_bytes()
+    """A posterior's netCDF, the same bytes for the same posterior."""
+    return storage.netcdf(posterior.to_inference_data(generator=torch.Generator().manual_seed(seed)))

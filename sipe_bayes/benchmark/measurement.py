@@ -21,7 +21,7 @@ from typing import ClassVar, Generic, TypeVar
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.executors.work import Done
 from sipe_bayes.benchmark.records import Record
-from sipe_bayes.core.files import installed_version
+from sipe_bayes.core.files import installed_version, no_room
 
 R = TypeVar("R", bound=Record)
 T = TypeVar("T")
@@ -82,7 +82,9 @@ class Measurement(ABC, Generic[R]):
             with _at_hand(folder) as here, warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 full, files, line = self.measured(cell, record, here)
-        except Exception:  # a failed cell must not stop the others
+        except Exception as error:  # a failed cell must not stop the others
+            if no_room(error) is not None:  # of which no cell is at fault
+                raise
             return _failed(record, traceback.format_exc(), time.process_time() - began)
         trained = self.trained_in(cell)
         spent = f"{trained}/{CHECKPOINTS}" if trained else ""

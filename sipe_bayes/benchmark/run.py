@@ -65,7 +65,7 @@ def run(cells: Sequence[Cell], order: Order, kind: AnyMeasurement | None = None)
     Raises:
         OutputError: for a folder with records of other versions, budgets, lengths or agents, or that another run is at
             work in.
-        OSError: where it cannot be written.
+        OSError: where it cannot be written, or a cell finds the disk full.
     """
     if kind is None:
         return run(cells, order, ESTIMATES)
@@ -236,6 +236,8 @@ def _carried_out(units: Sequence[Unit], order: Order) -> int:
             # write the next one that ends
             unit, done = executor.next()
             running -= 1
+            if done.stopped is not None:
+                raise done.stopped
             _write(done, order.folder)
             written.add(unit.name)
             failed += done.failed

@@ -13,12 +13,21 @@ import numpy as np
 import torch
 
 from sipe_bayes.calibration.problem import RUN, Problem
-from sipe_bayes.core.files import OutputError, installed_version, not_a_file, read_json, replacing, to_json, write_text
+from sipe_bayes.core.files import (
+    OutputError,
+    installed_version,
+    not_a_file,
+    read_json,
+    to_json,
+    write_bytes,
+    write_text,
+)
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.randomization_code import write_randomization
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior.storage import netcdf
 from sipe_bayes.report.interactive.clips import Clip, make_clip
 from sipe_bayes.report.interactive.motion import motion
 from sipe_bayes.report.page import write_report
@@ -137,8 +146,7 @@ def _clip(calibration: Calibration, problem: Problem) -> Clip:
 def save_posterior(posterior: Posterior, folder: Path) -> None:
     """Write ``posterior.*``: what ``load_posterior`` reads, and its draws for ArviZ."""
     posterior.save(folder / "posterior")
-    with replacing(folder / "posterior.nc") as temporary:
-        posterior.to_inference_data().to_netcdf(str(temporary), engine="h5netcdf")
+    write_bytes(folder / "posterior.nc", netcdf(posterior.to_inference_data()))
 
 
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, object]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
+from sipe_bayes.calibration.commands import check_commands
 from sipe_bayes.calibration.config import Config, check_dimensions, load_config
 from sipe_bayes.calibration.config_fields import ConfigError, overlap
 from sipe_bayes.calibration.config_tables import LogEntry
@@ -111,6 +112,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
     }
     dimensions = {target: d for target, d in dimensions.items() if d}
     check_dimensions(config, dimensions)
+    doubts = check_commands(config)
     train, train_reports = _read(config, train_logs, dimensions)
     held, held_reports = _read(config, held_logs, dimensions)
     for held_log, copy in zip(held_logs, held_reports, strict=True):
@@ -121,6 +123,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
                     "which trains; hold out another log"
                 )
     prior, remarks = _prior(config, environment.space, train_reports)
+    remarks = (*doubts, *remarks)
     return Problem(
         config,
         environment,

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import typer
 
+from sipe_bayes.core.files import FULL
 from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 
 BAD_INPUT = 2
@@ -20,10 +21,7 @@ INTERRUPTED = 130  # exit code, as shells have it for SIGINT
 _SPACE = "free some space, or raise the limit on the size of files, and the same command goes on"
 _REMEDIES = {
     errno.EACCES: "make it writable, or choose another folder",
-    errno.ENOSPC: _SPACE,
-    errno.EDQUOT: _SPACE,
-    errno.EFBIG: _SPACE,
-    errno.EIO: _SPACE,
+    **dict.fromkeys((*FULL, errno.EIO), _SPACE),
     errno.ENOENT: "look at the name, or choose another folder",
 }
 
@@ -70,8 +68,9 @@ def was_announced() -> bool:
 
 def _text(error: Exception) -> str:
     """Of an error of the file system: the path, what is wrong, and a remedy."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror.lower()}; {_REMEDIES.get(error.errno or 0, 'choose another folder')}"
+    if isinstance(error, OSError) and error.strerror and (error.filename is not None or error.errno in FULL):
+        remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
+        return f"{error.filename or 'a temporary file'}: {error.strerror.lower()}; {remedy}"
     return str(error)
 
 

@@ -29,6 +29,11 @@ _LONGEST_TEXT = 2**25  # bytes of JSON or TOML: what it becomes in memory is twe
 _WORDS = 200  # characters of what a library says
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What the system says where a disk, a quota or a limit on the size of files leaves no room."""
+_NATIVE = re.compile(r"\(os error (\d+)\)|\berrno\W+(\d+)")  # as libraries that are not Python's word it
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path to write to, which becomes ``path`` at the end and is removed where something fails.
@@ -46,6 +51,20 @@ def replacing(path: Path) -> Iterator[Path]:
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def no_room(error: BaseException) -> OSError | None:
+    """The error of a full disk that an exception is or comes from, if any; with the file's name where it is known."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in FULL:
+            return cause
+        native = _NATIVE.search(str(cause))
+        code = int(native[1] or native[2]) if native else 0
+        if code in FULL:
+            return OSError(code, os.strerror(code))
+        cause = cause.__cause__ or cause.__context__
+    return None
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -308,6 +308,9 @@ class Code(Enum):
     PRIOR_COUNTED_TWICE = caution(
         "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow"
     )
+    COMMAND_DOUBTED = caution(
+        "column {column!r} {reason}, and is given as the command of {actuator!r}, which takes {drive}"
+    )
     NOT_EXPORTED = caution("{reason}")
     BIAS_NOT_EXPORTED = caution(
         "identified.xml has no place for what a sensor does, {parameters!r}; take it off the measurement"

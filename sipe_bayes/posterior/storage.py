@@ -7,11 +7,12 @@ tensors, so that a pair torn by a crash between the two renames is refused and n
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 import safetensors.torch
@@ -20,6 +21,9 @@ from torch import Tensor
 
 from sipe_bayes.core.files import FileError, read_json, reading, write_bytes
 from sipe_bayes.core.parameters import Plain
+
+if TYPE_CHECKING:
+    import arviz
 
 FORMAT = "sipe_bayes.posterior/1"
 SAVE_AGAIN = "save it again with posterior.save(path)"
@@ -94,3 +98,14 @@ def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tenso
         if x.shape[:2] != theta.shape[:2]:
             raise ValueError(f"{name}: expected {key} {(*theta.shape[:2], '...')}, chains and draws, got {x.shape}")
     return arrays
+
+
+def netcdf(data: arviz.InferenceData) -> bytes:
+    """The netCDF of draws, the same bytes for the same draws, made in memory: on a full disk HDF5 crashes."""
+    buffer = io.BytesIO()
+    for k, name in enumerate(data.groups()):
+        group = data[name]
+        group.attrs.pop("created_at", None)
+        packed = {key: {"zlib": True} for key, values in group.variables.items() if values.dtype.kind in "fiub"}
+        group.to_netcdf(buffer, mode="a" if k else "w", group=name, engine="h5netcdf", encoding=packed)
+    return buffer.getvalue()

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sipe_bayes.benchmark import measurement, run
+from sipe_bayes.benchmark import measure, measurement, run
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.measure import ESTIMATES
 from sipe_bayes.benchmark.records import Record
@@ -123,6 +123,27 @@ def test_full_disk_loses_nothing(
     assert len(list(tmp_path.glob("records/P*.json"))) == kept
     assert not list(tmp_path.rglob(".*.[a-z]*"))  # no half-written file
     monkeypatch.setattr(files, "replacing", replacing)
+    assert measured(tmp_path, *PENDULUM).exit_code == 0
+    assert what_counts(tmp_path) == what_counts(undisturbed)
+
+
+def test_a_cell_that_finds_the_disk_full_is_not_at_fault(
+    monkeypatch: pytest.MonkeyPatch, undisturbed: Path, tmp_path: Path
+) -> None:
+    """However a library says it, no cell is recorded as failed, and the same command goes on."""
+    for error in (
+        OSError(errno.EFBIG, "File too large", "posterior.nc"),
+        RuntimeError("I/O error: No space left on device (os error 28)"),
+        RuntimeError("Unable to flush file (errno = 28, error message = 'No space left on device')"),
+    ):
+
+        def full(*_: object, error: Exception = error) -> bytes:
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(measure, "netcdf", full)
+            refused(measured(tmp_path, *PENDULUM), "free some space", "the same command goes on")
+        assert not list(tmp_path.glob("records/P*.json"))
     assert measured(tmp_path, *PENDULUM).exit_code == 0
     assert what_counts(tmp_path) == what_counts(undisturbed)
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
+from sipe_bayes.core.files import no_room
+
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
 """Environment of a worker: set before it starts, as numerical libraries read it when they are loaded."""
 
@@ -21,6 +23,7 @@ class Done:
         cpu_seconds: that it took.
         failed: whether it did.
         spent: a path in the folder of results that nothing needs any more once the files are written.
+        stopped: why no unit can go on: the disk is full. It is the machine's fault, and recorded of none.
     """
 
     files: tuple[tuple[str, bytes], ...]
@@ -28,6 +31,7 @@ class Done:
     cpu_seconds: float
     failed: bool = False
     spent: str = ""
+    stopped: OSError | None = None
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,10 @@ class Unit:
         torch.set_num_threads(1)
         try:
             return self.function(**self.arguments)
-        except Exception:
+        except Exception as error:
+            full = no_room(error)
+            if full is not None:
+                return Done((), str(full), 0.0, failed=True, stopped=full)
             return self.gave_up(traceback.format_exc().strip().splitlines()[-1])
 
     def gave_up(self, why: str) -> Done:

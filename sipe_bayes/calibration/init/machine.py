@@ -68,7 +68,7 @@ class Machine:
         ]
         by_id = dict(zip(named, joints, strict=True))
         actuators = [
-            Actuator(model.actuator(i).name, _drive(model, i), by_id.get(_joint_of(model, i)), k)
+            Actuator(model.actuator(i).name, drive_of(model, i), by_id.get(_joint_of(model, i)), k)
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
         free = [i for i in range(model.njnt) if int(model.jnt_type[i]) not in scalar]
@@ -78,7 +78,8 @@ class Machine:
         return cls(tuple(joints), tuple(actuators), tuple(b for b in bodies if b), tuple(s for s in sensors if s[1]))
 
 
-def _drive(model: mujoco.MjModel, index: int) -> Drive:
+def drive_of(model: mujoco.MjModel, index: int) -> Drive:
+    """What an actuator of a compiled model is given."""
     kind, inputs = int(model.actuator_gaintype[index]), int(model.actuator_ctrlspec[index])
     if kind in (int(mujoco.mjtGain.mjGAIN_DCMOTOR), int(mujoco.mjtGain.mjGAIN_PID)):
         return _INPUTS.get(inputs, Drive.OTHER)
@@ -87,6 +88,8 @@ def _drive(model: mujoco.MjModel, index: int) -> Drive:
     if int(model.actuator_biastype[index]) == int(mujoco.mjtBias.mjBIAS_NONE):
         return Drive.FORCE
     gain, (_, of_position, of_velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
+    if int(model.actuator_dyntype[index]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # <intvelocity>
+        return Drive.VELOCITY if of_position else Drive.OTHER
     if of_position:
         return Drive.POSITION
     if not of_velocity:
