@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt
 
-.PHONY: demo test fuzz faults bench studies docs wheel-check clean
+.PHONY: demo test fuzz faults bench studies leaderboard docs wheel-check clean
 .DEFAULT_GOAL := test
 
 $(READY): pyproject.toml constraints.txt
@@ -43,6 +43,21 @@ studies: $(patsubst examples/studies/%.py,study-%,$(wildcard examples/studies/[a
 
 study-%: $(READY)
 	$(BIN)/python examples/studies/$*.py
+
+# every entry of the leaderboard, two at a time, and the page; the same command goes on where it was interrupted
+LEADERBOARD ?= runs/leaderboard
+OWN := prior laplace npe bayessim cem regression
+FOREIGN := $(patsubst examples/leaderboard/%.py,%,$(wildcard examples/leaderboard/[a-z]*.py))
+
+leaderboard: $(READY)
+	OMP_NUM_THREADS=1 $(MAKE) -j2 $(OWN:%=own-entry-%) $(FOREIGN:%=foreign-entry-%)
+	$(BIN)/sipe leaderboard report $(addprefix $(LEADERBOARD)/,$(OWN) $(FOREIGN)) --out $(LEADERBOARD)/page
+
+own-entry-%: $(READY)
+	$(BIN)/sipe leaderboard run $* --out $(LEADERBOARD)/$*
+
+foreign-entry-%: $(READY)
+	$(BIN)/python examples/leaderboard/$*.py --out $(LEADERBOARD)/$*
 
 # the site, into docs/_build, with warnings as errors
 docs: $(READY)

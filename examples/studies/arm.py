@@ -23,7 +23,6 @@ import argparse
 import io
 import json
 import logging
-import re
 import time
 from contextlib import redirect_stdout
 from importlib.metadata import version
@@ -34,56 +33,34 @@ import mujoco
 import numpy as np
 from _kept import fits, keep
 from mujoco import sysid
-from mujoco.sysid.tests.test_integration import ARM_XML
 from numpy.typing import NDArray
 
 import sipe_bayes as sipe
+from sipe_bayes.benchmark.leaderboard.arm import (
+    HIGH,
+    JOINTS,
+    LOW,
+    NOISE,
+    RHO,
+    START,
+    TRUTH,
+    arm,
+    recorded,
+    torques,
+    xml,
+)
 from sipe_bayes.core.files import to_json, write_text
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import GaussianMixture
 
 FloatArray = NDArray[np.float64]
 
-AS_GIVEN = re.sub('armature="[^"]*"', 'armature="0.01"', ARM_XML)  # the truth is not told by the model
-
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "arm"
-JOINTS = tuple(f"joint{k}" for k in range(1, 6))
-TRUTH = np.array([0.5, 0.4, 0.3, 0.2, 0.1])  # kg m^2
-LOW, HIGH, START = 0.01, 0.6, 0.01
-NOISE, RHO, LEVEL = 0.6, 0.99, 0.95
-TORQUE = np.array([5.0, 4.0, 3.0, 2.0, 1.0])  # N m
-FREQUENCY = np.array([0.5, 0.7, 0.4, 0.9, 0.6])  # Hz
-PHASE = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+LEVEL = 0.95
 CELLS = {
     f"{seconds} s, {noise}": (seconds, rho) for seconds in (2, 10) for noise, rho in (("white", 0.0), ("AR(1)", RHO))
 }
 FITS, _EXACT = 400, 400
-
-
-def arm() -> sipe.Simulator:
-    parameters = [sipe.Parameter(f"{j}_armature", LOW, HIGH, targets=(f"joint:{j}.armature",)) for j in JOINTS]
-    motors = [f"act{k}" for k in range(1, 6)]
-    environment = MjcfEnvironment.build(AS_GIVEN, parameters, motors, [f"joint:{j}.position" for j in JOINTS])
-    return sipe.Simulator(environment, num_threads=1)
-
-
-def noises(rho: float, shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
-    """Stationary noise (T, C) of sd NOISE."""
-    white, found = rng.standard_normal(shape), np.empty(shape)
-    found[0] = white[0]
-    for k in range(1, len(white)):
-        found[k] = rho * found[k - 1] + np.sqrt(1 - rho**2) * white[k]
-    return NOISE * found
-
-
-def recorded(simulator: sipe.Simulator, seconds: int, rho: float, seed: int) -> sipe.Trajectory:
-    """A noisy log from rest, with its states."""
-    dt = float(simulator.model.opt.timestep)
-    torques = torques_of(seconds, dt)
-    motion = simulator.rollout((TRUTH - LOW) / (HIGH - LOW), torques, simulator.default_state(), dt=dt)
-    noise = noises(rho, motion.observations[0].shape, np.random.default_rng([seed, seconds, round(100 * rho)]))
-    return sipe.Trajectory(motion.observations[0] + noise, torques, dt, states=motion.states[0])
 
 
 def ours(simulator: sipe.Simulator, log: sipe.Trajectory, seed: int) -> dict[str, Any]:
@@ -96,7 +73,7 @@ def ours(simulator: sipe.Simulator, log: sipe.Trajectory, seed: int) -> dict[str
 
 
 def theirs(log: sipe.Trajectory) -> dict[str, Any]:
-    spec = mujoco.MjSpec.from_string(AS_GIVEN)
+    spec = mujoco.MjSpec.from_string(xml())
     for sensor in [s for s in spec.sensors if s.name.endswith("_vel")]:
         spec.delete(sensor)
     model, parameters = spec.compile(), sysid.ParameterDict()
@@ -134,7 +111,7 @@ def _row(value: FloatArray, low: FloatArray, high: FloatArray) -> dict[str, Any]
 
 def one(simulator: sipe.Simulator, cell: str, seed: int) -> dict[str, Any]:
     """Both methods on one log; CPU seconds each."""
-    log, found = recorded(simulator, *CELLS[cell], seed), {"seed": seed}
+    log, found = recorded(simulator, TRUTH, *CELLS[cell], seed), {"seed": seed}
     for name, fit in (("sipe_bayes", lambda: ours(simulator, log, seed)), ("mujoco.sysid", lambda: theirs(log))):
         began, cpu = time.perf_counter(), time.process_time()
         row = fit()
@@ -197,8 +174,10 @@ def exact(simulator: sipe.Simulator, cell: str) -> dict[str, float]:
     theta, step = (TRUTH - LOW) / (HIGH - LOW), 1e-4
     rows = theta + step * np.concatenate([np.eye(len(theta)), -np.eye(len(theta))])
     dt = float(simulator.model.opt.timestep)
-    torques = torques_of(seconds, dt)
-    seen = np.stack([simulator.rollout(row, torques, simulator.default_state(), dt=dt).observations[0] for row in rows])
+    commands = torques(seconds, dt)
+    seen = np.stack(
+        [simulator.rollout(row, commands, simulator.default_state(), dt=dt).observations[0] for row in rows]
+    )
     slopes = (seen[: len(theta)] - seen[len(theta) :]) / (2 * step)
     white = (
         np.concatenate([slopes[:, :1], (slopes[:, 1:] - rho * slopes[:, :-1]) / np.sqrt(1 - rho**2)], axis=1) / NOISE
@@ -216,12 +195,6 @@ def exact(simulator: sipe.Simulator, cell: str) -> dict[str, float]:
         "standard_error": round(float(covered.mean(1).std(ddof=1) / np.sqrt(_EXACT)), 4),
         "median_width": float(np.median([row["width"] for row in found])),
     }
-
-
-def torques_of(seconds: int, dt: float) -> FloatArray:
-    """Commands (T, 5)."""
-    clock = np.arange(round(seconds / dt)) * dt
-    return np.asarray(TORQUE * np.sin(2 * np.pi * FREQUENCY * clock[:, None] + PHASE))
 
 
 def main() -> None:

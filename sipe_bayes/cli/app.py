@@ -17,6 +17,7 @@ from sipe_bayes.cli import data as data_commands
 from sipe_bayes.cli import discover as discover_commands
 from sipe_bayes.cli import explain as explain_commands
 from sipe_bayes.cli import init as init_commands
+from sipe_bayes.cli import leaderboard as leaderboard_commands
 from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
@@ -307,7 +308,7 @@ _PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which
 for _panel, _commands in _PANELS.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
-for _group in (data_commands.app, transfer_commands.app, benchmark_commands.app):
+for _group in (data_commands.app, transfer_commands.app, benchmark_commands.app, leaderboard_commands.app):
     app.add_typer(_group, rich_help_panel="Studies")
 give_examples(app)
 

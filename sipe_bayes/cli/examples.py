@@ -30,6 +30,10 @@ EXAMPLES = {
     "benchmark report": "sipe benchmark report runs/quick",
     "benchmark status": "sipe benchmark status runs/quick",
     "benchmark cells": "sipe benchmark cells quick",
+    "leaderboard run": "sipe leaderboard run laplace --out runs/leaderboard/laplace",
+    "leaderboard tasks": "sipe leaderboard tasks",
+    "leaderboard submit-check": "sipe leaderboard submit-check runs/leaderboard/laplace",
+    "leaderboard report": "sipe leaderboard report runs/leaderboard/laplace --out runs/leaderboard/page",
 }
 
 

@@ -7,10 +7,14 @@ from collections.abc import Callable
 import jinja2
 
 
-def html_templates(package: str) -> jinja2.Environment:
-    """Templates of HTML pages: what is put in is escaped, and a name that is missing is an error."""
+def html_templates(*packages: str) -> jinja2.Environment:
+    """Templates of HTML pages: what is put in is escaped, and a name that is missing is an error.
+
+    Args:
+        *packages: whose folders of templates are looked through, in order.
+    """
     return jinja2.Environment(
-        loader=jinja2.PackageLoader(package, "templates"),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(package, "templates") for package in packages]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
