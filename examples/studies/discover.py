@@ -68,7 +68,7 @@ MACHINES = {
         (("upper", "shoulder", "drive1", 2.0), ("lower", "elbow", "drive2", 0.8)),
     ),
     "slide": (
-        HEAD + '<body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="2"/>'
+        HEAD + '<body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="2" armature="0.2"/>'
         '<geom type="box" size="0.1 0.1 0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>'
         '<actuator><motor name="drive" joint="rail"/></actuator></mujoco>',
         (("cart", "rail", "drive", 6.0),),

@@ -301,8 +301,10 @@ class MCMC(Estimator[MCMCState]):
         """What emcee proposes, and the shares of these moves."""
         import emcee
 
+        from sipe_bayes.posterior.snooker import SnookerMove
+
         independent = emcee.moves.MHMove(IndependentMove(state.proposal, self.space))
-        kinds = (independent, emcee.moves.DEMove(), emcee.moves.DESnookerMove())
+        kinds = (independent, emcee.moves.DEMove(), SnookerMove())
         return list(zip(kinds, self.options.tuning.moves, strict=True))
 
     def _mixing(self, state: MCMCState) -> dict[str, float]:

@@ -14,9 +14,9 @@ diag(tau) that leaves
     p(y_k \mid \mu, \tau) \propto |I + S L_k S|^{-1/2} e^{-(\mu - m_k)' P_k (\mu - m_k) / 2}, \qquad
     P_k = L_k - L_k S (I + S L_k S)^{-1} S L_k ,
 
-normal in mu, so that only tau is sampled (emcee). A. Gelman, "Prior distributions for variance parameters in
-hierarchical models", Bayesian Analysis 1 (2006), 515-533, https://doi.org/10.1214/06-BA117A, section 5, on the
-half-normal's kin.
+normal in mu, so that only tau is sampled (emcee), and mu with it where hardly a mu lies in the cube. A. Gelman, "Prior
+distributions for variance parameters in hierarchical models", Bayesian Analysis 1 (2006), 515-533,
+https://doi.org/10.1214/06-BA117A, section 5, on the half-normal's kin.
 
 Deviations:
 
@@ -26,7 +26,7 @@ Deviations:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import emcee
@@ -36,9 +36,11 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior.snooker import SnookerMove
 from sipe_bayes.posterior.truncated_normal import interval_quantile
 
 _FARTHEST = 40.0  # times the prior's scale: a spread beyond
+_FEW = 0.02  # share of mu in the cube, below which tau is sampled together with it
 _MIDDLE = 3.0  # precision around the cube's middle, by which mu is drawn and which the draws' weights take away again
 
 
@@ -95,7 +97,7 @@ def random_effects(
         options: of the sampling.
 
     Raises:
-        ValueError: for fewer than two logs, or where no draw lies in the cube.
+        ValueError: for fewer than two logs.
     """
     if len(logs) < 2:
         raise ValueError(f"logs: expected two or more, got {len(logs)}; one log tells nothing of what differs")
@@ -108,12 +110,17 @@ def random_effects(
     )
     random = np.random.default_rng(seed)
     tau = np.repeat(model.sampled(options, random), options.tries, axis=0)
-    common, new_log, kept = model.drawn(tau, random)
-    if not kept.any():
-        raise ValueError("logs: expected estimates near the cube, got none; widen the parameters' bounds")
-    space, weights = prior.space, np.exp(0.5 * _MIDDLE * ((common[kept] - 0.5) ** 2).sum(1))
-    shared = Particles(common[kept], space, weights=weights)
-    return RandomEffects(shared, Particles(new_log[kept], space, weights=weights), tau[kept])
+    mu = model.drawn(tau, random)
+    kept = ((mu >= 0) & (mu <= 1)).all(1)
+    if kept.mean() < _FEW:  # the logs ask for values beyond the bounds
+        mu, tau = model.sampled_inside(options, random)
+        weights = np.ones(len(mu))
+    else:
+        mu, tau = mu[kept], tau[kept]
+        weights = np.exp(0.5 * _MIDDLE * ((mu - 0.5) ** 2).sum(1))
+    further = mu + tau * interval_quantile(-mu / tau, (1 - mu) / tau, random.uniform(size=mu.shape))
+    common, new_log = (Particles(theta, prior.space, weights=weights) for theta in (mu, further))
+    return RandomEffects(common, new_log, tau)
 
 
 @dataclass(frozen=True)
@@ -134,39 +141,75 @@ class _Model:
         marginal = 0.5 * (marginal + np.swapaxes(marginal, -1, -2))
         pulls = np.einsum("wkij,kj->wki", marginal, self.mean)
         level = -0.5 * np.linalg.slogdet(inner)[1].sum(1) - 0.5 * np.einsum("wki,ki->w", pulls, self.mean)
-        flat = _MIDDLE * np.eye(n)
-        precision = marginal.sum(1) + self.prior.precision + flat
-        pull = pulls.sum(1) + self.prior.precision @ self.prior.mean + flat @ np.full(n, 0.5)
-        return level, precision, pull
+        return level, marginal.sum(1) + self.prior.precision, pulls.sum(1) + self.prior.precision @ self.prior.mean
 
-    def log_density(self, log_tau: FloatArray) -> FloatArray:
-        """Of log tau (W, N), up to a constant (W,)."""
-        far = (log_tau > np.log(_FARTHEST * self.scale)).any(1)  # next to no prior, and no numbers for it
-        tau = np.exp(np.where(far[:, None], 0.0, log_tau))
+    def flattened(self, tau: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``shared`` with a weak normal around the cube's middle, so that mu can be drawn; mean (W, N), not pull."""
         level, precision, pull = self.shared(tau)
+        precision, pull = precision + _MIDDLE * np.eye(tau.shape[-1]), pull + 0.5 * _MIDDLE
         mean = np.linalg.solve(precision, pull[..., None])[..., 0]
-        level = level + 0.5 * (pull * mean).sum(1) - 0.5 * np.linalg.slogdet(precision)[1]
-        density: FloatArray = level + (log_tau - 0.5 * (tau / self.scale) ** 2).sum(1)
-        return np.where(far, -np.inf, density)
+        return level + 0.5 * (pull * mean).sum(1) - 0.5 * np.linalg.slogdet(precision)[1], precision, mean
+
+    def spread_density(self, log_tau: FloatArray) -> FloatArray:
+        """Of log tau (W, N), up to a constant (W,)."""
+        far = self._too_far(log_tau)
+        tau = np.exp(np.where(far[:, None], 0.0, log_tau))
+        return np.where(far, -np.inf, self.flattened(tau)[0] + self._spread_prior(log_tau))
+
+    def joint_density(self, both: FloatArray) -> FloatArray:
+        """Of mu in the cube and log tau (W, 2 N), up to a constant (W,)."""
+        mu, log_tau = np.split(both, 2, axis=1)
+        outside = ((mu < 0) | (mu > 1)).any(1) | self._too_far(log_tau)
+        mu, tau = np.where(outside[:, None], 0.5, mu), np.exp(np.where(outside[:, None], 0.0, log_tau))
+        level, precision, pull = self.shared(tau)
+        level = level + (pull * mu).sum(1) - 0.5 * np.einsum("wi,wij,wj->w", mu, precision, mu)
+        return np.where(outside, -np.inf, level + self._spread_prior(log_tau))
+
+    def _too_far(self, log_tau: FloatArray) -> BoolArray:
+        """Next to no prior, and no numbers for it."""
+        return np.asarray((log_tau > np.log(_FARTHEST * self.scale)).any(1))
+
+    def _spread_prior(self, log_tau: FloatArray) -> FloatArray:
+        return np.asarray((log_tau - 0.5 * np.exp(2 * np.minimum(log_tau, 300.0)) / self.scale**2).sum(1))
 
     def sampled(self, options: RandomEffectsOptions, random: np.random.Generator) -> FloatArray:
         """Draws of tau (M, N)."""
         n = self.mean.shape[1]
         walkers = max(options.walkers * n, 32)
         start = np.log(self.scale * random.uniform(0.02, 1.0, (walkers, n)))
-        seed = int(random.integers(2**32))
-        state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
-        moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
-        sampler = emcee.EnsembleSampler(walkers, n, self.log_density, vectorize=True, moves=moves)
-        sampler.run_mcmc(state, options.warmup + options.steps)
-        tau: FloatArray = np.exp(sampler.get_chain(discard=options.warmup, thin=10, flat=True))
-        return tau
+        return np.exp(_walked(self.spread_density, start, options, random))
 
-    def drawn(self, tau: FloatArray, random: np.random.Generator) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """For each tau (M, N) a mu (M, N), a new log's theta (M, N) within the cube, and whether mu is in it (M,)."""
-        _, precision, pull = self.shared(tau)
-        mean = np.linalg.solve(precision, pull[..., None])[..., 0]
+    def sampled_inside(
+        self, options: RandomEffectsOptions, random: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draws of mu in the cube (M, N) and of tau (M, N), where the logs ask for values beyond its bounds."""
+        walkers = max(2 * options.walkers * self.mean.shape[1], 128)
+        near = np.clip(self.mean.mean(0), 0.02, 0.98)
+        apart = np.clip(np.sqrt(((self.mean - near) ** 2).mean(0)), 1e-6, self.scale * _FARTHEST / 4)
+        tau = apart * random.uniform(0.5, 2.0, (walkers, len(near)))
+        mu = near + apart / np.sqrt(len(self.mean)) * random.standard_normal(tau.shape)
+        start = np.concatenate([np.clip(mu, 0.001, 0.999), np.log(tau)], 1)
+        mu, log_tau = np.split(_walked(self.joint_density, start, options, random), 2, axis=1)
+        return mu, np.exp(log_tau)
+
+    def drawn(self, tau: FloatArray, random: np.random.Generator) -> FloatArray:
+        """For each tau (M, N) a mu (M, N), in the cube or not."""
+        _, precision, mean = self.flattened(tau)
         root = np.linalg.cholesky(np.linalg.inv(precision))
-        mu = mean + (root @ random.standard_normal((*tau.shape, 1)))[..., 0]
-        theta = mu + tau * interval_quantile(-mu / tau, (1 - mu) / tau, random.uniform(size=tau.shape))
-        return mu, theta, np.asarray(((mu >= 0) & (mu <= 1)).all(1))
+        return np.asarray(mean + (root @ random.standard_normal((*tau.shape, 1)))[..., 0])
+
+
+def _walked(
+    density: Callable[[FloatArray], FloatArray],
+    start: FloatArray,
+    options: RandomEffectsOptions,
+    random: np.random.Generator,
+) -> FloatArray:
+    """Draws (M, D) of a density of (W, D) with values (W,); walkers begin at ``start`` (W, D)."""
+    seed = int(random.integers(2**32))
+    state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
+    moves = [(emcee.moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
+    sampler = emcee.EnsembleSampler(*start.shape, density, vectorize=True, moves=moves)
+    sampler.run_mcmc(state, options.warmup + options.steps)
+    chain: FloatArray = sampler.get_chain(discard=options.warmup, thin=10, flat=True)
+    return chain

@@ -214,7 +214,9 @@ def _walk(
     """Chain (steps, W, N) and the ensemble's last state, from walkers (W, N) or a state."""
     import emcee
 
-    moves = [(emcee.moves.DEMove(), 0.6), (emcee.moves.DESnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
+    from sipe_bayes.posterior.snooker import SnookerMove
+
+    moves = [(emcee.moves.DEMove(), 0.6), (SnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
     if proposal is not None:
         moves = [(move, share / 2) for move, share in moves] + [(emcee.moves.MHMove(proposal), 0.5)]
     state = emcee.State(getattr(begin, "coords", begin), random_state=random.get_state())

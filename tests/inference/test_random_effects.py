@@ -48,6 +48,7 @@ def by_quadrature(estimates: list[LogEstimate]) -> tuple[float, float, float, fl
         ([0.3, 0.5, 0.55, 0.4, 0.62, 0.45], [0.01] * 6),  # differ
         ([0.05, 0.02, 0.3], [0.01, 0.05, 0.2]),  # beside a bound, of unequal worth
         ([0.5, 0.5, 0.9], [0.01, 0.01, 0.01]),  # one is odd
+        ([1.3, 1.32, 1.29, 1.3], [0.01] * 4),  # agree on what is beyond the bounds
     ],
 )
 def test_one_parameter_is_as_by_quadrature(means: list[float], sds: list[float]) -> None:

@@ -82,22 +82,20 @@ def missing_physics(
         options: of the search for causes.
 
     Returns:
-        None where nothing can be compared: a single log of one window, or estimates that all lie far outside the cube.
+        None where nothing can be compared: a single log of one window.
     """
     parts = parts_of(logs.windows)
     if len(parts) < 2:
         return None
     causes = _Causes.of(logs, options)
-    plain = _further(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed)
+    plain = random_effects(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed).new_log
     if not len(causes.kept):
-        return None if plain is None else MissingPhysics(plain, (), False)
+        return MissingPhysics(plain, (), False)
     explained = causes.explain(logs, seed)
-    corrected = _further(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed)
-    if corrected is None:
-        return None if plain is None else MissingPhysics(plain, (), False)
+    corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
     corrected = causes.widened(corrected, np.random.default_rng(seed))
     named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
-    if explained or plain is None:
+    if explained:
         return MissingPhysics(corrected, named, explained)
     return MissingPhysics(_mixed(plain, corrected), named, False)
 
@@ -110,13 +108,6 @@ def _estimates(
     residual = logs.residual - logs.jacobian[..., n:count] @ sizes
     lin = Linearisation(residual, np.concatenate([logs.jacobian[..., :n], logs.jacobian[..., count:]], -1), True)
     return linear_estimates(logs.windows, logs.theta, logs.starts, noise, lin, parts)
-
-
-def _further(estimates: list[LogEstimate], prior: Posterior, seed: int) -> Particles | None:
-    try:
-        return random_effects(estimates, prior, seed).new_log
-    except ValueError:  # none near the cube
-        return None
 
 
 def _mixed(one: Particles, other: Particles) -> Particles:
