@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.calibration.problem import Problem, method_of
 from sipe_bayes.core.files import write_text
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.likelihood.windows import Windows
@@ -32,10 +32,10 @@ def scores(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, float]]:
     """RMSE by held-out log and angle."""
     assert problem.holdout is not None
     windows = Windows(problem.likelihood, problem.simulator, problem.holdout)
-    found = errors(windows, np.clip(theta, 0, 1)[None])[0]
+    per_log = errors(windows, np.clip(theta, 0, 1)[None])[0]
     return {
         log: dict(zip(windows.fitted, row.round(4).tolist(), strict=True))
-        for log, row in zip(problem.holdout.names, found, strict=True)
+        for log, row in zip(problem.holdout.names, per_log, strict=True)
     }
 
 
@@ -48,21 +48,14 @@ def chirps(rows: dict[str, dict[str, float]]) -> dict[str, float]:
 def main() -> None:
     problem = sipe.prepare(CONFIG)
     began = time.monotonic()
-    method = sipe.get_estimator(
-        problem.simulator,
-        "laplace",
-        prior=problem.prior,
-        likelihood=problem.likelihood,
-        seed=0,
-        **problem.config.search.model_dump(),
-    )
+    method = method_of(problem, None, 0, None)
     posterior = method.fit(problem.train)
     seconds = time.monotonic() - began
     space, mode = problem.environment.space, posterior.mode.numpy()
     ours, nominal = scores(problem, mode), scores(problem, space.default_theta)
     draws = posterior.values(4000, generator=torch.Generator().manual_seed(0))
     values = space.values(mode)
-    found: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "command": "python examples/studies/furuta_heldout.py",
         "chirps_minus_1.5V": {
             "posterior_mode": chirps(ours),
@@ -81,8 +74,8 @@ def main() -> None:
         "seconds": round(seconds, 1),
     }
     result = HERE / "results" / "furuta_heldout.json"
-    write_text(result, json.dumps(found, indent=2) + "\n")
-    print(json.dumps(found, indent=2))
+    write_text(result, json.dumps(summary, indent=2) + "\n")
+    print(json.dumps(summary, indent=2))
 
 
 if __name__ == "__main__":

@@ -147,7 +147,7 @@ class _Model:
         """``shared`` with a weak normal around the cube's middle, so that mu can be drawn; mean (W, N), not pull."""
         level, precision, pull = self.shared(tau)
         precision, pull = precision + _MIDDLE * np.eye(tau.shape[-1]), pull + 0.5 * _MIDDLE
-        mean = np.linalg.solve(precision, pull[..., None])[..., 0]
+        mean: FloatArray = np.linalg.solve(precision, pull[..., None])[..., 0].astype(np.float64, copy=False)
         return level + 0.5 * (pull * mean).sum(1) - 0.5 * np.linalg.slogdet(precision)[1], precision, mean
 
     def spread_density(self, log_tau: FloatArray) -> FloatArray:
