@@ -22,15 +22,20 @@ import sipe_bayes
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Table
 from sipe_bayes.calibration.config_tables import NormalPrior
+from sipe_bayes.calibration.readers.base import WIDEST
 from sipe_bayes.calibration.readers.tables import READERS
 from sipe_bayes.cli.app import app
+from sipe_bayes.core.files import LIMITS, LONGEST_TEXT, VARIABLES
 from sipe_bayes.core.finding_advice import ADVICE, plain
 from sipe_bayes.core.finding_texts import Code
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.thresholds import Thresholds
 from sipe_bayes.core.units import DIMENSIONS, UNITS, unit_words
+from sipe_bayes.core.validation import MOST_ROLLOUTS
 from sipe_bayes.datasets.demonstrations import AGENT_FILES
 from sipe_bayes.diagnostics.catalogue import tasks
+from sipe_bayes.envs.foreign.load import LEAST_TIMESTEP
+from sipe_bayes.envs.foreign.trial import MOST_FILES
 from sipe_bayes.envs.target_texts import TARGET_TEXTS
 from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -104,6 +109,21 @@ Words for `unit` in a configuration; the first of each row is the one that value
 factors: [units and signs](../units-and-signs.md).
 
 {table(("of", "words"), rows)}"""
+
+
+def limits() -> str:
+    """What files may ask for, and the environment variables that say so, from ``core.files``."""
+    rows = [(f"`{name}`", text, code(LIMITS.get(name, ""))) for name, text in VARIABLES.items()]
+    return f"""# Limits and environment variables
+
+What a file may ask for is bounded before anything is allocated for it. A line that refuses a file names the limit; an
+environment variable raises it, no file can.
+
+{table(("variable", "what it is", "default"), rows)}
+Without a variable: JSON and TOML have at most {LONGEST_TEXT // 2**20} MiB, a column of a log {WIDEST} numbers a row, a
+model {MOST_FILES} included files and a timestep of at least {LEAST_TIMESTEP:g} s, a command {MOST_ROLLOUTS:g} rollouts.
+What is promised of files: [SECURITY.md](../../SECURITY.md).
+"""
 
 
 def targets() -> str:
@@ -306,7 +326,7 @@ def entry(name: str) -> str:
 PAGES = {
     page.__name__: page
     for page in (
-        *(configuration, units, targets, logs, estimators, extensions, agents),
+        *(configuration, limits, units, targets, logs, estimators, extensions, agents),
         *(environments, findings, thresholds, commands, python),
     )
 }

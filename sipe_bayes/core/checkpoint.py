@@ -176,6 +176,8 @@ def _restored(name: str, plain: Any, kind: Any, arrays: dict[str, Any]) -> Any:
         return origin(_restored(f"{name}.{k}", v, items[k], arrays) for k, v in enumerate(plain))
     if origin is dict:
         return {k: _restored(f"{name}.{k}", v, arguments[1], arrays) for k, v in plain.items()}
+    if kind is Tensor or origin is np.ndarray:
+        raise ValueError(f"{name.lstrip('.')}: expected an array, got a {type(plain).__name__}")
     if kind in (bool, int, float, str) and not isinstance(plain, (int, float) if kind is float else kind):
         raise ValueError(f"{name.lstrip('.')}: expected {kind.__name__}, got a {type(plain).__name__}")
     return plain

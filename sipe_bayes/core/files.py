@@ -24,8 +24,21 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LOG_GIB, MODEL_GIB, MODEL_SECONDS = "SIPE_LOG_GIB", "SIPE_MODEL_GIB", "SIPE_MODEL_SECONDS"
-_LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 20.0}
-_LONGEST_TEXT = 2**25  # bytes of JSON or TOML: what it becomes in memory is twenty times as much
+TRUST_MODELS, DATA = "SIPE_TRUST_MODELS", "SIPE_BAYES_DATA"
+LONGEST_TEXT = 2**25
+"""Bytes of JSON or TOML: what it becomes in memory is twenty times as much."""
+LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 20.0}
+"""What files may ask for, unless an environment variable of that name says otherwise."""
+VARIABLES = {
+    LOG_GIB: "GiB that a log's columns, or the arrays of a file, may take in memory; a file that has more itself may",
+    MODEL_GIB: "GiB that MuJoCo may take for a model file and its first steps",
+    MODEL_SECONDS: "s of CPU time that MuJoCo may take for a model file and its first steps",
+    TRUST_MODELS: "`1`: model files are not tried in a process of their own, and may include files from outside "
+    "their folder",
+    DATA: "the folder of the trajectory sets and what else lies outside the package; default `sipe_bayes` in the "
+    "user's cache (`XDG_CACHE_HOME`, or `~/.cache`)",
+}
+"""Every environment variable that this package reads for itself, and what it is."""
 _WORDS = 200  # characters of what a library says
 
 
@@ -110,8 +123,9 @@ def reading(path: object, what: str, remedy: str, kind: type[ValueError] = FileE
 
 
 def shortened(text: str) -> str:
-    """A line in which no word is longer than anybody reads."""
-    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...", text)
+    """A line that prints, in which no word is longer than anybody reads."""
+    printed = "".join(c if c.isprintable() else "?" for c in text)
+    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...", printed)
 
 
 def reason(error: Exception) -> str:
@@ -138,11 +152,11 @@ def limit(name: str) -> float:
     """
     given = os.environ.get(name, "")
     try:
-        value = float(given) if given else _LIMITS[name]
+        value = float(given) if given else LIMITS[name]
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise FileError(f"{name}={given}: expected a number above 0; {_LIMITS[name]:g} is the default")
+        raise FileError(f"{name}={given}: expected a number above 0; {LIMITS[name]:g} is the default")
     return value
 
 
@@ -153,8 +167,8 @@ def read_text(path: Path, what: str, remedy: str, kind: type[ValueError] = FileE
     with reading(path, what, remedy, kind):
         if not path.is_file():
             raise ValueError("is no plain file")
-        if path.stat().st_size > _LONGEST_TEXT:
-            raise ValueError(f"has {path.stat().st_size} bytes, the most is {_LONGEST_TEXT}")
+        if path.stat().st_size > LONGEST_TEXT:
+            raise ValueError(f"has {path.stat().st_size} bytes, the most is {LONGEST_TEXT}")
         return path.read_text(encoding="utf-8")
 
 

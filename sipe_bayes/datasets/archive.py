@@ -11,7 +11,7 @@ import io
 import zipfile
 from pathlib import Path
 
-from sipe_bayes.core.files import write_bytes
+from sipe_bayes.core.files import reading, write_bytes
 from sipe_bayes.datasets.trajectory_sets import (
     IN_PACKAGE,
     MANIFEST,
@@ -65,13 +65,14 @@ def install(archive: Path) -> Path:
     """
     remedy = "take the archive that lies beside this version's release"
     wanted, folder = manifest(IN_PACKAGE), data_folder() / "trajectories"
-    try:
-        with zipfile.ZipFile(archive) as opened:
-            content = {file: opened.read(file) for file in wanted}
-    except (OSError, KeyError, zipfile.BadZipFile) as error:
-        raise TrajectorySetError(
-            f"{archive}: cannot be read as an archive of trajectory sets ({error}); {remedy}"
-        ) from None
+    with (
+        reading(archive, "an archive of trajectory sets", remedy, TrajectorySetError),
+        zipfile.ZipFile(archive) as opened,
+    ):
+        content = {}
+        for file, entry in wanted.items():
+            with opened.open(file) as member:
+                content[file] = member.read(entry.bytes + 1)  # no more, whatever it claims
     for file, entry in wanted.items():
         if hashlib.sha256(content[file]).hexdigest() != entry.sha256:
             raise TrajectorySetError(f"{archive}: the SHA-256 of {file} is not the manifest's; {remedy}")

@@ -2,7 +2,8 @@
 
 ``sipe.from_minari("mujoco/halfcheetah/expert-v0")`` reads a data set that is installed, whoever made it;
 ``sipe data export --minari NAME`` writes one. It is looked for, and written, where Minari has them: in the folder of
-``MINARI_DATASETS_PATH``, default ~/.minari/datasets. Nothing is downloaded, and no code that a data set names is run.
+``MINARI_DATASETS_PATH``, default ~/.minari/datasets. Nothing is downloaded, and no code that a data set names is run:
+one that does not say its spaces, for which Minari would make the environment that it names, is refused.
 
 An observation that is a dictionary or a tuple becomes one row: its parts in the space's order, but the achieved and the
 desired goal of a goal-based environment last, as in this library's Fetch tasks. Minari has no place for the physics
@@ -19,11 +20,14 @@ from typing import Any
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.files import LOG_GIB, FileError, limit, read_json, reading
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.registry import TASKS
 
 _GOALS = ("achieved_goal", "desired_goal")
 _STATE = "state"
+_METADATA, _HDF5 = "metadata.json", "main_data.hdf5"
+_WHAT, _REMEDY = "a Minari data set", "see `minari list local`"
 
 
 def from_minari(dataset: str | Path, dt: float | None = None) -> Trajectories:
@@ -38,10 +42,15 @@ def from_minari(dataset: str | Path, dt: float | None = None) -> Trajectories:
         ValueError: for what cannot be read.
         ModuleNotFoundError: without Minari.
     """
-    opened = _open(dataset)
+    minari, folder = _minari(), _data_folder(dataset)
+    with reading(dataset, _WHAT, _REMEDY):
+        _check_said(folder)
+        opened = minari.MinariDataset(folder)
+        spec = opened.spec.env_spec
     if dt is None:
-        dt = _dt(opened.spec.env_spec, dataset)
-    episodes = [_trajectory(episode, dt, str(dataset)) for episode in opened.iterate_episodes()]
+        dt = _dt(spec, dataset)
+    with reading(dataset, _WHAT, _REMEDY):
+        episodes = [_trajectory(episode, dt, str(dataset)) for episode in opened.iterate_episodes()]
     if not episodes:
         raise ValueError(f"dataset: {dataset} holds no episodes; take another")
     return Trajectories.stack(episodes)
@@ -126,18 +135,42 @@ def _minari() -> Any:
     return minari
 
 
-def _open(dataset: str | Path) -> Any:
-    """A minari.MinariDataset; raises ValueError for what is none."""
-    minari, folder = _minari(), Path(dataset)
-    try:
-        if folder.is_dir():
-            return minari.MinariDataset(folder / "data" if (folder / "data").is_dir() else folder)
-        return minari.load_dataset(str(dataset))
-    except (ValueError, OSError, KeyError) as error:
-        raise ValueError(
-            f"dataset: {dataset} cannot be read as a Minari data set ({' '.join(str(error).split())}); "
-            "see `minari list local`"
-        ) from None
+def _data_folder(dataset: str | Path) -> Path:
+    """Where a data set's files lie; raises ValueError where there is none."""
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    folder = Path(dataset)
+    if not folder.is_dir():
+        with reading(dataset, _WHAT, _REMEDY):
+            folder = Path(get_dataset_path(str(dataset)))
+    inside = folder / "data" if (folder / "data").is_dir() else folder
+    if not (inside / _METADATA).is_file():
+        raise ValueError(f"dataset: {dataset} cannot be read as {_WHAT} (no {_METADATA} in {inside}); {_REMEDY}")
+    return inside
+
+
+def _check_said(folder: Path) -> None:
+    """See that nothing has to be run to read a data set, and that it claims no more than it may.
+
+    Raises:
+        ValueError: within ``reading``.
+    """
+    metadata = read_json(folder / _METADATA, "what a Minari data set says of itself", _REMEDY)
+    missing = [name for name in ("observation_space", "action_space") if not isinstance(metadata.get(name), str)]
+    if missing:
+        raise FileError(f"{folder / _METADATA}: has no {missing[0]}, and what it names is not run; export it anew")
+    if (folder / _HDF5).is_file():
+        _check_size(folder / _HDF5)
+
+
+def _check_size(path: Path) -> None:
+    import h5py
+
+    sizes: list[int] = []
+    with h5py.File(path, "r") as file:
+        file.visititems(lambda _, item: sizes.append(item.nbytes) if isinstance(item, h5py.Dataset) else None)
+    if sum(sizes) > max(limit(LOG_GIB) * 2**30, path.stat().st_size):
+        raise ValueError(f"claims {sum(sizes) / 2**30:.3g} GiB, the most is {limit(LOG_GIB):g} ({LOG_GIB})")
 
 
 def _dt(spec: Any, dataset: str | Path) -> float:
@@ -171,7 +204,7 @@ def _trajectory(episode: Any, dt: float, dataset: str) -> Trajectory:
             observations, actions, dt, states, str(episode.id), rewards=np.asarray(episode.rewards, float)
         )
     except ValueError as error:
-        raise ValueError(f"dataset: {dataset}, episode {episode.id}: {error}") from None
+        raise FileError(f"dataset: {dataset}, episode {episode.id}: {error}") from None
 
 
 def _rows(values: Any, goals_last: bool) -> FloatArray:
@@ -185,5 +218,5 @@ def _rows(values: Any, goals_last: bool) -> FloatArray:
         return np.concatenate([_rows(part, goals_last) for part in values], axis=1)
     array = np.asarray(values)
     if not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
-        raise ValueError(f"dataset: expected numbers, got {array.dtype}; convert it first")
+        raise FileError(f"dataset: expected numbers, got {array.dtype}; convert it first")
     return array.reshape(len(array), -1).astype(np.float64)

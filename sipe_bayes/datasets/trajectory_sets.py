@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import read_arrays, read_json, reading, to_json, write_bytes, write_text
+from sipe_bayes.core.files import DATA, read_arrays, read_json, reading, to_json, write_bytes, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
 from sipe_bayes.envs.task import VARIANTS, Variant
@@ -47,7 +47,6 @@ from sipe_bayes.simulation.simulator import Simulator
 
 IN_PACKAGE = Path(__file__).parent / "trajectories"
 """The manifest of the sets that are released, and, in a source tree, their files."""
-DATA = "SIPE_BAYES_DATA"
 """Names the folder in which ``trajectories`` is looked for."""
 FORMAT = "sipe_bayes.trajectories/1"
 MANIFEST = "manifest.json"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
@@ -107,11 +108,17 @@ class Training:
         return TrainingState(weights, first_moment, second_moment, self.steps, mean, sd)
 
     def load(self, state: TrainingState) -> None:
-        """Go on from what ``state`` returned."""
+        """Go on from what ``state`` returned; raises ValueError for that of a discriminator of another size."""
         parameters = list(self.network.layers.parameters())
-        vector_to_parameters(torch.tensor(state.weights), parameters)
-        sizes = [p.numel() for p in parameters]
-        first, second = (torch.tensor(moment).split(sizes) for moment in (state.first_moment, state.second_moment))
+        sizes, features = [p.numel() for p in parameters], self.network.standardise.mean.shape
+        weights, *moments = (
+            _of_shape(values, (sum(sizes),)) for values in (state.weights, state.first_moment, state.second_moment)
+        )
+        mean, sd = (_of_shape(values, tuple(features)) for values in (state.mean, state.sd))
+        if not 0 <= state.steps < 2**63:
+            raise ValueError("the checkpoint's discriminator claims impossibly many steps; delete it to start again")
+        vector_to_parameters(weights, parameters)
+        first, second = (moment.split(sizes) for moment in moments)
         self.steps = state.steps
         for p, a, b in zip(parameters, first, second, strict=True):
             self.optimiser.state[p] = {
@@ -119,5 +126,14 @@ class Training:
                 "exp_avg": a.view_as(p).clone(),
                 "exp_avg_sq": b.view_as(p).clone(),
             }
-        self.network.standardise.mean.copy_(torch.tensor(state.mean))
-        self.network.standardise.sd.copy_(torch.tensor(state.sd))
+        self.network.standardise.mean.copy_(mean)
+        self.network.standardise.sd.copy_(sd)
+
+
+def _of_shape(values: Float32Array, shape: tuple[int, ...]) -> Tensor:
+    if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
+        raise ValueError(
+            f"the checkpoint's discriminator has {values.dtype} {values.shape}, expected float32 {shape} of finite "
+            "numbers; it is of other options or damaged: delete the checkpoint to start again"
+        )
+    return torch.tensor(values)

@@ -24,7 +24,7 @@ from sipe_bayes.report.drawing import column_of_panels, equal_parts, new_figure,
 from sipe_bayes.report.legends import line_handle, shade_handle
 from sipe_bayes.report.panels import correlation, draws, marginal_grid, pair_grid, scale, view
 from sipe_bayes.report.posterior_plots import MAX_PAIRS
-from sipe_bayes.report.signal_panels import error_panel, signal_panel, worst_stretch
+from sipe_bayes.report.signal_panels import error_panel, signal_panel, within, worst_stretch
 from sipe_bayes.report.words import shortened, unit_text, with_unit
 
 
@@ -187,7 +187,7 @@ def log_figure(
     grid = figure.add_gridspec(2 * len(rows), 1 + long, height_ratios=[*heights] * len(rows), width_ratios=ratios)
     spans = [(float(first.time[0]), float(first.time[-1])), *([worst_stretch(rows)] if long else [])]
     for column, span in enumerate(spans):
-        for i, signal in enumerate(rows):
+        for i, signal in enumerate([within(row, span) for row in rows] if column else rows):
             above = figure.add_subplot(grid[2 * i, column])
             below = figure.add_subplot(grid[2 * i + 1, column], sharex=above)
             signal_panel(above, signal, span)

@@ -53,6 +53,10 @@ FIRST: dict[str, list[str]] = {
     "transfer status": ["runs"],
     "transfer cells": ["quick"],
     "transfer report": ["runs"],
+    "leaderboard run": ["prior", "--out", "entry"],
+    "leaderboard tasks": [],
+    "leaderboard submit-check": ["runs"],
+    "leaderboard report": ["runs", "--out", "page"],
 }
 """What each command is given where nothing odd stands in its place; a test holds that every command is here."""
 
@@ -71,10 +75,11 @@ def nothing_runs() -> Iterator[None]:
     from torch.utils import tensorboard
 
     from sipe_bayes.benchmark.executors import pool
+    from sipe_bayes.benchmark.leaderboard import run
     from sipe_bayes.simulation.engine import Engine
 
     places: list[tuple[Any, str]] = [
-        *((Engine, "advance"), (pool, "Pool"), (tensorboard, "SummaryWriter")),
+        *((Engine, "advance"), (pool, "Pool"), (tensorboard, "SummaryWriter"), (run, "made")),
     ]
     kept = [(place, name, getattr(place, name)) for place, name in places]
     for place, name in places:

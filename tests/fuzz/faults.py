@@ -142,9 +142,9 @@ class Case:
             raise RuntimeError(f"undisturbed it ends with exit code {process.returncode}: {errors[-500:]}")
 
     def fresh(self) -> Path:
-        """A new folder with the sound files."""
+        """A new folder with the sound files, of the same name as the others: runs are called after it."""
         self.count += 1
-        self.place = self.folder / f"run{self.count}"
+        self.place = self.folder / f"run{self.count}" / "case"
         shutil.copytree(self.folder / "sound", self.place)
         return self.place
 

@@ -31,7 +31,16 @@ PATIENCE = 10.0  # s of a case
 KILLED = 30.0  # s after which a case that no signal reaches is ended
 ROOM = 2 * 2**30
 LONGEST = 1000  # characters of a line
-WORDS = ("log ", "key ", "model", "parameter", "trajectory", "--", "sipe:")  # that name what is at fault, beside files
+WORDS = (
+    "log ",
+    "key ",
+    "model",
+    "parameter",
+    "trajectory",
+    "checkpoint",
+    "--",
+    "sipe:",
+)  # that name what is at fault, beside files
 
 
 class Hang(BaseException):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import random
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -208,13 +209,21 @@ class _State:
 
 def checkpoints(folder: Path) -> Change:
     """A search's state."""
+    from sipe_bayes.core.checkpoint import load_state
+
+    path = folder / "state.safetensors"
+    state = _State(torch.zeros(2, 3), _Inner(np.arange(3.0), 0.1), ("a", "b"), 3, {"x": 1.0})
+    return of_state(path, state, lambda: load_state(path, _State, "mine"))
+
+
+def of_state(path: Path, state: Any, read: Read) -> Change:
+    """A state's checkpoint, with a checksum that fits."""
     from safetensors import safe_open
 
     from sipe_bayes.core import checkpoint
-    from sipe_bayes.core.checkpoint import load_state, save_state
+    from sipe_bayes.core.checkpoint import save_state
 
-    path = folder / "state.safetensors"
-    save_state(path, _State(torch.zeros(2, 3), _Inner(np.arange(3.0), 0.1), ("a", "b"), 3, {"x": 1.0}), "mine")
+    save_state(path, state, "mine")
     whole = path.read_bytes()
     with safe_open(path, framework="numpy") as file:
         plain = json.loads(file.metadata()["plain"])
@@ -228,7 +237,7 @@ def checkpoints(folder: Path) -> Change:
             text = text_of(mutations.of_data(plain, chance)).decode("utf-8", "replace")
             checksum = checkpoint.checksum(some, text)
             path.write_bytes(save(some, {"plain": text, "fingerprint": "mine", "sha256": checksum}))
-        return lambda: load_state(path, _State, "mine")
+        return read
 
     return change
 
@@ -278,6 +287,95 @@ def descriptions(folder: Path) -> Change:
     return change
 
 
+def learned_rewards(folder: Path) -> Change:
+    """A discriminator's state, as a search's checkpoint holds it."""
+    from sipe_bayes.core.checkpoint import load_state
+    from sipe_bayes.models.discriminator import Discriminator, Training, TrainingState
+
+    def load() -> None:
+        Training(Discriminator(3, 0, 4), 1e-3).load(load_state(path, TrainingState, "mine"))
+
+    path = folder / "state.safetensors"
+    return of_state(path, Training(Discriminator(3, 0, 4), 1e-3).state(), load)
+
+
+def archives(folder: Path) -> Change:
+    """An archive of trajectory sets; nothing is stored, as none has what the manifest says."""
+    from sipe_bayes.datasets import archive, trajectory_sets
+
+    path, (name, *_) = folder / "sets.zip", sorted(trajectory_sets.manifest(trajectory_sets.IN_PACKAGE))
+    with zipfile.ZipFile(path, "w") as opened:
+        opened.writestr(name, b"content", zipfile.ZIP_DEFLATED)
+    whole = path.read_bytes()
+
+    def change(chance: random.Random) -> Read:
+        path.write_bytes(mutations.of_bytes(whole, chance))
+        return lambda: archive.install(path)
+
+    return change
+
+
+def entries(folder: Path) -> Change:
+    """An entry of the leaderboard: what made it, and its answers to a task."""
+    from sipe_bayes.benchmark.leaderboard import entry as board
+    from sipe_bayes.benchmark.leaderboard.registry import TASKS
+    from sipe_bayes.benchmark.leaderboard.scoring import made
+
+    task = TASKS["two_moons"]
+    problem = made(task.name)
+    board.Entry("mine", "command", [0], {"numpy": "2"}).write(folder)
+    answers = {case.name: board.Answer([[0.1, 0.2], [0.3, 0.1]], 3, 0.1) for case in problem.cases[:2]}
+    board.Answers(task.name, task.definition(problem), list(problem.space.names), answers).write(folder)
+    files = {
+        path: json.loads(path.read_text()) for path in (folder / board.ENTRY, board.answers_path(folder, task.name))
+    }
+
+    def change(chance: random.Random) -> Read:
+        changed = chance.choice(list(files))
+        for path, plain in files.items():
+            path.write_bytes(changed_json(plain, chance) if path == changed else text_of(plain))
+        return lambda: (board.Entry.read(folder), board.read_answers(folder, task, problem))
+
+    return change
+
+
+def minari_sets(folder: Path) -> Change:
+    """A Minari data set: what it says of itself, and its HDF5."""
+    import h5py
+
+    from sipe_bayes.datasets.minari_data import from_minari
+
+    def box(size: int) -> str:
+        return json.dumps(
+            {"type": "Box", "dtype": "float64", "shape": [size], "low": [-9.0] * size, "high": [9.0] * size}
+        )
+
+    spec = {"id": "Pendulum-v1", "entry_point": None, "additional_wrappers": [], "kwargs": {}}
+    plain = {
+        **{"total_episodes": 1, "total_steps": 3, "dataset_id": "tests/own-v0", "minari_version": "0.5.4"},
+        **{"data_format": "hdf5", "observation_space": box(2), "action_space": box(1), "env_spec": json.dumps(spec)},
+    }
+    data, metadata = folder / "set" / "data" / "main_data.hdf5", folder / "set" / "data" / "metadata.json"
+    data.parent.mkdir(parents=True)
+    with h5py.File(data, "w") as file:
+        group = file.create_group("episode_0")
+        group.attrs.update(id=0, total_steps=3)
+        group["observations"], group["actions"], group["rewards"] = np.zeros((4, 2)), np.zeros((3, 1)), np.zeros(3)
+        group["terminations"], group["truncations"] = np.zeros(3, bool), np.ones(3, bool)
+    whole = data.read_bytes()
+
+    def change(chance: random.Random) -> Read:
+        data.write_bytes(whole)
+        metadata.write_bytes(text_of(plain))
+        if chance.random() < 0.5:
+            data.write_bytes(mutations.of_bytes(whole, chance))
+        else:
+            metadata.write_bytes(changed_json(plain, chance))
+        return lambda: from_minari(folder / "set", dt=0.1)
+
+    return change
+
+
 STORED = {
     "posterior": (posteriors, 20),
     "policy": (policies, 10),
@@ -286,5 +384,9 @@ STORED = {
     "trajectory sets": (trajectory_sets, 8),
     "checkpoint": (checkpoints, 8),
     "descriptions": (descriptions, 16),
+    "learned reward": (learned_rewards, 6),
+    "archive": (archives, 4),
+    "minari": (minari_sets, 8),
+    "leaderboard": (entries, 8),
 }
 """By name, and how often of all."""

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, FileError
-from sipe_bayes.envs.foreign.trial import TRUST
+from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, TRUST_MODELS, FileError
 from tests.fuzz import run
 from tests.fuzz.commands import FIRST, commands
 from tests.fuzz.corpus import CORPUS, read
@@ -20,7 +19,7 @@ SEEDS = 6  # of each target; `make fuzz` has 100,000
 
 @pytest.fixture(autouse=True)
 def _limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(TRUST)
+    monkeypatch.delenv(TRUST_MODELS)
     monkeypatch.setenv(MODEL_SECONDS, "1")
     monkeypatch.setenv(MODEL_GIB, "2")
 

@@ -23,6 +23,7 @@ import typer.main
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.cli.app import app
 from sipe_bayes.cli.examples import EXAMPLES
+from sipe_bayes.core.files import VARIABLES
 from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.finding_texts import Code
 from sipe_bayes.envs.sensing import NEUTRAL
@@ -76,6 +77,15 @@ def test_every_key_is_described() -> None:
     rows = generator().keys(Config, "")
     assert len(rows) > 40
     assert not [key for key, text, _ in rows if not text], "write a docstring below the field"
+
+
+def test_every_environment_variable_is_described() -> None:
+    named = {
+        name
+        for path in (*(ROOT / "sipe_bayes").rglob("*.py"), *PAGES)
+        for name in re.findall(r"\bSIPE_[A-Z_]+", path.read_text(encoding="utf-8"))
+    }
+    assert named == set(VARIABLES)
 
 
 def test_every_finding_says_what_to_do() -> None:

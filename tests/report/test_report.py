@@ -174,6 +174,19 @@ def test_a_long_log_gets_a_close_up_of_its_worst_stretch() -> None:
     png(figure)
 
 
+def test_what_a_pixel_shows_of_a_very_long_log_is_drawn() -> None:
+    """No more points than that, and a glitch of one sample among them."""
+    long = signal("train_0", "train", "angle_0", steps=60_000)
+    long.measured[12_345] = 7.0
+    (figure,) = plots.signals(dataclasses.replace(make_calibration(), signals=[long]), "train_0")
+    overview, _, closer, _ = figure.axes
+    for ax in (overview, closer):
+        lines = [line for line in ax.lines if len(line.get_xdata()) > 2]
+        assert lines
+        assert all(len(line.get_xdata()) <= 20_002 for line in lines)
+        assert max(float(np.nanmax(line.get_ydata())) for line in lines) == 7.0
+
+
 def test_a_default_that_runs_away_does_not_flatten_the_signal() -> None:
     wild = signal("train_0", "train", "angle_0")
     wild.default[:] = 1e6

@@ -22,18 +22,18 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, limit
+from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, TRUST_MODELS, limit
 
-TRUST = "SIPE_TRUST_MODELS"
 _STEPS = 5
 _START = 10.0  # s that a process may take until it reads the file
-_MOST_FILES = 1000  # that a model includes
+MOST_FILES = 1000
+"""That a model may include."""
 _INCLUDE = re.compile(r"<\s*(?:include|model)\b[^>]*?\bfile\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", re.DOTALL)
 
 
 def trusted() -> bool:
     """Whether the user vouches for every model."""
-    return os.environ.get(TRUST, "") not in ("", "0")
+    return os.environ.get(TRUST_MODELS, "") not in ("", "0")
 
 
 def refusal(path: Path) -> str:
@@ -71,14 +71,14 @@ def _files(path: Path) -> Iterator[Path]:
         if file in seen:
             continue
         seen.add(file)
-        if len(seen) > _MOST_FILES:
-            raise _OutsideError(f"includes more than {_MOST_FILES} files")
+        if len(seen) > MOST_FILES:
+            raise _OutsideError(f"includes more than {MOST_FILES} files")
         yield file
         for pair in _INCLUDE.findall(file.read_text(encoding="utf-8", errors="replace")):
             name = html.unescape(pair[0] or pair[1])
             places = {(folder / name).resolve() for folder in (root, file.parent)}
             if not all(place.is_relative_to(root) for place in places):
-                remedy = f"move it there, or set {TRUST}=1 if you trust this model"
+                remedy = f"move it there, or set {TRUST_MODELS}=1 if you trust this model"
                 raise _OutsideError(f"includes {name!r} from outside its folder {root}; {remedy}")
             waiting += [place for place in places if place.is_file()]
 
@@ -97,7 +97,7 @@ def _tried(path: str, content: str, seconds: float, gib: float) -> str:
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                timeout=seconds + 10,
+                timeout=seconds + _START,
             )
         except subprocess.TimeoutExpired:
             return _slow(seconds)

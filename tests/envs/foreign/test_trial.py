@@ -21,7 +21,7 @@ BODY = "<worldbody><body><joint/><geom size='.1'/></body></worldbody>"
 
 @pytest.fixture(autouse=True)
 def _limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(trial.TRUST)
+    monkeypatch.delenv(trial.TRUST_MODELS)
     monkeypatch.setenv("SIPE_MODEL_SECONDS", "1")
     monkeypatch.setenv("SIPE_MODEL_GIB", "4")
 
@@ -80,7 +80,7 @@ def test_includes_stay_in_the_folder(name: str, tmp_path: Path, monkeypatch: pyt
     path.write_text(f'<mujoco>{BODY}<include\n file = "{name.format(folder=tmp_path)}"/></mujoco>')
     assert "from outside its folder" in refusal(path)
     if name == "../part.xml":
-        monkeypatch.setenv(trial.TRUST, "1")
+        monkeypatch.setenv(trial.TRUST_MODELS, "1")
         load_spec(str(path))
 
 
