@@ -6,7 +6,6 @@ The benchmark's estimates and the transfer's agents are the two kinds; each is a
 from __future__ import annotations
 
 import hashlib
-import tempfile
 import time
 import traceback
 import warnings
@@ -21,7 +20,7 @@ from typing import ClassVar, Generic, TypeVar
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.executors.work import Done
 from sipe_bayes.benchmark.records import Record
-from sipe_bayes.core.files import installed_version, no_room
+from sipe_bayes.core.files import installed_version, no_room, scratch
 
 R = TypeVar("R", bound=Record)
 T = TypeVar("T")
@@ -133,8 +132,8 @@ def _at_hand(folder: Path) -> Iterator[Path]:
     if folder.is_dir():
         yield folder
     else:
-        with tempfile.TemporaryDirectory() as instead:
-            yield Path(instead)
+        with scratch() as instead:
+            yield instead
 
 
 class Clock:

@@ -9,7 +9,6 @@ import io
 import re
 import shutil
 import subprocess
-import tempfile
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +17,7 @@ from sipe_bayes.benchmark import report_html
 from sipe_bayes.benchmark.cells import BASELINES
 from sipe_bayes.benchmark.report_contents import Contents, Picture
 from sipe_bayes.benchmark.tables import Entry, Table
-from sipe_bayes.core.files import write_bytes, write_text
+from sipe_bayes.core.files import scratch, write_bytes, write_text
 from sipe_bayes.report.drawing import equal_parts
 from sipe_bayes.report.templates import latex_templates
 
@@ -127,7 +126,7 @@ def compile_pdf(folder: Path, seconds: int = 300) -> str:
     program = shutil.which("pdflatex")
     if program is None:
         return "report.pdf not made: pdflatex is not installed (Debian: texlive-latex-recommended)"
-    with tempfile.TemporaryDirectory() as work:
+    with scratch() as work:
         command = [program, "-interaction=nonstopmode", "-halt-on-error", f"-output-directory={work}", "report.tex"]
         for _ in range(3):  # contents, then the page numbers that they moved
             try:
@@ -139,5 +138,5 @@ def compile_pdf(folder: Path, seconds: int = 300) -> str:
             if done.returncode:
                 error = next((line for line in done.stdout.splitlines() if line.startswith("!")), "no reason given")
                 return f"report.pdf not made: pdflatex on {folder / 'report.tex'} says {error!r}"
-        write_bytes(folder / "report.pdf", Path(work, "report.pdf").read_bytes())
+        write_bytes(folder / "report.pdf", (work / "report.pdf").read_bytes())
     return ""

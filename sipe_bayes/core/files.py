@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import tempfile
 import uuid
 import zipfile
 from collections.abc import Iterator
@@ -78,6 +79,17 @@ def no_room(error: BaseException) -> OSError | None:
             return OSError(code, os.strerror(code))
         cause = cause.__cause__ or cause.__context__
     return None
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder that is gone at the end; OSError where none can be written, which tempfile says in its own way."""
+    try:
+        folder = tempfile.TemporaryDirectory()
+    except FileNotFoundError as error:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "temporary folder (TMPDIR)") from error
+    with folder as name:
+        yield Path(name)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -12,7 +12,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import logging
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -89,14 +91,14 @@ class Ordered(Simulator):
         return replace(made, **{name: getattr(made, name)[back] for name in fields})
 
 
-def bits(name: str, way: Way) -> str:
-    """What a fit comes to, as a digest."""
+def bits(name: str, way: Way, budget: int | None = None) -> str:
+    """What a fit comes to, as a digest; with ``budget`` by the methods' own settings."""
     import torch
 
     torch.set_num_threads(way.torch_threads)
     logs = [log(pendulum(), [0.6, 0.05], 1, "a", steps=120), log(pendulum(), [0.6, 0.05], 2, "b", steps=90)]
     logs[0].observations[20:40] = np.nan
-    estimator = get_estimator(Ordered(way.threads, way.order), name, seed=3, **{"budget": BUDGET, **FORM.get(name, {})})
+    estimator = get_estimator(Ordered(way.threads, way.order), name, seed=3, **_settings(name, budget))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         posterior = estimator.fit(logs)
@@ -107,12 +109,17 @@ def bits(name: str, way: Way) -> str:
     return digest.hexdigest()[:16]
 
 
-def every(way: str, names: list[str]) -> dict[str, str]:
+def _settings(name: str, budget: int | None) -> dict[str, Any]:
+    return {"budget": BUDGET, **FORM.get(name, {})} if budget is None else {"budget": budget}
+
+
+def every(way: str, names: list[str], budget: int | None = None) -> dict[str, str]:
     """The digests of all estimators, in a process of its own."""
     chosen = WAYS[way]
     threads = str(max(chosen.threads, chosen.torch_threads))
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONHASHSEED": str(chosen.hash_seed)}
     words = [sys.executable, "-m", "tests.fuzz.bits", "--way", way, *(w for name in names for w in ("--name", name))]
+    words += [] if budget is None else ["--budget", str(budget)]
     processes = [
         subprocess.Popen(words, env={**environment, "OMP_NUM_THREADS": threads}, stdout=subprocess.PIPE, text=True)
         for _ in range(1 + chosen.beside)
@@ -128,21 +135,29 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--name", action="append", choices=list(ESTIMATORS), help="again for several; default all")
     parser.add_argument("--way", choices=list(WAYS), help="this one alone, as JSON")
+    parser.add_argument(
+        "--budget", type=int, help="rollouts, with the methods' own settings; default few, and quick ones"
+    )
     parser.add_argument("--out", type=Path, default=RESULT)
     given = parser.parse_args()
     names = given.name or list(ESTIMATORS)
     if given.way:
-        print(json.dumps({name: bits(name, WAYS[given.way]) for name in names}))
+        logging.disable(logging.WARNING)
+        print(json.dumps({name: bits(name, WAYS[given.way], given.budget) for name in names}))
         return 0
     digests, began = dict[str, dict[str, str]](), time.perf_counter()
     for way in WAYS:
-        digests[way] = every(way, names)
+        digests[way] = every(way, names, given.budget)
         differing = [name for name in names if digests[way][name] != digests["alone"][name]]
         print(f"{way:24}{', '.join(differing) or 'the same bits'}", flush=True)
     differing = {name: [way for way in WAYS if digests[way][name] != digests["alone"][name]] for name in names}
     import torch
 
-    about = {"command": "python -m tests.fuzz.bits", "torch": torch.__version__, "ways": list(WAYS)}
+    about = {
+        "command": shlex.join(["python", "-m", "tests.fuzz.bits", *sys.argv[1:]]),
+        "torch": torch.__version__,
+        "ways": list(WAYS),
+    }
     write_text(given.out, to_json({**about, "differing": differing}, indent=1))
     print(f"{len(names)} estimators, {sum(map(bool, differing.values()))} differ, {time.perf_counter() - began:.0f} s")
     return any(differing.values())

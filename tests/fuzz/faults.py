@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
+RESULT = ROOT / "examples" / "studies" / "results" / "faults.json"
 MARK = "SIPE_FAULT"  # in the environment of a command and of all that it starts
 ORPHANS = 2.0  # s after which none may be left
 PATIENCE = 600.0
@@ -212,7 +213,10 @@ class Case:
         time.sleep(chance.uniform(0.05, 0.95) * self.seconds)
         process.send_signal(number)
         _, errors = process.communicate(timeout=PATIENCE)
-        if number != signal.SIGKILL and process.returncode:
+        begun, whole = (self.place / "out").is_dir(), self.digests(self.place) == self.expected
+        if process.returncode == -number and not errors.strip() and (whole or not begun):
+            report.line = "after its end" if whole else "before its start"
+        elif number != signal.SIGKILL and process.returncode:
             check_line(report, errors, "interrupted")
         return self.settle(report, again=(self.place / "out").is_dir())
 
@@ -301,19 +305,30 @@ def faults(case: Case, times: int, seed: int = 0) -> list[Report]:
     return reports
 
 
+def counted(reports: Sequence[Report]) -> dict[str, dict[str, int]]:
+    """How many of each kind of fault there were, and how many of them left something wrong."""
+    kinds = ["full disk" if report.fault.startswith("files of") else report.fault for report in reports]
+    failures = [kind for kind, report in zip(kinds, reports, strict=True) if report.wrong]
+    return {kind: {"faults": kinds.count(kind), "wrong": failures.count(kind)} for kind in dict.fromkeys(kinds)}
+
+
 def main() -> int:
     """Print a line for each fault; exit code 1 where something is wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--command", action="append", choices=list(COMMANDS), help="again for several; default all")
     parser.add_argument("--times", type=int, default=10, help="kills of each command, with the other faults among them")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=RESULT, help="counts of each command, beside those of others")
     given = parser.parse_args()
-    wrong = 0
+    wrong, counts = 0, json.loads(given.out.read_text(encoding="utf-8")) if given.out.is_file() else {}
     for name in given.command or COMMANDS:
         with tempfile.TemporaryDirectory(prefix="sipe-faults-") as folder:
             case = Case(COMMANDS[name], Path(folder))
             print(f"{name}: {case.seconds:.0f} s undisturbed, {len(case.expected)} results", flush=True)
-            wrong += sum(bool(report.wrong) for report in faults(case, given.times, given.seed))
+            reports = faults(case, given.times, given.seed)
+        counts[name] = counted(reports)
+        given.out.write_text(json.dumps(counts, indent=1) + "\n", encoding="utf-8")
+        wrong += sum(bool(report.wrong) for report in reports)
     print(f"{wrong} wrong")
     return bool(wrong)
 

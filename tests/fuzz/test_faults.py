@@ -7,12 +7,13 @@ import json
 import os
 import signal
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from sipe_bayes.cli.app import main
-from sipe_bayes.core.files import replacing, write_text
+from sipe_bayes.core.files import replacing, scratch, write_text
 from tests.fuzz.faults import COMMANDS, Case, Report, check_line, digest
 from tests.problems.swings import write_case
 
@@ -55,6 +56,16 @@ def test_a_full_disk_names_the_file(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "x.json"))
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("x.json", "old")]
+
+
+def test_no_room_for_a_temporary_folder_is_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> None:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", none)
+    with pytest.raises(OSError, match="TMPDIR") as caught, scratch():
+        pass
+    assert caught.value.errno == errno.ENOSPC
 
 
 def test_times_are_no_bits(tmp_path: Path) -> None:

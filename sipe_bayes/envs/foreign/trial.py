@@ -18,11 +18,10 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, TRUST_MODELS, limit
+from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, TRUST_MODELS, limit, scratch
 
 _STEPS = 5
 _START = 10.0  # s that a process may take until it reads the file
@@ -89,7 +88,7 @@ def _tried(path: str, content: str, seconds: float, gib: float) -> str:
     command = [sys.executable, "-m", __name__, path, str(seconds), str(gib)]
     package = str(Path(__file__).parents[3])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([package, os.environ.get("PYTHONPATH", "")])}
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch() as folder:
         try:
             done = subprocess.run(
                 command,

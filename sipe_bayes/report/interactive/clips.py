@@ -9,13 +9,13 @@ import base64
 import os
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.files import scratch
 from sipe_bayes.report.video import Motion, pictures, save
 from sipe_bayes.simulation.rendering import Stage
 
@@ -51,11 +51,10 @@ def make_clip(model: mujoco.MjModel, shown: Motion, log: str) -> Clip:
         return Clip(f"No moving picture: MUJOCO_GL={backend}.")
     headless = sys.platform == "linux" and not os.environ.get("DISPLAY")
     environment = {**({"MUJOCO_GL": "egl"} if headless else {}), **os.environ}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with scratch() as folder:
         mujoco.mj_saveModel(model, str(folder / _MODEL))
         _write(shown, folder / _MOTION)
-        command = [sys.executable, "-m", __name__, name]
+        command = [sys.executable, "-m", __name__, str(folder)]
         try:
             done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=_PATIENCE)
         except subprocess.TimeoutExpired:
