@@ -46,7 +46,7 @@ study-%: $(READY)
 
 # every entry of the leaderboard, two at a time, and the page; the same command goes on where it was interrupted
 LEADERBOARD ?= runs/leaderboard
-OWN := prior laplace npe bayessim cem regression
+OWN := prior laplace calibrate npe bayessim cem regression
 FOREIGN := $(patsubst examples/leaderboard/%.py,%,$(wildcard examples/leaderboard/[a-z]*.py))
 
 leaderboard: $(READY)

@@ -20,7 +20,9 @@ _SHOWN = 16  # lines of an entry's tasks
 
 @app.command()
 def run(
-    method: Annotated[str, typer.Argument(help="An estimator, or prior; methods of others write their entry.")],
+    method: Annotated[
+        str, typer.Argument(help="An estimator, calibrate or prior; methods of others write their entry.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the entry; the same command goes on where it was interrupted.")],
     tasks: Annotated[
         list[str] | None, typer.Option(help="Only this task; again for several. `sipe leaderboard tasks` lists them.")
@@ -29,6 +31,7 @@ def run(
 ) -> None:
     """Write an entry: a method on every log of every task, at the tasks' budgets."""
     with exit_on_error("; the same command goes on"):
+        from sipe_bayes.benchmark.leaderboard.calibrate import NAME, Calibrate
         from sipe_bayes.benchmark.leaderboard.entry import Entry
         from sipe_bayes.benchmark.leaderboard.registry import chosen
         from sipe_bayes.benchmark.leaderboard.run import OwnMethod, run_entry
@@ -36,9 +39,10 @@ def run(
 
         check_least(0, seed=seed)
         which = chosen(tasks or ())
+        fit = Calibrate(seed) if method == NAME else OwnMethod(method, seed)
         entry = Entry(method, command_line(), [seed], versions(), "sipe_bayes, its defaults")
         lines: list[str] = []
-        ran = run_entry(entry, out, which, OwnMethod(method, seed), lines.append)
+        ran = run_entry(entry, out, which, fit, lines.append)
     for line in lines[:_SHOWN]:
         say(line)
     if len(lines) > _SHOWN:

@@ -167,6 +167,11 @@ def run_from_command_line(method: str, about: str, packages: Sequence[str], make
     run_entry(entry, given.out, chosen(given.tasks), make(given.seed))
 
 
+def draws_of(seed: int, problem: Problem, case: Case) -> torch.Generator:
+    """The generator of a log's draws."""
+    return torch.Generator().manual_seed(_EACH * seed + problem.cases.index(case))
+
+
 class OwnMethod:
     """One of the library's estimators with its defaults, and the task's budget, prior and likelihood.
 
@@ -183,8 +188,7 @@ class OwnMethod:
 
     def __call__(self, task: Task, problem: Problem, case: Case) -> Estimate:
         """See ``Method``."""
-        number = problem.cases.index(case)
-        generator = torch.Generator().manual_seed(_EACH * self.seed + number)
+        generator = draws_of(self.seed, problem, case)
         if self.name == PRIOR:
             return Estimate(problem.prior.values(DRAWS, generator), 0)
         estimator = self._estimator(task, problem)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 
@@ -42,7 +42,8 @@ class Case:
 
     Args:
         name: of the log.
-        trajectories: what a method is given. Of recorded states the first alone is there, the others are NaN.
+        trajectories: what a method is given. Of recorded states those alone are there in which a
+            window of the likelihood starts, the others are NaN.
         truth: theta (N,), NaN where it is not known.
         heldout: logs of the same machine that predictions are scored on.
         reference: draws (M, N) in theta of the exact posterior, where it is known.
@@ -146,13 +147,13 @@ class Task:
         return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:12]
 
 
-def known_start(trajectories: Trajectories) -> Trajectories:
-    """Trajectories of whose recorded states the first alone is left: it is known, and nothing else."""
+def known_start(trajectories: Trajectories, every: int | None = None) -> Trajectories:
+    """Trajectories of whose recorded states the first alone is left, or each one after ``every`` control steps."""
     assert trajectories.states is not None
     states = trajectories.states.copy()
-    states[:, 1:] = np.nan
-    changed = dict(vars(trajectories), states=states, rewards=None)
-    return Trajectories(**changed)
+    left = np.arange(states.shape[1]) % (every or states.shape[1]) != 0
+    states[:, left] = np.nan
+    return replace(trajectories, states=states, rewards=None)
 
 
 FROM_START = Segments(None, starts="recorded")

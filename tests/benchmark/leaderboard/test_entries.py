@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sipe_bayes.benchmark.leaderboard.calibrate import Calibrate
 from sipe_bayes.benchmark.leaderboard.entry import ENTRY, Entry, EntryError, answers_path
 from sipe_bayes.benchmark.leaderboard.registry import TASKS, chosen
 from sipe_bayes.benchmark.leaderboard.report import write
@@ -236,3 +237,24 @@ def test_the_page_has_a_record_behind_every_cell(honest: Path, tmp_path: Path) -
     assert cells == 2 * len(EXACT)
     with pytest.raises(EntryError, match="another name"):
         write([honest, honest], tmp_path / "page")
+
+
+def test_calibrate_is_laplace_where_there_is_no_model_to_extend() -> None:
+    task, problem = TASKS[LINEAR], made(LINEAR)
+    one, other = (method(task, problem, problem.cases[0]) for method in (Calibrate(0), OwnMethod("laplace", 0)))
+    assert one.rollouts == other.rollouts
+    np.testing.assert_array_equal(one.values, other.values)
+
+
+def test_what_is_run_prints_little_and_goes_on(tmp_path: Path) -> None:
+    out = str(tmp_path / "laplace")
+    words = ["leaderboard", "run", "laplace", "--out", out, "--tasks", "two_moons"]
+    result = CliRunner().invoke(app, words)
+    assert (result.exit_code, len(result.output.splitlines())) == (0, 2), result.output
+    assert "20 failed: ValueError: likelihood" in result.output, "a function that makes its own noise has none"
+    again = CliRunner().invoke(app, words).output
+    assert "20 logs (0 now)" in again
+    checked = CliRunner().invoke(app, ["leaderboard", "submit-check", out])
+    assert checked.exit_code == 0
+    assert "1 of 20 tasks, 20 logs failed; accepted" in checked.output
+    assert CliRunner().invoke(app, ["leaderboard", "run", "laplac", "--out", out]).exit_code == 2

@@ -29,8 +29,9 @@ def test_a_method_is_given_what_it_needs(name: str) -> None:
         assert case.truth.shape == (len(problem.space),)
         known = case.truth[np.isfinite(case.truth)]
         assert ((known > 0) & (known < 1)).all()
-        states = case.trajectories.states
-        assert states is None or np.isnan(states[:, 1:]).all(), "of recorded states the first alone is given"
+        states, starts = case.trajectories.states, problem.windows(case.trajectories).start
+        given = [] if states is None else np.flatnonzero(np.isfinite(states[0]).all(1)).tolist()
+        assert states is None or set(given) - {states.shape[1] - 1} == set(starts.tolist()), "starts of windows alone"
 
 
 @pytest.mark.parametrize(("name", "share"), [("HalfCheetahLinks", 0.01), ("arm_white", None)])

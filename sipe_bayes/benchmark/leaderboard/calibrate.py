@@ -1,0 +1,87 @@
+"""The method ``calibrate``: ``laplace``, and where its residuals are no noise what ``sipe calibrate`` then shows first.
+
+That is the interval with what the model lacks (``diagnostics.misfit.missing_physics``), which asks for windows: a log
+that was fitted whole from its known start is fitted again in windows of half a second, within the same budget. Only of
+a user's MJCF, which extensions are made for; elsewhere it is ``laplace``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sipe_bayes.benchmark.leaderboard.run import DRAWS, Estimate, draws_of
+from sipe_bayes.benchmark.leaderboard.task import Case, Problem, Task
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.posterior import Posterior
+
+NAME = "calibrate"
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A fit of ``laplace`` and the logs it was given."""
+
+    method: Laplace
+    posterior: Posterior
+    logs: Trajectories
+
+    def probed(self) -> ProbedLogs:
+        """The logs linearised at the estimate."""
+        method, theta = self.method, self.posterior.mode.numpy()
+        assert isinstance(method.likelihood, Segments)
+        windows = bind(method.likelihood, method.simulator, self.logs)
+        noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
+        starts = method.fitted_starts(theta)
+        starts = windows.no_starts() if starts is None else starts
+        prior, linearised = QuadraticPrior.of(method.prior), windows.linearise(theta, starts)
+        return ProbedLogs(windows, theta, noise, starts, prior, linearised)
+
+
+class Calibrate:
+    """See the module.
+
+    Args:
+        seed: of the fits and the draws.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def __call__(self, task: Task, problem: Problem, case: Case) -> Estimate:
+        """See ``Method``."""
+        logs, given = case.trajectories, problem.likelihood
+        fit = self._fit(problem, given, logs, task.budget)
+        posterior, rollouts = fit.posterior, fit.method.rollouts
+        if isinstance(problem.simulator.environment, MjcfEnvironment) and self._alarm(fit):
+            if given.starts == "recorded":
+                fit = self._fit(problem, Segments(), replace(logs, states=None), task.budget - rollouts)
+                rollouts += fit.method.rollouts
+            missing = missing_physics(fit.probed(), problem.prior, self.seed)
+            posterior = posterior if missing is None else missing.further
+        return Estimate(posterior.values(DRAWS, draws_of(self.seed, problem, case)), rollouts)
+
+    def _fit(self, problem: Problem, likelihood: Segments, logs: Trajectories, budget: int) -> _Fit:
+        method = Laplace(
+            problem.simulator,
+            prior=problem.prior,
+            likelihood=likelihood,
+            budget=budget,
+            seed=self.seed,
+            **problem.settings,  # type: ignore[arg-type]
+        )
+        return _Fit(method, method.fit(logs), logs)
+
+    def _alarm(self, fit: _Fit) -> bool:
+        """Whether the residuals are no noise."""
+        return misfit(fit.probed(), fit.posterior.stddev.numpy(), self.seed).alarm
