@@ -51,7 +51,14 @@ _ALL = {
 def tasks() -> list[Task]:
     """The three."""
     return [
-        Task(name, Kind.WRONG, f"double pendulum, the model lacks {p.about}", _BUDGET, partial(_problem, name))
+        Task(
+            name,
+            Kind.WRONG,
+            f"double pendulum, the model lacks {p.about}",
+            _BUDGET,
+            partial(_problem, name),
+            heldout=True,
+        )
         for name, p in _ALL.items()
     ]
 

@@ -25,7 +25,10 @@ _ABOUT = {
 
 def tasks() -> list[Task]:
     """The two."""
-    return [Task(name, Kind.REAL, about, _BUDGET, partial(_problem, name)) for name, about in _ABOUT.items()]
+    return [
+        Task(name, Kind.REAL, about, _BUDGET, partial(_problem, name), bool(_WEIGHED[name]), True)
+        for name, about in _ABOUT.items()
+    ]
 
 
 def _problem(name: str) -> Problem:

@@ -91,6 +91,7 @@ class Page:
         rows: entries, the first the best.
         cells: (task, entry) -> cell.
         records: of the cells: anchor, task, entry, score, link to the JSON.
+        measure: by which entries are ranked, and which is shown first.
     """
 
     title: str
@@ -99,6 +100,7 @@ class Page:
     rows: tuple[Row, ...]
     cells: dict[tuple[str, str], Cell]
     records: tuple[tuple[str, Task, str, TaskScore, str], ...]
+    measure: str
 
 
 def write(folders: Sequence[Path], out: Path) -> list[Path]:
@@ -130,14 +132,16 @@ def write(folders: Sequence[Path], out: Path) -> list[Path]:
     written = []
     for file, title in names.items():
         (other,) = [(f, t) for f, t in names.items() if f != file]
-        view = _page(title, other, choices[file], entries, out)
+        view = _page(title, other, choices[file], entries, out, "skill" if choices[file] == every else "heldout")
         page = template.render(page=view, measures=MEASURES, level=LEVEL, charts=None, kinds=list(Kind))
         write_text(out / file, page)
         written.append(out / file)
     return written
 
 
-def _page(title: str, other: tuple[str, str], tasks: tuple[Task, ...], entries: dict[str, Scored], out: Path) -> Page:
+def _page(
+    title: str, other: tuple[str, str], tasks: tuple[Task, ...], entries: dict[str, Scored], out: Path, measure: str
+) -> Page:
     cells, records = {}, []
     for k, (name, one) in enumerate(entries.items()):
         for task in tasks:
@@ -148,16 +152,9 @@ def _page(title: str, other: tuple[str, str], tasks: tuple[Task, ...], entries: 
                 cells[task.name, name] = Cell(anchor, tuple(_value(m, score) for m in MEASURES))
                 records.append((anchor, task, name, score, link))
     rows = [Row(name, one, _summary(one, tasks)) for name, one in entries.items()]
-    scores = [len(tasks) and _rank(row) for row in rows]
-    order = sorted(range(len(rows)), key=lambda i: scores[i])
-    return Page(title, other, tasks, tuple(rows[i] for i in order), cells, tuple(records))
-
-
-def _rank(row: Row) -> float:
-    """Smaller is better: skill, or where nothing has one the held-out error."""
-    by_key = {value.key: value.number for value in row.values}
-    skill, heldout = by_key["skill"], by_key["heldout"]
-    return -skill if skill is not None else heldout if heldout is not None else math.inf
+    sign, ranked = (-1, "skill") if measure == "skill" else (1, measure)
+    rows.sort(key=lambda row: sign * next(v.number or 0.0 for v in row.values if v.key == ranked))
+    return Page(title, other, tasks, tuple(rows), cells, tuple(records), measure)
 
 
 def _value(measure: Measure, score: TaskScore) -> Value:
@@ -177,35 +174,29 @@ def _text(key: str, value: float) -> str:
 
 
 def _summary(one: Scored, tasks: Sequence[Task]) -> tuple[Value, ...]:
-    """Over the tasks of a page; one without an answer counts as the prior."""
+    """Over the tasks of a page; one without an answer counts as the prior, held out as the model as given."""
     scores = [one.tasks[task.name] for task in tasks if task.name in one.tasks]
-    with_truth = [task for task in tasks if task.name not in one.tasks or one.tasks[task.name].skill is not None]
-    skills = [one.tasks[t.name].skill or 0.0 if t.name in one.tasks else 0.0 for t in with_truth]
-    covers = [(s.coverage, s.coverage_error) for s in scores if s.coverage is not None]
-    right = sum(abs(c - LEVEL) <= _NEAR for c, _ in covers)
-    values = [Value("answered", len(scores), f"{len(scores)} of {len(tasks)}")]
-    values.append(_mean("skill", skills, np.mean))
-    if covers:
-        error = math.sqrt(sum((e or 0.0) ** 2 for _, e in covers)) / len(covers)
-        values.append(Value("coverage", float(np.mean([c for c, _ in covers])), "", f"{error:.2f}"))
-        values[-1] = Value("coverage", values[-1].number, _text("coverage", values[-1].number or 0.0), values[-1].error)
-    else:
-        values.append(Value("coverage", None, "–"))
-    values.append(Value("right", right, f"{right} of {len(covers)}"))
-    values.append(_mean("heldout", [s.heldout for s in scores if s.heldout is not None], _geometric))
-    values.append(_mean("rollouts", [s.rollouts for s in scores], np.mean))
-    values.append(_mean("cpu", [s.cpu_seconds for s in scores], np.mean))
+    skills = [one.tasks[t.name].skill or 0.0 if t.name in one.tasks else 0.0 for t in tasks if t.truths]
+    errors = [one.tasks[t.name].heldout or 1.0 if t.name in one.tasks else 1.0 for t in tasks if t.heldout]
+    covers = [(s.coverage, s.coverage_error or 0.0) for s in scores if s.coverage is not None]
+    right = sum(abs(cover - LEVEL) <= _NEAR for cover, _ in covers)
     failed, logs = sum(s.failed for s in scores), sum(len(s.logs) for s in scores)
-    values.append(Value("failed", failed, f"{failed} of {logs}"))
-    return tuple(values)
+    error = math.hypot(*(e for _, e in covers)) / len(covers) if covers else 0.0
+    return (
+        Value("answered", len(scores), f"{len(scores)} of {len(tasks)}"),
+        _mean("skill", skills),
+        _mean("coverage", [cover for cover, _ in covers], f"{error:.2f}" if covers else ""),
+        Value("right", right, f"{right} of {len(covers)}") if covers else Value("right", None, "–"),
+        _mean("heldout", errors),
+        _mean("rollouts", [s.rollouts for s in scores]),
+        _mean("cpu", [s.cpu_seconds for s in scores]),
+        Value("failed", failed, f"{failed} of {logs}"),
+    )
 
 
-def _geometric(values: Sequence[float]) -> float:
-    return float(np.exp(np.mean(np.log(values))))
-
-
-def _mean(key: str, values: Sequence[float], mean: Callable[[Sequence[float]], float]) -> Value:
+def _mean(key: str, values: Sequence[float], error: str = "") -> Value:
+    """Geometric of errors."""
     if not values:
         return Value(key, None, "–")
-    value = float(mean(values))
-    return Value(key, value, _text(key, value))
+    value = float(np.exp(np.mean(np.log(values)))) if key == "heldout" else float(np.mean(values))
+    return Value(key, value, _text(key, value), error)

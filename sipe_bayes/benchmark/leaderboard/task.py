@@ -131,6 +131,8 @@ class Task:
         about: a sentence.
         budget: rollouts that a method may use for each case.
         load: makes it; may take seconds.
+        truths: whether some parameters' are known.
+        heldout: whether logs are held out.
     """
 
     name: str
@@ -138,6 +140,8 @@ class Task:
     about: str
     budget: int
     load: Callable[[], Problem]
+    truths: bool = True
+    heldout: bool = False
 
     def definition(self, problem: Problem) -> str:
         """A digest of what the scores depend on: an entry of another definition does not compare."""

@@ -21,6 +21,8 @@ def test_there_are_enough() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_method_is_given_what_it_needs(name: str) -> None:
     problem = made(name)
+    assert TASKS[name].truths == any(np.isfinite(case.truth).any() for case in problem.cases)
+    assert TASKS[name].heldout == any(case.heldout is not None for case in problem.cases)
     values = problem.space.values(np.stack([np.full(len(problem.space), level) for level in (0.4, 0.6)]))
     for case in problem.cases[:2]:
         observed, simulated = problem.observed(case), problem.simulate(case, values)
