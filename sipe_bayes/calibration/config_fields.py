@@ -64,8 +64,12 @@ def _resolved(value: Any, info: ValidationInfo) -> Any:
         return value
     if not str(value).strip():
         raise problem("expected a path, got an empty string; give the file's name")
-    folder = (info.context or {}).get("folder", Path())
-    return Path(folder, value)
+    path = Path((info.context or {}).get("folder", Path()), value)
+    try:
+        path.exists()
+    except OSError as error:  # too long, or in a folder that is closed
+        raise problem(f"expected a path, got {str(value)!r} ({error.strerror}); give another") from None
+    return path
 
 
 def _read_by(read: Callable[[str], str]) -> AfterValidator:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sipe_bayes.calibration.commands import check_commands
-from sipe_bayes.calibration.config import load_config
+from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.units import DIMENSIONS, unit_words
@@ -30,7 +30,7 @@ MODEL = """\
 CONFIG = """\
 model = "model.xml"
 window = 0.5
-commands = [{{ actuator = "driven", column = "{column}", unit = "{unit}", factor = {factor} }}]
+commands = [{{ actuator = "driven", column = "{column}", unit = "1", factor = {factor} }}]
 measurements = [{{ column = "angle", target = "joint:hinge.position", unit = "rad" }}]
 logs = [{{ file = "log.csv" }}]
 parameters = [{{ name = "unknown", target = "{target}", bounds = [0.5, 2.0], description = "{description}" }}]
@@ -67,26 +67,34 @@ CASES = [  # actuator, factor, what else there is, the dimensions that it takes 
 ]  # fmt: skip
 
 
-def check(folder: Path, actuator: str, unit: str, factor: float = 1, column: str = "u", **parameter: str) -> list[Code]:
+def configured(folder: Path, actuator: str, factor: float = 1, column: str = "u", **parameter: str) -> Config:
+    """A configuration whose command is dimensionless."""
     (folder / "model.xml").write_text(MODEL.format(actuator=actuator))
     (folder / "log.csv").write_text("time,u,angle\n0,0,0\n0.1,0,0\n")
     parameter = {"target": "joint:hinge.damping", "description": ""} | parameter
-    text = CONFIG.format(unit=unit, factor=f"{factor:.6f}", column=column, **parameter)
-    (folder / "config.toml").write_text(text)
-    return [doubt.code for doubt in check_commands(load_config(folder / "config.toml"))]
+    (folder / "config.toml").write_text(CONFIG.format(factor=f"{factor:.6f}", column=column, **parameter))
+    return load_config(folder / "config.toml")
+
+
+def check(config: Config, unit: str) -> list[Code]:
+    """The doubts of its command, given in a unit."""
+    (command,) = config.commands
+    config = config.model_copy(update={"commands": (command.model_copy(update={"unit": unit}),)})
+    return [doubt.code for doubt in check_commands(config)]
 
 
 @pytest.mark.parametrize(("actuator", "factor", "parameter", "takes"), CASES)
 def test_every_unit_passes_or_is_refused(
     actuator: str, factor: float, parameter: dict[str, str], takes: list[str], tmp_path: Path
 ) -> None:
+    config = configured(tmp_path, actuator, factor, **parameter)
     for dimension in DIMENSIONS:
         word = unit_words(dimension)[-1]
         if dimension in (*takes, "dimensionless"):
-            assert check(tmp_path, actuator, word, factor, **parameter) == []
+            assert check(config, word) == []
             continue
         with pytest.raises(ConfigError) as refused:
-            check(tmp_path, actuator, word, factor, **parameter)
+            check(config, word)
         line = str(refused.value)
         assert "\n" not in line
         assert all(part in line for part in ("commands[0].unit", "'driven'", repr(word), takes[0], "; use one of"))
@@ -95,7 +103,7 @@ def test_every_unit_passes_or_is_refused(
 @pytest.mark.parametrize("actuator", sorted({case[0] for case in CASES}))
 def test_nothing_is_commanded_in_kg(actuator: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"'kg' \(mass\)"):
-        check(tmp_path, actuator, "kg", factor=9.81)
+        check(configured(tmp_path, actuator, factor=9.81), "kg")
 
 
 @pytest.mark.parametrize(
@@ -115,4 +123,4 @@ def test_nothing_is_commanded_in_kg(actuator: str, tmp_path: Path) -> None:
 def test_a_column_of_another_name_is_doubted(
     actuator: str, column: str, unit: str, doubted: bool, tmp_path: Path
 ) -> None:
-    assert check(tmp_path, actuator, unit, column=column) == [Code.COMMAND_DOUBTED] * doubted
+    assert check(configured(tmp_path, actuator, column=column), unit) == [Code.COMMAND_DOUBTED] * doubted

@@ -16,11 +16,22 @@ def read(file: Path, folder: Path) -> object:
     from sipe_bayes.calibration.config import load_config
     from sipe_bayes.calibration.readers.tables import read_table
     from sipe_bayes.core.trajectory import Trajectories
+    from sipe_bayes.datasets.archive import install
+    from sipe_bayes.datasets.minari_data import from_minari
     from sipe_bayes.envs.foreign.load import compile_spec, load_spec
     from sipe_bayes.posterior import load_posterior
     from sipe_bayes.rl.randomization import load_randomization
 
+    def minari(path: Path) -> object:
+        """What a data set says of itself, as a file of its folder."""
+        data = folder / path.stem / "data"
+        data.mkdir(parents=True)
+        shutil.copy(path, data / "metadata.json")
+        return from_minari(data.parent, dt=0.1)
+
     readers = {
+        "archives": install,
+        "minari": minari,
         "configurations": load_config,
         "logs": read_table,
         "models": lambda path: compile_spec(load_spec(str(path)), str(path)),
