@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import functools
 import io
+import warnings
 from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
@@ -47,7 +48,8 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        with matplotlib.style.context(["default", _RC]):
+        with matplotlib.style.context(["default", _RC]), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"Glyph \d+", UserWarning)  # a name of the user's in another script
             return draw(*args, **kwargs)
 
     return wrapper

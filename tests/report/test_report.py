@@ -187,6 +187,14 @@ def test_what_a_pixel_shows_of_a_very_long_log_is_drawn() -> None:
         assert max(float(np.nanmax(line.get_ydata())) for line in lines) == 7.0
 
 
+def test_names_in_other_scripts_warn_of_no_font() -> None:
+    named = signal("訓練", "train", "関節")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (figure,) = plots.signals(dataclasses.replace(make_calibration(), signals=[named]), "訓練")
+        png(figure)
+
+
 def test_a_default_that_runs_away_does_not_flatten_the_signal() -> None:
     wild = signal("train_0", "train", "angle_0")
     wild.default[:] = 1e6
