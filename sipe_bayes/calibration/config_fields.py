@@ -64,6 +64,8 @@ def _resolved(value: Any, info: ValidationInfo) -> Any:
         return value
     if not str(value).strip():
         raise problem("expected a path, got an empty string; give the file's name")
+    if not str(value).isprintable():
+        raise problem(f"expected a path, got {str(value)!r} with characters that cannot be printed; give another")
     path = Path((info.context or {}).get("folder", Path()), value)
     try:
         path.exists()
@@ -177,7 +179,7 @@ def _target(word: str) -> str:
     return word
 
 
-Text = Annotated[str, Field(min_length=1), Strict()]
+Text = Annotated[str, Field(min_length=1, max_length=500), Strict()]
 ExtensionName = Annotated[Text, AfterValidator(_extension)]
 OwnExtension = Annotated[Text, AfterValidator(_own_extension)]
 Budget = Annotated[int, Strict(), Field(gt=0, le=MOST_ROLLOUTS)]

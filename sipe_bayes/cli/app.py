@@ -23,7 +23,15 @@ from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
 from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.check import SimulatedOn
-from sipe_bayes.cli.errors import INTERRUPTED, check_least, check_words, exit_on_error, say_interrupted, was_announced
+from sipe_bayes.cli.errors import (
+    INTERRUPTED,
+    check_least,
+    check_words,
+    exit_on_error,
+    say_interrupted,
+    was_announced,
+    was_interruption,
+)
 from sipe_bayes.cli.examples import give_examples
 from sipe_bayes.core import __version__
 from sipe_bayes.inference.progress_bar import ProgressBar
@@ -64,7 +72,9 @@ def main() -> None:
         code = app(standalone_mode=False)
     except typer.Exit as ended:
         code = ended.exit_code
-    except (typer.Abort, KeyboardInterrupt):  # before or after what ``exit_on_error`` sees to
+    except (typer.Abort, KeyboardInterrupt, ImportError) as error:  # before or after what ``exit_on_error`` sees to
+        if isinstance(error, ImportError) and not was_interruption(error):
+            raise
         code = INTERRUPTED
     except _REFUSED as error:
         message = error.format_message()

@@ -41,6 +41,9 @@ def exit_on_error(then: str = "") -> Iterator[None]:
     except (NotImplementedError, RecursionError, typer.Exit):
         raise  # no input is at fault
     except (ValueError, ImportError, OSError, RuntimeError) as error:
+        if was_interruption(error):
+            say_interrupted(then)
+            raise typer.Exit(INTERRUPTED) from None
         if type(error).__name__.endswith("LinAlgError"):
             raise
         print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
@@ -51,6 +54,14 @@ def exit_on_error(then: str = "") -> Iterator[None]:
     except KeyboardInterrupt:
         say_interrupted(then)
         raise typer.Exit(INTERRUPTED) from None
+
+
+def was_interruption(error: BaseException) -> bool:
+    """Whether an exception is what a library made of an interruption, as native modules do while they are imported."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None
 
 
 def say_interrupted(then: str) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sipe_bayes.posterior import Posterior
 
 _SHOWN = 10
+_MOST, _MOST_STEPS = 10_000, 10_000_000  # sequences, and control steps of all of them
 
 
 def suggest(
@@ -61,6 +62,7 @@ def suggest(
         if out.resolve() in (path.resolve() for path in read):
             raise ValueError(f"--out {out}: is what {config} reads, and would be lost; choose another name")
         dt = float(problem.train.dt[0])
+        _check_amount(candidates, duration, dt)
         bounds = suggestions.limits(problem.simulator, np.concatenate([log.actions for log in problem.train]))
         band = (low or 1 / duration, high or min(5.0, 0.2 / dt))
         plans = suggestions.generate(candidates, duration, dt, bounds, band, seed)
@@ -81,6 +83,15 @@ def suggest(
         lost = f"; diverges at {one.diverged} of {draws} draws" if one.diverged else ""
         print(f"{one.score:.3f}  {one.plan.name}: expected contraction {each}; reaches {reach}{lost}")
     print(f"the first one is in {out}; check what it reaches before it runs on the machine")
+
+
+def _check_amount(candidates: int, duration: float, dt: float) -> None:
+    """Raises ValueError for more sequences than anybody waits for."""
+    if candidates > _MOST or candidates * duration / dt > _MOST_STEPS:
+        raise ValueError(
+            f"--candidates {candidates:.4g} --duration {duration:g}: expected at most {_MOST} sequences of "
+            f"{_MOST_STEPS:.0e} control steps together; lower them"
+        )
 
 
 def _known(problem: Problem, path: Path | None) -> Posterior:

@@ -181,6 +181,8 @@ def saddle_point(lower: FloatArray, low: FloatArray, high: FloatArray) -> tuple[
         if norm < 1e-9 * (1 + np.linalg.norm(point)):
             z, mu = np.append(point[:n], 0.0), np.append(point[n:], 0.0)
             return mu, _psi(z, mu, lower, low, high)
+        if not (np.isfinite(jacobian).all() and np.isfinite(norm)):
+            break
         direction = np.linalg.lstsq(jacobian, -gradient, rcond=None)[0]
         for step in 0.5 ** np.arange(30):
             trial, trial_jacobian = _saddle_equations(point + step * direction, lower, low, high)
@@ -321,7 +323,7 @@ class TruncatedNormal:
         while missing > 0:
             batch = min(int(1.1 * missing / rate) + 16, 2**16)
             if left < 0:
-                raise ValueError("sample: far fewer draws lie in the cube than the stored mass says; save it again")
+                raise ValueError("posterior: far fewer draws lie in the cube than the stored mass says; save it again")
             accepted.append(draw(batch, generator)[:missing])
             missing, left = missing - len(accepted[-1]), left - batch
         return np.concatenate(accepted)

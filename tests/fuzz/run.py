@@ -11,6 +11,7 @@ raises what is not for the user, words it in more than a line or without naming 
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import os
 import random
@@ -33,6 +34,7 @@ ROOM = 2 * 2**30
 LONGEST = 1000  # characters of a line
 WORDS = (
     "log ",
+    "posterior: ",
     "key ",
     "model",
     "parameter",
@@ -177,7 +179,9 @@ def _work(first: int, step: int, last: int, chosen: list[str], base: int, out: C
     out.send(None)
 
 
-def fuzz(cases: int, processes: int = 1, chosen: list[str] | None = None, base: int = 0) -> dict[str, Tally]:
+def fuzz(
+    cases: int, processes: int = 1, chosen: list[str] | None = None, base: int = 0, seconds: float = math.inf
+) -> dict[str, Tally]:
     """Play so many cases in processes of their own, which are replaced where one crashes or hangs.
 
     Args:
@@ -185,6 +189,7 @@ def fuzz(cases: int, processes: int = 1, chosen: list[str] | None = None, base: 
         processes: side by side.
         chosen: targets; default all.
         base: added to every seed, for other cases than the last time.
+        seconds: after which no more are played.
     """
     context = multiprocessing.get_context("spawn")
     tallies: dict[str, Tally] = {}
@@ -210,7 +215,12 @@ def fuzz(cases: int, processes: int = 1, chosen: list[str] | None = None, base: 
 
     for first in range(processes):
         start(first)
+    deadline = time.monotonic() + seconds
     while running:
+        if time.monotonic() > deadline:
+            for worker in running.values():
+                worker.process.kill()
+            break
         for channel in wait(list(running), timeout=1.0):
             assert isinstance(channel, Connection)
             worker = running[channel]
@@ -249,6 +259,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=100_000)
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="after which no more are played")
     parser.add_argument("--target", action="append", help="again for several; default all")
     parser.add_argument("--seed", type=int, help="play this one case of the one target")
     parser.add_argument("--base", type=int, default=0, help="added to every seed")
@@ -259,7 +270,7 @@ def main() -> int:
         print(outcome, f"its files are in {folder}", sep="\n")
         return bool(outcome.wrong)
     began = time.perf_counter()
-    tallies = fuzz(given.cases, given.processes, given.target, given.base)
+    tallies = fuzz(given.cases, given.processes, given.target, given.base, 60 * given.minutes)
     print(f"{'target':24}{'cases':>8}{'refused':>9}{'slowest s':>11}{'wrong':>7}")
     for name, tally in sorted(tallies.items()):
         print(f"{name:24}{tally.cases:8}{tally.refused:9}{tally.slowest:11.2f}{len(tally.wrong):7}")

@@ -18,6 +18,32 @@ from tests.fuzz.faults import COMMANDS, Case, Report, check_line, digest
 from tests.problems.swings import write_case
 
 
+@pytest.mark.parametrize("begun", [False, True])
+def test_an_interruption_that_a_native_module_words_otherwise(
+    begun: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """pybind11 makes an ImportError of what interrupts the import of its modules."""
+
+    def stop(*_: object, **__: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise ImportError("initialization failed") from error
+
+    if begun:
+        from sipe_bayes.calibration import run
+
+        monkeypatch.setattr(run, "run", stop)
+    else:
+        slow = type("Slow", (), {"__getattr__": stop})()
+        monkeypatch.setitem(sys.modules, "sipe_bayes.calibration.discover", slow)
+    monkeypatch.setattr(sys, "argv", ["sipe", "calibrate", str(write_case(tmp_path))])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err.count("sipe: interrupted; the same command ") == 1
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("begun", [False, True])
 def test_an_interrupted_command_says_so_once(
