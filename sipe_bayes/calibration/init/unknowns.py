@@ -81,7 +81,9 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     gains = [unknown for a, r in driven for unknown in _of_actuator(model, a, r)]
     known_force = any(r.match.label.kind == Kind.TORQUE or r.unit in ("N m", "N") for _, r in driven)
     fixed_scale = not driven or (bool(gains) and not known_force and any(a.drive != Drive.POSITION for a, _ in driven))
-    masses = [] if fixed_scale and len(joints) < 2 else _masses(model, joints, first=fixed_scale)
+    behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
+    free = [] if fixed_scale else [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
+    masses = [] if fixed_scale and len(joints) < 2 else _masses(model, [*behind, *free], first=fixed_scale)
     return gains + masses + [u for joint in joints for u in _of_joint(model, joint, sizes)] + _contacts(model, machine)
 
 
@@ -120,11 +122,10 @@ def _factor(name: str, target: str, low: float, high: float, note: str) -> Unkno
     return Unknown(name, (target,), low, high, True, note)
 
 
-def _masses(model: mujoco.MjModel, joints: Sequence[Joint], first: bool) -> list[Unknown]:
-    """The heaviest body behind each joint; with ``first`` not that of the first joint, to which others are relative."""
+def _masses(model: mujoco.MjModel, bodies: Sequence[int], first: bool) -> list[Unknown]:
+    """The heaviest of what moves with each body; with ``first`` not of the first one, to which others are relative."""
     out, seen = [], set()
-    for joint in joints:
-        body = int(model.joint(joint.name).bodyid[0])
+    for body in bodies:
         moved = [b for b in range(1, model.nbody) if int(model.body_weldid[b]) == int(model.body_weldid[body])]
         heaviest = max(moved, key=lambda b: float(model.body_mass[b]))
         mass, name = float(model.body_mass[heaviest]), model.body(heaviest).name
