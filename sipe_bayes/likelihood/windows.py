@@ -327,6 +327,7 @@ class Windows:
         with_starts: bool = True,
         residual: FloatArray | None = None,
         theta_step: float | FloatArray | None = None,
+        start_step: float | FloatArray = STATE_STEP,
     ) -> Linearisation:
         """Residual and Jacobian: one batch of N + D + 1 simulations of the logs, in float64.
 
@@ -336,8 +337,8 @@ class Windows:
             with_theta: whether the Jacobian holds the columns of theta.
             with_starts: whether it holds those of the starts.
             residual: (W, L, C), of a valid simulation at this very point, which spares the one.
-            theta_step: of the finite differences, of the cube; default ``self.theta_step``, or where that is too short
-                ``least_steps``.
+            theta_step: of the differences, of the cube; default ``self.theta_step``, or ``least_steps`` if longer.
+            start_step: the same of the starts, a number or (D,).
 
         Raises:
             BudgetExhausted: instead of simulating beyond the budget.
@@ -345,12 +346,13 @@ class Windows:
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
         default = np.maximum(self.theta_step, self.least_steps(theta))
         size = default if theta_step is None else np.broadcast_to(theta_step, theta.shape)
+        of_starts = np.broadcast_to(start_step, self.num_start)[:d]
         sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
         for j in range(n):
             thetas[j + 1, j] += sign[j] * size[j]
         for j in range(d):
-            all_starts[n + 1 + j, :, j] += STATE_STEP
+            all_starts[n + 1 + j, :, j] += of_starts[j]
         if residual is None:
             predicted, valid = self.predict(thetas, all_starts, True)
         else:
@@ -368,7 +370,7 @@ class Windows:
                 inside, all_starts[: len(wrong)], True
             )
         predicted[1:] = self._continued(predicted[1:], predicted[0])
-        scale = np.concatenate([sign[:n] * size[:n], np.full(d, STATE_STEP)])
+        scale = np.concatenate([sign[:n] * size[:n], of_starts])
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
         jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)

@@ -8,6 +8,10 @@ https://doi.org/10.1142/S0218127404010345). So theta and the starts descend toge
 windows meet in theta alone, each takes as much of a step of its start as serves it best: one that misses an impact on
 the way holds back itself, not the search.
 
+Contact that chatters (a body that lies or is pushed) jumps over short differences, whose slopes then say nothing, and
+starts would follow them anywhere. So theta moves alone at first, by the measured starts, over wide differences. They
+shrink where nothing is left to gain over them, as long as the slopes do not grow with that.
+
 The noise meanwhile is white, of the size that the samples' roughness shows whatever the model.
 
 Through impacts the likelihood has valleys within valleys, each far narrower than they lie apart, and no search is sure
@@ -34,6 +38,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, noise_level, pooled
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal
+from sipe_bayes.likelihood.starts import STATE_STEP
 from sipe_bayes.likelihood.windows import Windows
 
 
@@ -69,6 +74,15 @@ def first_horizon(windows: Windows, tuning: GrowingTuning) -> int:
     return max(2, math.ceil(tuning.first * int(windows.steps.max())))
 
 
+def first_beginnings(
+    windows: Windows, here: Position, tuning: GrowingTuning, after: Position | None = None
+) -> Position:
+    """A starting point on the first beginnings, theta alone; after a search without jumps, over short differences."""
+    horizon, jumps = first_horizon(windows, tuning), after is not None and after.jumps
+    here = replace(here, phase=Phase.GROW, horizon=horizon, jumps=jumps)
+    return here if after is not None and not jumps else replace(here, theta_step=tuning.widest, alone=True)
+
+
 def level(windows: Windows) -> Noise:
     """White noise of the size that the samples' roughness shows, or as given."""
     rough = noise_level(windows.trajectories, windows.settings)[windows.channels]
@@ -96,10 +110,20 @@ def grown(
     view = part.beginnings(here.horizon)
     before = windows.rollouts
     view.rollouts, view.budget = before, windows.budget
-    lin = view.linearise(here.theta, here.starts, theta_step=view.theta_step)
+    size = np.clip(here.theta_step, view.theta_step, tuning.widest)
+    of_starts = start_steps(view, size) if size > view.theta_step else STATE_STEP
+    lin = view.linearise(here.theta, here.starts, with_starts=not here.alone, theta_step=size, start_step=of_starts)
+    if here.alone:
+        fixed = np.zeros((*lin.residual.shape, windows.num_start))
+        lin = replace(lin, jacobian=np.concatenate([lin.jacobian, fixed], axis=-1))
+    noise = level(windows)
+    slope = float(np.sqrt(((lin.jacobian[..., : windows.num_theta] / noise.sd[:, None]) ** 2).sum()))
     point = WindowPoint(here.theta, here.starts, lin.residual)
-    energy = WindowEnergy(view, level(windows), prior)
+    energy = WindowEnergy(view, noise, prior)
     linearised = ManyStarts(energy, point, view.moments(lin, white=True), tuning.shares)
+    if here.slope and slope > tuning.rougher * here.slope and size < tuning.widest:  # these differences are luck
+        windows.rollouts = before + math.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum()))
+        return replace(here, theta_step=size * tuning.finer, slope=0.0, jumps=True)
     fit = descend(linearised, here.damping, max(tuning.enough * linearised.energy, 0.02), rule)
     share = view.steps.sum() / windows.steps.sum()
     windows.rollouts = before + math.ceil((view.rollouts - before) * share)
@@ -107,12 +131,23 @@ def grown(
     here = replace(here, theta=point.theta, starts=point.starts, damping=fit.damping, iteration=steps)
     on = fit.converged or fit.gained < tuning.enough * linearised.energy or steps >= tuning.most_steps
     if not on and lin.valid:
-        return here
+        return replace(here, slope=0.0)
+    if lin.valid and here.alone:
+        return replace(here, alone=False, damping=rule.first, iteration=0, slope=0.0)
+    if lin.valid and size > view.theta_step and not here.jumps:
+        return replace(here, theta_step=max(size / tuning.finer, view.theta_step), slope=slope, iteration=0)
+    here = replace(here, slope=0.0)
     damping = min(here.damping, tuning.damping)
     if here.horizon >= longest or not lin.valid:
         return replace(here, phase=Phase.ROUGH, damping=damping, iteration=0, kept=Kept())
     horizon = min(longest, math.ceil(tuning.growth * here.horizon))
     return replace(here, horizon=horizon, damping=damping, iteration=0)
+
+
+def start_steps(windows: Windows, size: float) -> FloatArray:
+    """Differences (D,) of the starts beside ``size`` of theta: positions, then velocities."""
+    half = windows.num_start // 2
+    return size * np.concatenate([np.full(half, 0.05), np.full(windows.num_start - half, 0.5)])
 
 
 def grown_starts(windows: Windows, theta: FloatArray, noise: Noise, tuning: GrowingTuning) -> FloatArray:

@@ -52,6 +52,11 @@ class GrowingTuning(Options):
     most_steps: int = option(12, "steps after which they grow all the same", least=1)
     start_steps: int = option(4, "the same where only the starts are looked for", least=1)
     damping: float = option(1e-2, "of the first step of longer ones, at most", above=0)
+    widest: float = option(
+        0.02, "differences that they begin with: contact jumps over shorter ones", above=0, below=0.5
+    )
+    finer: float = option(8.0, "factor by which differences shrink where nothing is left to gain over them", above=1)
+    rougher: float = option(2.0, "growth of the slope over shorter differences that tells jumps", above=1)
     shares: tuple[float, ...] = option((1.0, 0.4, 0.1, 0.0), "of its step, of which a start takes the best")
     groups: int = option(8, "groups of windows fitted apart at most, two windows each at least", least=4)
     fewest: int = option(4, "groups whose scatter says something", least=4)

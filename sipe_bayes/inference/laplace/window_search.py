@@ -40,7 +40,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.growing_windows import (
     ManyStarts,
-    first_horizon,
+    first_beginnings,
     group,
     grown,
     grows,
@@ -180,8 +180,7 @@ class WindowSearch:
         best = max(state.optima, key=lambda optimum: optimum.evidence)
         part = group(self.windows, number, num_groups(self.windows, self._tuning.growing))
         here = Position.at(part, best.theta, self._tuning.damping, subset=False)
-        horizon = first_horizon(part, self._tuning.growing)
-        return replace(here, phase=Phase.GROW, horizon=horizon, group=number)
+        return replace(first_beginnings(part, here, self._tuning.growing, state.here), group=number)
 
     def _subset(self, state: WindowState) -> WindowState:
         """A step of theta alone, the starts as the log tells them, on every other window.
@@ -377,7 +376,7 @@ class WindowSearch:
         here = Position.at(self.windows, theta, self._tuning.damping, subset)
         if not grows(self.windows):
             return here
-        return replace(here, phase=Phase.GROW, horizon=first_horizon(self.windows, self._tuning.growing))
+        return first_beginnings(self.windows, here, self._tuning.growing)
 
     def _unrecorded(self, state: WindowState) -> bool:
         """Whether theta alone is searched and no optimum is known yet, so that the budget must leave room for one."""

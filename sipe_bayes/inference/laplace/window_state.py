@@ -73,6 +73,9 @@ class Position:
         patterns: pattern searches that have led on.
         horizon: control steps of the beginnings of windows that are looked at; zero for whole ones.
         group: which group of windows is fitted apart; None while all are searched.
+        alone: whether theta moves alone, from the measured starts.
+        slope: of the beginnings over the differences before these; zero where there is none to compare with.
+        jumps: whether shorter differences than these measure jumps.
     """
 
     phase: Phase
@@ -89,6 +92,9 @@ class Position:
     patterns: int = 0
     horizon: int = 0
     group: int | None = None
+    alone: bool = False
+    slope: float = 0.0
+    jumps: bool = False
 
     @classmethod
     def at(cls, windows: Windows, theta: FloatArray, rule: DampingRule, subset: bool) -> Self:
