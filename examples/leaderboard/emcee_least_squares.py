@@ -25,10 +25,10 @@ WALKERS, FIRST, BALL = 4, 0.2, 0.01
 
 def log_density(problem: Problem, case: Case, theta: FloatArray) -> FloatArray:
     """Of theta (B, N), minus infinity outside the cube and where a simulation failed."""
-    found = np.full(len(theta), -np.inf)
+    values = np.full(len(theta), -np.inf)
     inside = ((theta >= 0) & (theta <= 1)).all(1)
     if not inside.any():
-        return found
+        return values
     simulator, scale = problem.simulator, problem.scale(case)
     off = (problem.simulate(case, problem.space.values(theta[inside])) - problem.observed(case)) / scale
     squares = np.square(off).sum(1)
@@ -37,8 +37,8 @@ def log_density(problem: Problem, case: Case, theta: FloatArray) -> FloatArray:
     else:
         likelihood = -off.shape[1] / 2 * np.log(squares)
     prior = problem.prior.log_prob(torch.from_numpy(theta[inside])).numpy()
-    found[inside] = np.nan_to_num(likelihood + prior, nan=-np.inf)
-    return found
+    values[inside] = np.nan_to_num(likelihood + prior, nan=-np.inf)
+    return values
 
 
 def method(seed: int) -> Method:

@@ -111,16 +111,16 @@ def _row(value: FloatArray, low: FloatArray, high: FloatArray) -> dict[str, Any]
 
 def one(simulator: sipe.Simulator, cell: str, seed: int) -> dict[str, Any]:
     """Both methods on one log; CPU seconds each."""
-    log, found = recorded(simulator, TRUTH, *CELLS[cell], seed), {"seed": seed}
+    log, rows = recorded(simulator, TRUTH, *CELLS[cell], seed), {"seed": seed}
     for name, fit in (("sipe_bayes", lambda: ours(simulator, log, seed)), ("mujoco.sysid", lambda: theirs(log))):
         began, cpu = time.perf_counter(), time.process_time()
         row = fit()
-        found[name] = {
+        rows[name] = {
             **row,
             "seconds": round(time.perf_counter() - began, 3),
             "cpu_seconds": round(time.process_time() - cpu, 3),
         }
-    return found
+    return rows
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -56,7 +56,7 @@ class Dictionary(gymnasium.Env[dict[str, Any], Any]):
 
 def collected(minari: Any, env: Any, dataset: str, episodes: int = 2, steps: int = 6) -> list[tuple[Any, Any, Any]]:
     """Minari's own collector at work; returns observations, actions and rewards of each episode as they came."""
-    collector, said = minari.DataCollector(env), []
+    collector, episodes = minari.DataCollector(env), []
     for i in range(episodes):
         seen, rewards, actions = [collector.reset(seed=i)[0]], [], []
         collector.action_space.seed(i)
@@ -67,23 +67,23 @@ def collected(minari: Any, env: Any, dataset: str, episodes: int = 2, steps: int
             rewards.append(reward)
             if terminated or truncated:
                 break
-        said.append((seen, actions, rewards))
+        episodes.append((seen, actions, rewards))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         collector.create_dataset(dataset)
     collector.close()
-    return said
+    return episodes
 
 
 @pytest.mark.parametrize(("env", "dt"), [("HalfCheetah-v5", 0.05), ("Pendulum-v1", 0.05)])
 def test_a_data_set_of_minari_s_own_collector(env: str, dt: float, minari: Any, tmp_path: Path) -> None:
     """By its id and by its folder; episodes of different lengths."""
-    said = collected(minari, gymnasium.make(env), "tests/own-v0")
-    for found in (sipe.from_minari("tests/own-v0"), sipe.from_minari(tmp_path / "minari" / "tests" / "own-v0")):
-        assert found.length.tolist() == [6, 7]
-        assert found.dt.tolist() == [dt] * 2
-        assert found.states is None
-        for one, (seen, actions, rewards) in zip(found, said, strict=True):
+    episodes = collected(minari, gymnasium.make(env), "tests/own-v0")
+    for stored in (sipe.from_minari("tests/own-v0"), sipe.from_minari(tmp_path / "minari" / "tests" / "own-v0")):
+        assert stored.length.tolist() == [6, 7]
+        assert stored.dt.tolist() == [dt] * 2
+        assert stored.states is None
+        for one, (seen, actions, rewards) in zip(stored, episodes, strict=True):
             np.testing.assert_array_equal(one.observations, np.array(seen))
             np.testing.assert_array_equal(one.actions, np.array(actions))
             np.testing.assert_allclose(one.rewards, rewards)
@@ -91,12 +91,12 @@ def test_a_data_set_of_minari_s_own_collector(env: str, dt: float, minari: Any, 
 
 def test_observations_that_are_dictionaries(minari: Any) -> None:
     """As in this library's Fetch tasks: observation, achieved goal, desired goal."""
-    said = collected(minari, Dictionary(), "goals-v0", steps=4)
+    episodes = collected(minari, Dictionary(), "goals-v0", steps=4)
     with pytest.raises(ValueError, match="goals-v0 does not say how long a control step is; pass dt in seconds"):
         sipe.from_minari("goals-v0")
-    found = sipe.from_minari("goals-v0", dt=0.1)
-    assert found.length.tolist() == [4, 4]
-    for one, (seen, _, _) in zip(found, said, strict=True):
+    stored = sipe.from_minari("goals-v0", dt=0.1)
+    assert stored.length.tolist() == [4, 4]
+    for one, (seen, _, _) in zip(stored, episodes, strict=True):
         at = np.array([s["achieved_goal"] for s in seen])
         np.testing.assert_array_equal(one.observations, np.hstack([2 * at, at, np.tile([5.0, 6.0], (5, 1))]))
 
@@ -104,15 +104,15 @@ def test_observations_that_are_dictionaries(minari: Any) -> None:
 @pytest.mark.parametrize("task", ["HalfCheetahLinks", "FetchPush"])
 def test_what_is_exported_comes_back(task: str, minari: Any) -> None:
     words = ("--minari", f"sipe/{task}/random-v0", "--task", task, "--type", "random", "--steps", "4", "--count", "2")
-    code, said = run("export", *words, "--variant", "in_distribution")
-    assert code == 0, said
-    found = sipe.from_minari(f"sipe/{task}/random-v0")
+    code, output = run("export", *words, "--variant", "in_distribution")
+    assert code == 0, output
+    stored = sipe.from_minari(f"sipe/{task}/random-v0")
     made = sipe.demonstrations(task, "random", variant="in_distribution", steps=4, count=2)
     for name in ("observations", "actions", "states", "rewards", "dt", "length"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(made, name), err_msg=name)
-    code, said = run("export", *words)
+        np.testing.assert_array_equal(getattr(stored, name), getattr(made, name), err_msg=name)
+    code, output = run("export", *words)
     assert code == 2
-    assert "exists; choose another name" in said.replace("\n", " ")
+    assert "exists; choose another name" in output.replace("\n", " ")
     assert minari.load_dataset(f"sipe/{task}/random-v0").total_steps == 8
 
 
