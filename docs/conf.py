@@ -38,7 +38,7 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 240
 nb_merge_streams = True
 os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # tqdm's, of a notebook without ipywidgets
-OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+((?:examples|results|sipe_bayes|\.github)[^)#]*)(?:#[^)]*)?\)")
+OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+((?:examples|results|sipe_bayes|SECURITY|\.github)[^)#]*)(?:#[^)]*)?\)")
 
 
 def name_files(app: sphinx.application.Sphinx, page: str, source: list[str]) -> None:

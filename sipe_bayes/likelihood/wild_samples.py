@@ -90,6 +90,8 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
         if not np.isfinite(least := _least(windows, c)) or len(index) <= 2 * WILD.neighbours + 1:
             continue
         series, log = residual[..., c].reshape(-1)[index], windows.log[sequence.window]
+        if not np.isfinite(series).all():  # a window diverged
+            continue
         steps, within = np.abs(np.diff(series)), np.diff(log) == 0
         limit = np.maximum(WILD.residual_sds * _scale(steps[within]), least * spread[c])
         limit = np.maximum(WILD.residual_times * _around(steps), limit)

@@ -56,7 +56,7 @@ class Dictionary(gymnasium.Env[dict[str, Any], Any]):
 
 def collected(minari: Any, env: Any, dataset: str, episodes: int = 2, steps: int = 6) -> list[tuple[Any, Any, Any]]:
     """Minari's own collector at work; returns observations, actions and rewards of each episode as they came."""
-    collector, episodes = minari.DataCollector(env), []
+    collector, kept = minari.DataCollector(env), []
     for i in range(episodes):
         seen, rewards, actions = [collector.reset(seed=i)[0]], [], []
         collector.action_space.seed(i)
@@ -67,12 +67,12 @@ def collected(minari: Any, env: Any, dataset: str, episodes: int = 2, steps: int
             rewards.append(reward)
             if terminated or truncated:
                 break
-        episodes.append((seen, actions, rewards))
+        kept.append((seen, actions, rewards))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         collector.create_dataset(dataset)
     collector.close()
-    return episodes
+    return kept
 
 
 @pytest.mark.parametrize(("env", "dt"), [("HalfCheetah-v5", 0.05), ("Pendulum-v1", 0.05)])
