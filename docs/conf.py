@@ -18,7 +18,7 @@ release = version = sipe_bayes.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "jupyter_execute"]
 html_theme = "sphinx_book_theme"
 html_title = f"sipe_bayes {release}"
 html_theme_options = {"show_toc_level": 2, "navbar_persistent": []}  # the search stands in the sidebar
@@ -38,7 +38,9 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 240
 nb_merge_streams = True
 os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # tqdm's, of a notebook without ipywidgets
-OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+((?:examples|results|sipe_bayes|SECURITY|\.github)[^)#]*)(?:#[^)]*)?\)")
+OUTSIDE = re.compile(
+    r"(?<!!)\[([^\]]+)\]\((?:\.\./)+((?:examples|results|sipe_bayes|SECURITY|\.github)[^)#]*)(?:#[^)]*)?\)"
+)
 
 
 def name_files(app: sphinx.application.Sphinx, page: str, source: list[str]) -> None:
