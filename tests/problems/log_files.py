@@ -52,6 +52,13 @@ def csv_file(folder: Path, table: Table) -> Written:
     return Written(folder / "log.csv")
 
 
+def text_file(folder: Path, table: Table, suffix: str = ".txt", header: str = "") -> Written:
+    """Below remarks and an empty line; the header may be one of them."""
+    text = pd.DataFrame(table).to_csv(sep="\t", index=False)
+    (folder / f"log{suffix}").write_text(f"# bench 3, firmware 1.2\n\n# gains: 3, 4\n{header}{text}")
+    return Written(folder / f"log{suffix}")
+
+
 def parquet_file(folder: Path, table: Table) -> Written:
     pd.DataFrame(table).to_parquet(folder / "log.parquet")
     return Written(folder / "log.parquet")
@@ -208,6 +215,8 @@ def ulog_file(folder: Path, table: Table) -> Written:
 
 WRITERS: dict[str, Callable[[Path, Table], Written]] = {
     ".csv": csv_file,
+    ".tsv": lambda folder, table: text_file(folder, table, ".tsv", "# "),
+    ".txt": text_file,
     ".parquet": parquet_file,
     ".npz": npz_file,
     ".h5": hdf5_file,

@@ -113,7 +113,7 @@ def _files(logs: Sequence[Path]) -> list[Path]:
             within = sorted(p for p in log.iterdir() if p.suffix.lower() in READERS or (p.is_dir() and _is_log(p)))
             if not within:
                 raise LogError(f"{log}: a folder without logs; name the files")
-            out += within
+            out += [p for p in within if p.suffix.lower() != ".txt"] or within  # notes beside the logs
             continue
         files = matching(log, Path())
         if not files:
@@ -228,10 +228,11 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
     part = decide(part, machine, trial, layout)
     logs = loaded(part, sources, folder)
     unknowns, delay, notes = _unknowns(part, model, machine, logs, folder)
+    unknowns, doubts = _some(unknowns)
     window, why = _window(machine, logs, trial)
     return replace(
         part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
-        notes=(*draft.notes, *notes), delay=delay,
+        notes=(*draft.notes, *notes), doubts=(*part.doubts, *doubts), delay=delay,
     )  # fmt: skip
 
 
@@ -256,6 +257,16 @@ def _unknowns(
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
     return [*late, *told_apart(unknowns, left)], samples, [note] if note and not late else []
+
+
+def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:
+    """The unknowns, all of them asked for where the simulations told none apart, and what is said of that."""
+    if any(not unknown.left_out for unknown in unknowns):
+        return unknowns, []
+    if not unknowns:
+        return [], ["nothing of the model could be proposed as unknown; add [[parameters]] by hand"]
+    doubt = "no unknown shows in the windows that were simulated, so all are asked for; look at the log and the model"
+    return [replace(unknown, left_out="") for unknown in unknowns], [doubt]
 
 
 def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str, str]:

@@ -34,10 +34,13 @@ def slope_of(position: FloatArray, velocity: FloatArray, dt: float = 1.0) -> Slo
     Over a few samples the mean velocity is compared with the way travelled, which noise and rounding spoil less than
     differences of single samples.
     """
-    known = np.isfinite(position) & np.isfinite(velocity)
-    if known.sum() < _FEWEST or np.ptp(position[known]) == 0 or np.ptp(velocity[known]) == 0:
+    known = np.isfinite(position), np.isfinite(velocity)
+    if min(k.sum() for k in known) < _FEWEST or not np.ptp(position[known[0]]) or not np.ptp(velocity[known[1]]):
         return Slope(1.0, 0.0, 0.0)
-    position, velocity = position[known], velocity[known]
+    row = np.arange(max(k.argmax() for k in known), len(position) - max(k[::-1].argmax() for k in known))
+    position, velocity = (  # one of them may have been measured at every fifth row only
+        np.interp(row, np.flatnonzero(k), values[k]) for k, values in zip(known, (position, velocity), strict=True)
+    )
     span = int(np.clip(len(position) // 60, 2, 12))
     way = (position[span:] - position[:-span]) / (span * dt)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])

@@ -2,7 +2,8 @@
 
 Windows of a log are simulated from the state that its measurements tell. What a straight line in time explains of the
 difference is taken out of each window, since that is what an inexact start leaves; the rest is compared with what such
-a line leaves of the measurement itself. So a *miss* of 1 is no better than going on straight, in any unit.
+a line leaves of the measurement itself. So a *miss* of 1 is no better than going on straight, in any unit. Samples that
+are missing are bridged by straight lines, and windows with long gaps are not taken where others are.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.core.rotations import written_near
+from sipe_bayes.core.rotations import bridged, written_near
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -101,10 +102,11 @@ class Trial:
     ) -> None:
         environment = MjcfEnvironment.build(model, parameters, actuators, channels)
         self.simulator = Simulator(environment, num_threads=1)
-        self.logs, self.length = tuple(logs), _length(logs, share)
+        self.logs = tuple(_bridged(log, environment.rotations) for log in logs)
+        self.length = _length(self.logs, share)
         steps, _ = self.simulator.physics_steps(logs[0].dt)
         count = int(np.clip(_STEPS / (self.length * steps), 6, windows))
-        self.places = _places(logs, self.length, count)
+        self.places = _places(logs, self.length, count)  # of the logs as they are: gaps count
         time = np.linspace(-1, 1, self.length + 1)
         self._line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]
         self._read: dict[Assumption, Flight] = {}
@@ -168,6 +170,21 @@ def spread_of(values: FloatArray) -> FloatArray:
     return np.asarray(np.median(np.sqrt((values**2).mean(axis=2)), axis=1))
 
 
+def _bridged(log: Trajectory, triples: Sequence[tuple[int, int, int]]) -> Trajectory:
+    """The log with missing samples put between their neighbours; channels without any stay as they are."""
+    if np.isfinite(log.observations).all():
+        return log
+    observations, sample = log.observations.copy(), np.arange(len(log) + 1)
+    for series in observations.T:
+        known = np.isfinite(series)
+        if known.any():
+            series[:] = np.interp(sample, sample[known], series[known])
+    for triple in map(list, triples):
+        if np.isfinite(log.observations[:, triple]).all(-1).any():
+            observations[:, triple] = bridged(log.observations[:, triple])
+    return Trajectory(observations, log.actions, log.dt)
+
+
 def _read_as(log: Trajectory, assumption: Assumption) -> Trajectory:
     observations = log.observations[:, list(assumption.channels)] * np.array(assumption.observed)
     return Trajectory(observations, log.actions, log.dt * assumption.clock)
@@ -203,7 +220,8 @@ def _places(logs: Sequence[Trajectory], length: int, windows: int) -> list[IntAr
         sizes = np.maximum(np.nanstd(log.observations, axis=0), 1e-12)
         cut = starts[:, None] + np.arange(length + 1)
         pieces = log.observations[cut]
-        whole = np.isfinite(pieces).mean(axis=(1, 2)) > 0.9
+        quarters = np.array_split(np.isfinite(pieces), 4, axis=1)
+        whole = np.all([quarter.any(axis=1) for quarter in quarters], axis=(0, 2))
         moves = np.where(whole, np.nan_to_num(np.nanstd(pieces, axis=1) / sizes).sum(1), -1.0)
         if log.actions.shape[1]:
             spread = np.maximum(log.actions.std(axis=0), 1e-12)

@@ -1,15 +1,16 @@
-"""CSV: separated by comma, semicolon, tab or blanks; the first line names the columns."""
+"""Tables of text, separated by comma, semicolon, tab or blanks; the first line that is no remark names the columns."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Collection
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TextIO
 
 from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, frame_columns
 
 _LONGEST = 2**17  # characters of a header or a name: what the csv module takes
+_REMARKS = 200  # lines above the header that are looked through
 
 
 def read_csv(path: Path, wanted: Collection[str]) -> Columns:
@@ -18,11 +19,11 @@ def read_csv(path: Path, wanted: Collection[str]) -> Columns:
 
     check_size(path, path.stat().st_size)
     with path.open(encoding="utf-8-sig", newline="") as file:
-        header, first = file.readline(_LONGEST).rstrip("\r\n"), file.readline(_LONGEST)
+        above, header, first = _opening(file)
     if len(header) >= _LONGEST - 2:
         raise LogError(f"{path}: the first line is longer than {_LONGEST} characters; is it a table of columns?")
     separator = _separator(header)
-    names = [name.strip() for name in _split(header.lstrip("# "), separator)]
+    names = [name.strip() for name in _split(header.lstrip("#% "), separator)]
     if any(_is_number(name) for name in names):
         raise LogError(f"{path}: the first line must name the columns, got {header[:40]!r}; add a header line")
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -32,7 +33,7 @@ def read_csv(path: Path, wanted: Collection[str]) -> Columns:
         path,
         sep=separator,
         names=names,
-        skiprows=1,
+        skiprows=above + 1,
         index_col=False,
         decimal="," if separator == ";" and "," in first and "." not in first else ".",
         skipinitialspace=True,
@@ -40,6 +41,25 @@ def read_csv(path: Path, wanted: Collection[str]) -> Columns:
         float_precision=_float_precision(pd.__version__),
     )
     return frame_columns(frame)
+
+
+def _opening(file: TextIO) -> tuple[int, str, str]:
+    """How many lines of remarks stand above the header, the header, and the line after it.
+
+    A remark is an empty line or one that begins with ``#`` or ``%``; the last one is the header where rows follow.
+    """
+    header, first = file.readline(_LONGEST).rstrip("\r\n"), file.readline(_LONGEST)
+    for above in range(_REMARKS):
+        remark = not header.strip() or (header.lstrip()[0] in "#%" and not _is_row(first))
+        if not remark or not first:
+            return above, header, first
+        header, first = first.rstrip("\r\n"), file.readline(_LONGEST)
+    return _REMARKS, header, first
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line begins with a number."""
+    return bool(line.strip()) and _is_number(_split(line.strip(), _separator(line))[0])
 
 
 def _float_precision(version: str) -> Literal["round_trip"] | None:

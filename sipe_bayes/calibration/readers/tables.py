@@ -19,6 +19,7 @@ from sipe_bayes.calibration.readers.ros_bag import read_bag
 from sipe_bayes.calibration.readers.ulog import read_ulog
 from sipe_bayes.core.files import reading
 
+_TEXT = Format(read_csv, "as the first line says, or the last of those with `#` or `%` above the rows")
 _HDF5 = Format(read_hdf5, "the path of the dataset: `robot/arm/state[0]`")
 _BAG = Format(
     read_bag,
@@ -28,7 +29,9 @@ _BAG = Format(
 )
 
 READERS: dict[str, Format] = {
-    ".csv": Format(read_csv, "as the first line says"),
+    ".csv": _TEXT,
+    ".tsv": _TEXT,
+    ".txt": _TEXT,
     ".parquet": Format(read_parquet, "as there; entries of lists `state[0]`"),
     ".npz": Format(read_npz, "as its array; of two dimensions, where rows are samples, `states[0]` and so on"),
     ".h5": _HDF5,

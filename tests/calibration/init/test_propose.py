@@ -60,6 +60,31 @@ def test_units_signs_and_delays_of_twenty_logs(tmp_path: Path) -> None:
     assert len(mistakes) <= 1, mistakes
 
 
+def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
+    """A sensor at a fifth of the other's rate, frames that were dropped, and a gap; in a text file with remarks."""
+    truth = make_log(tmp_path, KINDS["arm"], 1, 3)
+    table = pd.read_csv(tmp_path / "log.csv")
+    rows = np.arange(len(table))
+    table.loc[rows % 5 > 0, "joint_2_pos"] = np.nan
+    table.loc[(rows > 300) & (rows < 330), ["joint_1_pos", "joint_2_pos"]] = np.nan
+    table = table[np.random.default_rng(0).uniform(size=len(table)) > 0.05]
+    text = "# arm of bench 2\n# started by hand\n" + table.to_csv(index=False, sep="\t")
+    (tmp_path / "log.txt").write_text(text)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.txt"], tmp_path)
+    assert not wrong(draft, truth)
+    assert {"upper_arm_mass", "forearm_mass", "shoulder_damping"} <= {unknown.name for unknown in draft.proposed}
+
+
+def test_where_nothing_shows_all_is_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "model.xml").write_text(PENDULUM)
+    time = np.arange(200) * 0.01
+    still = 1e-3 * np.random.default_rng(0).standard_normal(len(time))
+    pd.DataFrame({"time": time, "angle": still, "torque": 0.0 * time}).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    assert draft.proposed
+    assert any("all are asked for" in doubt for doubt in draft.open_doubts)
+
+
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A folder with an arm's model and log, and the configuration that is written for them."""

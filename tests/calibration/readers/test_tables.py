@@ -51,14 +51,15 @@ def test_a_reader_is_added_by_one_line(tmp_path: Path, monkeypatch: pytest.Monke
     def read_lines(path: Path, wanted: Collection[str]) -> Columns:
         return {"value": np.array([float(line) for line in path.read_text().split()])}
 
-    monkeypatch.setitem(READERS, ".txt", Format(read_lines, "`value`"))
-    (tmp_path / "log.txt").write_text("1 2.5")
-    assert read_table(tmp_path / "log.txt")["value"].tolist() == [1.0, 2.5]
-    (tmp_path / "log.txt").write_text("1 two")
-    with pytest.raises(LogError, match=r"log.txt: cannot be read as .txt \(could not convert string to float: 'two'"):
-        read_table(tmp_path / "log.txt")
+    monkeypatch.setitem(READERS, ".lines", Format(read_lines, "`value`"))
+    (tmp_path / "log.lines").write_text("1 2.5")
+    assert read_table(tmp_path / "log.lines")["value"].tolist() == [1.0, 2.5]
+    (tmp_path / "log.lines").write_text("1 two")
+    message = r"log.lines: cannot be read as .lines \(could not convert string to float: 'two'"
+    with pytest.raises(LogError, match=message):
+        read_table(tmp_path / "log.lines")
     (tmp_path / "log.tdms").write_text("")
-    with pytest.raises(LogError, match=r"expected a .csv, .*, .ulg or .txt file, got '.tdms'"):
+    with pytest.raises(LogError, match=r"expected a .csv, .*, .ulg or .lines file, got '.tdms'"):
         read_table(tmp_path / "log.tdms")
 
 
