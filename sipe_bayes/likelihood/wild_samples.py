@@ -21,6 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.rotations import continued
 from sipe_bayes.likelihood.noise import NORMAL_MAD
 from sipe_bayes.likelihood.windows import Windows
 
@@ -81,10 +82,11 @@ def wild_positions(values: FloatArray) -> BoolArray:
 def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
     """Samples (k, 3), each by log, number in it and channel of the model, that a residual (W, L, C) shows as wild.
 
-    Asked of channels that measure positions and velocities of the state.
+    Asked of channels that measure positions and velocities of the state. Rotation vectors are followed beyond half a
+    turn, where a body that tumbles otherwise than its simulation would seem to flip.
     """
     length, found = residual.shape[1], []
-    spread = windows.spread
+    spread, residual = windows.spread, _continued(windows, residual)
     for c, sequence in enumerate(windows.sequences):
         index = sequence.index
         if not np.isfinite(least := _least(windows, c)) or len(index) <= 2 * WILD.neighbours + 1:
@@ -108,6 +110,16 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
             sample = windows.start[sequence.window] + index % length
             found.append(np.stack([log[wild], sample[wild], np.full(wild.sum(), windows.channels[c])], axis=1))
     return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
+
+
+def _continued(windows: Windows, residual: FloatArray) -> FloatArray:
+    """Residuals (W, L, C) whose rotation vectors go on from sample to sample of each window."""
+    out = residual.copy() if windows.rotations else residual
+    for triple in map(list, windows.rotations):
+        for w, observed in enumerate(windows.observed[..., triple].all(-1)):
+            place = np.ix_([w], np.flatnonzero(observed), triple)
+            out[place] = continued(out[place][0])
+    return out
 
 
 def _least(windows: Windows, channel: int) -> float:

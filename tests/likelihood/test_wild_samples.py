@@ -9,13 +9,14 @@ import pytest
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
-from sipe_bayes.core.rotations import aligned, product, quaternions
+from sipe_bayes.core.rotations import aligned, product, quaternions, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.wild_samples import jumps, wild_positions, wild_residuals
 from sipe_bayes.likelihood.windows import Windows
 from tests.problems import pendulums
+from tests.problems.bodies import cube, tosses
 
 TIME = np.arange(0, 5, 0.005)
 SWING = 0.2 * np.sin(3 * TIME) + 0.05 * np.sin(11 * TIME)
@@ -65,6 +66,19 @@ def test_flips_of_a_body_are_wild_and_signs_are_not() -> None:
     assert not wild_positions(aligned(seen)).any()
     seen[200:210] = product(seen[200:210], quaternions(np.array([[2.0, 0.0, 0.0]])))
     assert np.flatnonzero(wild_positions(aligned(seen))).tolist() == list(range(200, 210))
+
+
+def test_a_body_that_tumbles_otherwise_than_simulated_is_not_wild() -> None:
+    """Its rotation vector wraps at half a turn, there and soon back; a flip of one sample stands out all the same."""
+    simulator = cube()
+    windows = Windows(Segments(None, "white"), simulator, tosses(simulator, 2, 60, seed=5)[0])
+    residual = np.random.default_rng(6).normal(0, 0.003, (2, 61, 6))
+    angle = 3.08 + 0.1 * np.exp(-(((np.arange(61) - 30) / 2) ** 2))
+    residual[..., 3:] += rotation_vectors(quaternions(angle[:, None] * np.array([0.6, 0.0, 0.8])))
+    assert np.abs(np.diff(residual[0], axis=0)).max() > 4
+    assert not len(wild_residuals(windows, residual))
+    residual[1, 10, 4] += 1.0
+    assert wild_residuals(windows, residual).tolist() == [[1, 10, 4]]
 
 
 def test_so_many_are_no_accidents() -> None:
