@@ -148,10 +148,11 @@ def unmeasured_starts(
     for joint in joints:
         body = model.body(int(model.jnt_bodyid[joint])).name or f"body {int(model.jnt_bodyid[joint])}"
         name = model.joint(joint).name or f"of {body}"
-        place = f"body:{body}.position and " if int(model.jnt_type[joint]) == _FREE else ""
-        needed = f"{place}body:{body}.orientation"
+        wanted = ("position", "orientation") if int(model.jnt_type[joint]) == _FREE else ("orientation",)
+        seen = {reading.quantity for reading in simulator.environment.poses if reading.joint == joint}
+        missing = [f"body:{body}.{quantity}" for quantity in wanted if quantity not in seen]
         code = Code.HELD_OUT_AT_REST if isinstance(likelihood, StateSpace) else Code.STARTS_AT_REST
-        findings.append(finding(code, joint=name, needed=needed))
+        findings.append(finding(code, joint=name, needed=" and ".join(missing)))
     return findings
 
 

@@ -160,12 +160,12 @@ class Code(Enum):
         "intervals"
     )
     STARTS_AT_REST = blocking(
-        "the measurements do not tell the pose of joint {joint}: every window starts it where the model has it at "
-        "rest; measure {needed}, or use likelihood = 'state_space'"
+        "the measurements do not tell the whole pose of joint {joint}: every window starts the rest of it where the "
+        "model has it; measure {needed}, or use likelihood = 'state_space'"
     )
     HELD_OUT_AT_REST = caution(
-        "the measurements do not tell the pose of joint {joint}: simulations of held-out logs start it where the model "
-        "has it at rest; measure {needed} to believe their errors"
+        "the measurements do not tell the whole pose of joint {joint}: simulations of held-out logs start the rest of "
+        "it where the model has it; measure {needed} to believe their errors"
     )
     SCATTER = note(
         "impacts make the simulation rough: the intervals are not those of the curvature but of the scatter of "

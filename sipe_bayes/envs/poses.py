@@ -70,6 +70,20 @@ def has_pose(model: mujoco.MjModel, joint: int) -> bool:
     return int(model.jnt_type[joint]) in (_FREE, _BALL)
 
 
+def is_round(model: mujoco.MjModel, joint: int) -> bool:
+    """Whether a free joint's body moves alike however it is turned: what touches are spheres about its centre of mass.
+
+    Nothing hangs on it, and its inertia is the same about every axis.
+    """
+    body = int(model.jnt_bodyid[joint])
+    own = (model.geom_bodyid == body) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    spheres = (model.geom_type[own] == int(mujoco.mjtGeom.mjGEOM_SPHERE)).all()
+    centred = np.allclose(model.geom_pos[own], model.body_ipos[body], atol=1e-9)
+    inertia = model.body_inertia[body]
+    alone = not (model.body_parentid[1:] == body).any() and int(model.jnt_type[joint]) == _FREE
+    return bool(alone and own.any() and spheres and centred and np.ptp(inertia) <= 1e-6 * inertia.max())
+
+
 def inertial_joints(model: mujoco.MjModel, readings: Sequence[PoseReading]) -> tuple[int, ...]:
     """Free joints whose body has an accelerometer, and no measured orientation or position."""
     told = {(r.joint, r.quantity) for r in readings}

@@ -14,7 +14,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.states import joints_at_rest
-from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints
+from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
@@ -163,7 +163,7 @@ def _parents(model: mujoco.MjModel, joint: int, states: FloatArray) -> FloatArra
 def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
     """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state.
 
-    Not those of which the model itself says how far from rest they start.
+    Not those of which the model itself says how far from rest they start; a ball's orientation does not matter.
     """
     model, environment = simulator.model, simulator.environment
     if are_states(simulator, trajectories.states):
@@ -171,10 +171,11 @@ def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[
     seen = np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
     columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
     known_poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
+    placed = {r.joint for r in environment.poses if r.quantity == "position" and r.at_origin}
     missing, resting = [], {*joints_at_rest(model), *inertial_joints(model, environment.poses)}
     for joint in (joint for joint in range(model.njnt) if joint not in resting):
         if has_pose(model, joint):
-            known = (joint, "orientation") in known_poses
+            known = (joint, "orientation") in known_poses or (is_round(model, joint) and joint in placed)
             if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
                 known &= (joint, "position") in known_poses
         else:

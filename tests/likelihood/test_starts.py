@@ -8,11 +8,12 @@ import pytest
 from sipe_bayes.core.rotations import between, quaternions
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.starts import estimate_states, smoothed, smoothed_rotations, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from tests.problems.bodies import BALL, CUBE, DAMPING, FRICTION, POSE, cube, tosses, turns
+from tests.problems.bodies import BALL, CUBE, DAMPING, FRICTION, POSE, ROUND, cube, tosses, turns
 
 TAG, SPEED, GYRO = (tuple(f"sensor:{name}[{i}]" for i in range(3)) for name in ("tag", "speed", "gyro"))
 FLIGHT = 20  # control steps before any of these cubes lands
@@ -108,6 +109,16 @@ def test_joints_that_no_measurement_tells_are_named(measurements: tuple[str, ...
     logs, _ = tosses(simulator, 1, 5, seed=0)
     assert unmeasured_joints(simulator, logs) == joints
     assert Windows(Segments(None), simulator, logs).starts_measured is not bool(joints)
+
+
+@pytest.mark.parametrize(("measured", "joints"), [(("body:cube.position",), []), (TAG, [0])])
+def test_how_a_ball_is_turned_does_not_matter(measured: tuple[str, ...], joints: list[int]) -> None:
+    """Its place alone tells where it starts, unless it is that of a tag off its centre."""
+    environment = MjcfEnvironment.build(ROUND, [FRICTION], [], measured)
+    simulator = Simulator(environment, num_threads=1)
+    logs, _ = tosses(simulator, 1, 5, seed=0)
+    assert unmeasured_joints(simulator, logs) == joints
+    assert grows(Windows(Segments(None), simulator, logs)) is not bool(joints)
 
 
 def test_the_sensors_that_read_bodies_are_the_models() -> None:

@@ -26,6 +26,7 @@ BALL = """<mujoco><option timestep="0.002"/><worldbody>
       <geom type="capsule" fromto="0 0 0 .1 .05 -.3" size=".02" mass=".3"/>
       <site name="imu" pos="0 0 -.2" euler="40 0 10"/></body></body></worldbody>
   <sensor><gyro name="gyro" site="imu"/><ballquat name="own" joint="ball"/></sensor></mujoco>"""
+ROUND = CUBE.replace('type="box" size=".05 .05 .05"', 'type="sphere" size=".05"')
 POSE = ("body:cube.position", "body:cube.orientation")
 FRICTION = Parameter("friction", 0.05, 0.6, targets=("geom:cube.friction", "geom:floor.friction"))
 DAMPING = Parameter("damping", 0.0, 0.05, targets=("joint:ball.damping",))
