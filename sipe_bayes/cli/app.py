@@ -56,6 +56,7 @@ app = typer.Typer(
 # what the parser says of options and arguments, whose name typer keeps private
 _REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
+_AXES = ("_x", "_y", "_z")
 _LINES, _SENTENCES, _WARNINGS, _CHANNELS = 20, 3, 3, 3  # that a calibration may fill, and of each kind of line
 _SDS = 3.3  # in a 90 % interval
 _LONGEST, _VERDICT = 300, 44  # characters of a sentence on the terminal, and of a verdict in the table
@@ -229,7 +230,7 @@ def print_calibration(calibration: Calibration) -> None:
     sentences = verdicts(calibration, brief=True)
     for verdict in sentences[:_SENTENCES]:
         console.print(Text(_cut(verdict.text), style=_TONES[verdict.tone]))
-    below = [*_pooled(calibration)[:_CHANNELS], *_worst(findings)]
+    below = [*_pooled(calibration), *_worst(findings)]
     below.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s" + _report(calibration))
     _print_parameters(console, calibration, findings, _LINES - 1 - min(len(sentences), _SENTENCES) - len(below))
     for line in below:
@@ -269,18 +270,24 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
 
 
 def _pooled(calibration: Calibration) -> list[str]:
-    """A line for each channel: the root-mean-square of the errors on held-out logs, or where there are none on all."""
+    """A line for each channel, of vectors one for all three: root-mean-square errors on held-out logs, else on all."""
     from sipe_bayes.report.words import times
 
     title, scores = ("held out", calibration.holdout) if calibration.holdout else ("train", calibration.train)
-    lines = []
-    for channel in dict.fromkeys(s.channel for s in scores):
-        mine = [s for s in scores if s.channel == channel]
-        own, given = (math.sqrt(sum(e * e for e in rmse) / len(mine)) for rmse in _errors(mine))
-        logs = f"{title} {mine[0].log}" if len(mine) == 1 else f"{title}, {len(mine)} logs"
+    known, lines = {(s.channel, s.unit) for s in scores}, []
+    quantities: dict[str, list[ChannelScore]] = {}
+    for s in scores:
+        stem = s.channel.removesuffix(s.channel[-2:]) if s.channel[-2:] in _AXES else ""
+        whole = bool(stem) and all((stem + axis, s.unit) in known for axis in _AXES)
+        quantities.setdefault(stem if whole else s.channel, []).append(s)
+    for quantity, mine in quantities.items():
+        logs = list(dict.fromkeys(s.log for s in mine))
+        own, given = (math.sqrt(sum(e * e for e in rmse) / len(logs)) for rmse in _errors(mine))
+        where = f"{title} {logs[0]}" if len(logs) == 1 else f"{title}, {len(logs)} logs"
         ratio = times(given / own if own else float("inf"))
-        lines.append(f"{logs}, {channel}: RMSE {own:.3g} {mine[0].unit}; model as given {given:.3g} (now {ratio})")
-    return lines
+        lines.append(f"{where}, {quantity}: RMSE {own:.3g} {mine[0].unit}; model as given {given:.3g} (now {ratio})")
+    more = len(lines) - _CHANNELS
+    return lines if more <= 0 else [*lines[: _CHANNELS - 1], f"{lines[_CHANNELS - 1]} [{more} more in the report]"]
 
 
 def _errors(scores: Sequence[ChannelScore]) -> tuple[list[float], list[float]]:

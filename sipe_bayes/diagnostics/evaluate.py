@@ -1,7 +1,8 @@
 """How well simulations follow logs: errors over open-loop windows, signals with their band, residuals.
 
 Windows start from the measured state (``likelihood.starts``), so a held-out log needs no fit of its own; a
-parameter that differs between logs takes the mean of the calibrated ones there.
+parameter that differs between logs takes the mean of the calibrated ones there. Of bodies that tumble the first tenth
+of a second tells the start: a slope of noisy poses is so far off that its error would hide the model's.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
-from sipe_bayes.inference.laplace.growing_windows import grown_starts, grows
+from sipe_bayes.inference.laplace.growing_windows import grown_starts, grows, told_starts
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
@@ -31,8 +32,14 @@ _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
-def measured_starts(windows: Windows, theta: FloatArray) -> FloatArray:
-    """Starts (B, W, D) of theta (B, N): what was measured there, as theta claims the sensors' bias and scale."""
+def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
+    """Starts (B, W, D) of theta (B, N): what was measured there, as theta claims the sensors' bias and scale.
+
+    Of bodies that tumble those of ``near`` (N,) serve all, default each theta its own.
+    """
+    if grows(windows) and windows.trajectories.states is None:
+        own = [told_starts(windows, at, GrowingTuning()) for at in (theta if near is None else near[None])]
+        return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
     simulator, model = windows.simulator, windows.simulator.model
     starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
     states, tangent = simulator.environment.state_columns(model), _tangents(model)
@@ -273,10 +280,10 @@ def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArr
     spread = draws.std(0)
     if spread.max() > _NARROW:
         few = draws[:: max(1, len(draws) // _FEW_DRAWS)]
-        return windows.predict(few, measured_starts(windows, few))[0]
+        return windows.predict(few, measured_starts(windows, few, theta))[0]
     step = np.where(theta + spread <= 1, 1.0, -1.0) * np.maximum(spread, windows.theta_step)
     beside = theta + np.diag(step)
-    slopes = (windows.predict(beside, measured_starts(windows, beside))[0] - here) / step[:, None, None, None]
+    slopes = (windows.predict(beside, measured_starts(windows, beside, theta))[0] - here) / step[:, None, None, None]
     return np.asarray(here + np.tensordot(draws - theta, slopes, axes=1))
 
 

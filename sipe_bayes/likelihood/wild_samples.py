@@ -116,9 +116,9 @@ def _continued(windows: Windows, residual: FloatArray) -> FloatArray:
     """Residuals (W, L, C) whose rotation vectors go on from sample to sample of each window."""
     out = residual.copy() if windows.rotations else residual
     for triple in map(list, windows.rotations):
-        for w, observed in enumerate(windows.observed[..., triple].all(-1)):
-            place = np.ix_([w], np.flatnonzero(observed), triple)
-            out[place] = continued(out[place][0])
+        for own, observed in zip(out, windows.observed[..., triple].all(-1), strict=True):
+            rows = np.flatnonzero(observed)[:, None]
+            own[rows, triple] = continued(own[rows, triple])
     return out
 
 

@@ -1,22 +1,22 @@
 """Windows of bodies that tumble: their beginnings first, ever longer, and each window's start the best of several.
 
-A measured pose tells nearly where such a window starts, but an impact magnifies what is left, the next one that, and a
-simulation that misses a corner's touch has no slope towards the one that does not. A beginning with one impact is
-nearly smooth; fitted, it foretells the next impact nearly enough (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear
-dynamical system identification from uncertain and indirect measurements", 2004,
-https://doi.org/10.1142/S0218127404010345). So theta and the starts descend together on beginnings that grow. And since
-windows meet in theta alone, each takes as much of a step of its start as serves it best: one that misses an impact on
-the way holds back itself, not the search.
+A measured pose tells nearly where such a window starts, and its first tenth of a second, followed by the model, ten
+times nearer. But an impact magnifies what is left, the next one that, and a simulation that misses a corner's touch has
+no slope towards the one that does not. A beginning with one impact is nearly smooth; fitted, it foretells the next
+impact nearly enough (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear dynamical system identification from uncertain and
+indirect measurements", 2004, https://doi.org/10.1142/S0218127404010345). So theta and the starts descend together on
+beginnings that grow. And since windows meet in theta alone, each takes as much of a step of its start as serves it
+best: one that misses an impact on the way holds back itself, not the search.
 
 Contact that chatters (a body that lies or is pushed) jumps over short differences, whose slopes then say nothing, and
-starts would follow them anywhere. So theta moves alone at first, by the measured starts, over wide differences. They
+starts would follow them anywhere. So theta moves alone at first, by those starts, over wide differences. They
 shrink where nothing is left to gain over them, as long as the slopes do not grow with that.
 
 The noise meanwhile is white, of the size that the samples' roughness shows whatever the model.
 
 Through impacts the likelihood has valleys within valleys, each far narrower than they lie apart, and no search is sure
 to end in the deepest. So the curvature where it ended says little of how well theta is known. Groups of windows are
-fitted apart, each from the measured starts. Where their estimates scatter by more than the curvature says, the
+fitted apart, each from starts of their own. Where their estimates scatter by more than the curvature says, the
 posterior is a normal half way between their mean and the estimate of all windows together. Its covariance is that of a
 mean of so few (batch means, as Student's t has it), and holds both of these.
 """
@@ -79,7 +79,9 @@ def first_beginnings(
 ) -> Position:
     """A starting point on the first beginnings, theta alone; after a search without jumps, over short differences."""
     horizon, jumps = first_horizon(windows, tuning), after is not None and after.jumps
-    here = replace(here, phase=Phase.GROW, horizon=horizon, jumps=jumps)
+    here = replace(
+        here, phase=Phase.GROW, horizon=horizon, jumps=jumps, starts=told_starts(windows, here.theta, tuning)
+    )
     return here if after is not None and not jumps else replace(here, theta_step=tuning.widest, alone=True)
 
 
@@ -122,11 +124,10 @@ def grown(
     energy = WindowEnergy(view, noise, prior)
     linearised = ManyStarts(energy, point, view.moments(lin, white=True), tuning.shares)
     if here.slope and slope > tuning.rougher * here.slope and size < tuning.widest:  # these differences are luck
-        windows.rollouts = before + math.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum()))
+        counted(windows, view, before)
         return replace(here, theta_step=size * tuning.finer, slope=0.0, jumps=True)
     fit = descend(linearised, here.damping, max(tuning.enough * linearised.energy, 0.02), rule)
-    share = view.steps.sum() / windows.steps.sum()
-    windows.rollouts = before + math.ceil((view.rollouts - before) * share)
+    counted(windows, view, before)
     point, steps = fit.point or point, here.iteration + 1
     here = replace(here, theta=point.theta, starts=point.starts, damping=fit.damping, iteration=steps)
     on = fit.converged or fit.gained < tuning.enough * linearised.energy or steps >= tuning.most_steps
@@ -148,6 +149,25 @@ def start_steps(windows: Windows, size: float) -> FloatArray:
     """Differences (D,) of the starts beside ``size`` of theta: positions, then velocities."""
     half = windows.num_start // 2
     return size * np.concatenate([np.full(half, 0.05), np.full(windows.num_start - half, 0.5)])
+
+
+def told_starts(windows: Windows, theta: FloatArray, tuning: GrowingTuning) -> FloatArray:
+    """Starts (W, D) that the first moments of the windows tell of at a fixed theta (N,): of what follows nothing.
+
+    The measured ones of windows that do not grow.
+    """
+    if not grows(windows):
+        return windows.no_starts()
+    steps, before = math.ceil(tuning.telling / float(windows.dt.min())), windows.rollouts
+    view = windows.beginnings(max(tuning.fewest_steps, steps))
+    starts = grown_starts(view, theta, level(windows), replace(tuning, first=1.0))
+    counted(windows, view, before)
+    return starts
+
+
+def counted(windows: Windows, view: Windows, before: int) -> None:
+    """Count the rollouts of a view of the windows, which simulates a share of them, since there were ``before``."""
+    windows.rollouts = before + math.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum()))
 
 
 def grown_starts(windows: Windows, theta: FloatArray, noise: Noise, tuning: GrowingTuning) -> FloatArray:

@@ -51,6 +51,8 @@ class GrowingTuning(Options):
     enough: float = option(1e-3, "gain of a step below which they grow", "of the energy", above=0)
     most_steps: int = option(12, "steps after which they grow all the same", least=1)
     start_steps: int = option(4, "the same where only the starts are looked for", least=1)
+    telling: float = option(0.1, "beginning that tells a start that is not fitted: few fly longer", "s", above=0)
+    fewest_steps: int = option(8, "control steps of that, at least: two unknowns of six coordinates", least=2)
     damping: float = option(1e-2, "of the first step of longer ones, at most", above=0)
     widest: float = option(
         0.02, "differences that they begin with: contact jumps over shorter ones", above=0, below=0.5

@@ -7,6 +7,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.growing_windows import told_starts
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.likelihood.windows import Windows
 
@@ -28,7 +29,8 @@ def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
         later = np.diff(ends.astype(int)).tolist()
     draws = problem.prior.sample((count - sum(later),), generator=generator).numpy()
     points = np.concatenate([problem.space.default_theta[None], draws])
-    loss = _plain_loss(windows, points)
+    starts = told_starts(windows, problem.space.default_theta.clip(0, 1), problem.options.tuning.growing)
+    loss = _plain_loss(windows, starts, points)
     if not np.isfinite(loss).any():
         raise ValueError(
             f"every one of {len(points)} starting points diverges in the simulation; narrow the bounds, "
@@ -39,7 +41,7 @@ def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
         best = points[_by_loss(loss)[: tuning.elite]]
         drawn = best.mean(0) + (best.std(0) + tuning.least_spread) * rng.standard_normal((size, points.shape[1]))
         points = np.concatenate([points, np.clip(drawn, 0.0, 1.0)])
-        loss = np.concatenate([loss, _plain_loss(windows, points[-size:])])
+        loss = np.concatenate([loss, _plain_loss(windows, starts, points[-size:])])
     chosen = _by_loss(loss)
     if np.isfinite(loss[0]):
         chosen = np.concatenate([[0], chosen[chosen != 0]])
@@ -48,9 +50,12 @@ def screen(problem: SearchProblem, windows: Windows) -> FloatArray:
     return points[chosen[: problem.options.restarts]]
 
 
-def _plain_loss(windows: Windows, points: FloatArray) -> FloatArray:
-    """Squared residuals (B,) of points (B, N), in units of each channel's spread; infinite where one diverges."""
-    residual, valid = windows.residuals(points, np.tile(windows.no_starts(), (len(points), 1, 1, 1)))
+def _plain_loss(windows: Windows, starts: FloatArray, points: FloatArray) -> FloatArray:
+    """Squared residuals (B,) of points (B, N) from starts (W, D), in units of each channel's spread.
+
+    Infinite where one diverges.
+    """
+    residual, valid = windows.residuals(points, np.tile(starts, (len(points), 1, 1)))
     spread = np.maximum(windows.spread, 1e-12)
     return np.where(valid, ((residual / spread) ** 2).sum((1, 2, 3)), np.inf)
 

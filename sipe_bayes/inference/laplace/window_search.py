@@ -40,6 +40,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.growing_windows import (
     ManyStarts,
+    counted,
     first_beginnings,
     group,
     grown,
@@ -176,11 +177,13 @@ class WindowSearch:
         return self._next(replace(state, points=np.concatenate([state.points, more]), scouted=True))
 
     def _apart(self, number: int, state: WindowState) -> Position:
-        """Where a group of windows is fitted from: the best optimum's theta, and the measured starts."""
+        """Where a group of windows is fitted from: the best optimum's theta, and starts of its own."""
         best = max(state.optima, key=lambda optimum: optimum.evidence)
         part = group(self.windows, number, num_groups(self.windows, self._tuning.growing))
-        here = Position.at(part, best.theta, self._tuning.damping, subset=False)
-        return replace(first_beginnings(part, here, self._tuning.growing, state.here), group=number)
+        at = Position.at(part, best.theta, self._tuning.damping, subset=False)
+        here = first_beginnings(part, at, self._tuning.growing, state.here)
+        counted(self.windows, part, self.windows.rollouts)
+        return replace(here, group=number)
 
     def _subset(self, state: WindowState) -> WindowState:
         """A step of theta alone, the starts as the log tells them, on every other window.
@@ -189,10 +192,8 @@ class WindowSearch:
         """
         windows, here, tuning = self.windows, state.here, self._tuning.windows
         view = windows.every_other()
-        before, starts = view.rollouts, view.no_starts()
-        lin = view.linearise(
-            here.theta, starts, with_starts=False, residual=here.kept.residual, theta_step=view.theta_step
-        )
+        before, starts, kept = view.rollouts, view.no_starts(), here.kept.residual
+        lin = view.linearise(here.theta, starts, with_starts=False, residual=kept, theta_step=view.theta_step)
         fixed = np.zeros((*lin.residual.shape, windows.num_start))
         lin = replace(lin, jacobian=np.concatenate([lin.jacobian, fixed], axis=-1))
         energy = WindowEnergy(view, present_noise(view, lin.residual), self.problem.quadratic_prior)
@@ -200,8 +201,7 @@ class WindowSearch:
         linearised = LinearisedWindows(energy, point, view.moments(lin, white=True))
         tolerance = max(tuning.rough_tolerance * linearised.energy, tuning.tolerance)
         fit = descend(linearised, here.damping, tolerance, self._tuning.damping)
-        if view is not windows:
-            windows.rollouts += int(np.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum())))
+        counted(windows, view, before)
         point = fit.point or point
         least = tuning.subset_gain if foretold(fit, tuning) else tuning.subset_gain_unforetold
         again = not fit.converged and fit.gained > least * linearised.energy

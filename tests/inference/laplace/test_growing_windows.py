@@ -10,7 +10,14 @@ import pytest
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.growing_windows import ManyStarts, grown_starts, grows, num_groups, scattered
+from sipe_bayes.inference.laplace.growing_windows import (
+    ManyStarts,
+    grown_starts,
+    grows,
+    num_groups,
+    scattered,
+    told_starts,
+)
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
@@ -54,6 +61,23 @@ def test_starts_are_found_through_impacts(windows: Windows) -> None:
     found = chi_square(windows, grown_starts(windows, TRUTH, WHITE, TUNING))
     assert np.median(found) < 1.3, found
     assert (found < 3).sum() >= 6, found
+
+
+def test_first_moments_tell_where_windows_start(windows: Windows) -> None:
+    """Velocities of a free flight to the error of a straight line's slope, and later samples change nothing."""
+    _, states = tosses(windows.simulator, 8, 70, seed=5, noise=NOISE)
+    told, velocity = told_starts(windows, TRUTH, TUNING), slice(8, 14)
+    samples = int(TUNING.telling / windows.dt[0]) + 2
+    slope = np.sqrt(12) * NOISE / (samples**1.5 * windows.dt[0])
+    error = {
+        name: np.sqrt(((windows.states(starts) - states[:, 0])[:, velocity] ** 2).mean())
+        for name, starts in (("told", told), ("measured", windows.no_starts()))
+    }
+    assert error["told"] < 1.3 * slope < 0.5 * error["measured"], (error, slope)
+    later = windows.part(np.arange(8))
+    later.measured = windows.measured.copy()
+    later.measured[:, samples:] += 0.1
+    np.testing.assert_allclose(told_starts(later, TRUTH, TUNING), told)
 
 
 def test_a_window_that_is_lost_does_not_stop_the_others(windows: Windows) -> None:

@@ -1,0 +1,34 @@
+"""What `sipe calibrate` prints of errors: a line for a channel, one for a vector, and how many more there are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from sipe_bayes.cli.app import print_calibration
+from sipe_bayes.diagnostics.records import ChannelScore
+from tests.problems.calibrations import make_calibration
+
+
+def printed(capsys: pytest.CaptureFixture[str], channels: dict[str, str]) -> list[str]:
+    """The lines about held-out errors of two logs, .03 in each channel and .06 with the model as given."""
+    rows = [ChannelScore(log, name, unit, 0.03, 0.06) for log in "ab" for name, unit in channels.items()]
+    print_calibration(replace(make_calibration(), holdout=rows))
+    return [line for line in capsys.readouterr().out.splitlines() if line.startswith("held out")]
+
+
+def test_a_vector_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of the lengths of its errors: .03 times the root of three."""
+    pose = {f"cube.{name}_{axis}": unit for name, unit in (("place", "m"), ("turn", "rad")) for axis in "xyz"}
+    first, second = printed(capsys, {**pose, "lid_x": "rad"})[:2]
+    assert first.startswith("held out, 2 logs, cube.place: RMSE 0.052 m; model as given 0.104")
+    assert second.startswith("held out, 2 logs, cube.turn: RMSE 0.052 rad")
+    assert printed(capsys, {"lid_x": "rad"})[0].startswith("held out, 2 logs, lid_x: RMSE 0.03 rad")
+
+
+def test_channels_beyond_three_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = printed(capsys, {f"q{k}": "rad" for k in range(5)})
+    assert len(lines) == 3
+    assert lines[-1].endswith("[2 more in the report]")
+    assert "more" not in "".join(printed(capsys, {f"q{k}": "rad" for k in range(3)}))
