@@ -41,7 +41,7 @@ from sipe_bayes.calibration.config_tables import (
     Structure,
 )
 from sipe_bayes.calibration.readers.many import episodes_of
-from sipe_bayes.core.files import read_text, reading, shortened
+from sipe_bayes.core.files import read_text, reading
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST
 
@@ -224,7 +224,7 @@ def load_config(path: str | Path) -> Config:
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"{path}: not valid TOML: {error}; correct that line") from None
         except ValidationError as error:
-            raise ConfigError(f"{path}: {shortened(one_line(error.errors()[0]))}") from None
+            raise ConfigError(f"{path}: {one_line(error.errors()[0])}") from None
     config = config.model_copy(update={"logs": _episodes(path, config)})
     config._path = path
     if not config.model.is_file():

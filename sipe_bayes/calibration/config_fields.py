@@ -20,6 +20,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from sipe_bayes.core.files import LineError, is_file, is_folder
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST_ROLLOUTS, nearest_name
 from sipe_bayes.inference.registry import ESTIMATORS
@@ -28,7 +29,7 @@ from sipe_bayes.structure.registry import EXTENSIONS
 _LISTED = 30  # words in a line
 
 
-class ConfigError(ValueError):
+class ConfigError(LineError):
     """A configuration that cannot be used; the message is one line with key, value and remedy."""
 
 
@@ -51,7 +52,7 @@ def listed(words: Sequence[str]) -> str:
 
 def nearest_file(path: Path) -> str:
     """The remedy for a missing file: the nearest name in its folder."""
-    if not path.parent.is_dir():
+    if not is_folder(path.parent):
         return f"the folder {path.parent} does not exist; correct the path"
     names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file())
     return nearest_name(path.name, names, 0.5).removeprefix("; ") or (
@@ -107,7 +108,7 @@ def _own_extension(word: str, info: ValidationInfo) -> str:
     if not module.endswith(".py"):
         return word
     path = Path((info.context or {}).get("folder", Path()), module)
-    if not path.is_file():
+    if not is_file(path):
         raise problem(f"no such file, got {path}; {nearest_file(path)}")
     return f"{path}:{kind}"
 

@@ -27,12 +27,13 @@ from sipe_bayes.cli.errors import (
     INTERRUPTED,
     check_least,
     check_words,
+    exit_code_of,
     exit_on_error,
     say_interrupted,
     was_announced,
-    was_interruption,
 )
 from sipe_bayes.cli.examples import give_examples
+from sipe_bayes.cli.surroundings import settle
 from sipe_bayes.core import __version__
 from sipe_bayes.inference.progress_bar import ProgressBar
 from sipe_bayes.inference.registry import ESTIMATORS
@@ -69,13 +70,13 @@ def main() -> None:
     was_announced()  # of an earlier call in this process
     try:
         with exit_on_error():
+            settle()
             check_words(sys.argv[1:])
         code = app(standalone_mode=False)
+        sys.stdout.flush()
     except typer.Exit as ended:
         code = ended.exit_code
-    except (typer.Abort, KeyboardInterrupt, ImportError) as error:  # before or after what ``exit_on_error`` sees to
-        if isinstance(error, ImportError) and not was_interruption(error):
-            raise
+    except (typer.Abort, KeyboardInterrupt):  # before or after what ``exit_on_error`` sees to
         code = INTERRUPTED
     except _REFUSED as error:
         message = error.format_message()
@@ -84,6 +85,10 @@ def main() -> None:
         else:
             print(f"sipe: {message[:1].lower()}{message[1:].rstrip('.')}; see --help of the command", file=sys.stderr)
         code = error.exit_code
+    except Exception as error:
+        code = exit_code_of(error)
+        if code is None:
+            raise
     finally:
         signal.signal(signal.SIGTERM, before)
     if code == INTERRUPTED and not was_announced():

@@ -105,6 +105,7 @@ def simulate(
         from sipe_bayes.envs.task import VARIANTS
 
         check_least(1, budget=budget, steps=steps, jobs=jobs)
+        check_least(0, seed=seed)
         check_one_of("variant", variant, VARIANTS)
         (replayed,) = (v for v in VARIANTS if v == variant)
         horizon = Cell(environment, "prior", variant=replayed, seed=seed, steps=steps).horizon

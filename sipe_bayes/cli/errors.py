@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -10,7 +11,8 @@ from contextlib import contextmanager
 
 import typer
 
-from sipe_bayes.core.files import FULL
+from sipe_bayes.cli.surroundings import broken_import, drop_output
+from sipe_bayes.core.files import FULL, reason
 from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 
 BAD_INPUT = 2
@@ -54,6 +56,27 @@ def exit_on_error(then: str = "") -> Iterator[None]:
     except KeyboardInterrupt:
         say_interrupted(then)
         raise typer.Exit(INTERRUPTED) from None
+
+
+def exit_code_of(error: Exception) -> int | None:
+    """Of what no command is at fault for, after the line that says it: None for what is a mistake of ours.
+
+    An interruption while a module is imported, a package that cannot be imported, and output that nobody takes.
+    """
+    if was_interruption(error):
+        return INTERRUPTED
+    package = broken_import(error)
+    if package:
+        remedy = "install it again, or look at the environment variables that it reads"
+        print(f"sipe: {package} cannot be imported ({reason(error)}); {remedy}", file=sys.stderr)
+        return BAD_INPUT
+    if not isinstance(error, OSError) or error.errno not in (*FULL, errno.EIO, errno.EPIPE) or error.filename:
+        return None
+    drop_output()
+    if error.errno == errno.EPIPE:  # as `| head` does
+        return 1
+    print(f"sipe: standard output: {os.strerror(error.errno or 0).lower()}; free some space there", file=sys.stderr)
+    return BAD_INPUT
 
 
 def was_interruption(error: BaseException) -> bool:

@@ -25,11 +25,11 @@ from safetensors import safe_open
 from safetensors.numpy import save
 from torch import Tensor, from_numpy
 
-from sipe_bayes.core.files import reading, write_bytes
+from sipe_bayes.core.files import LineError, reading, write_bytes
 from sipe_bayes.core.findings import Finding
 
 
-class CheckpointError(ValueError):
+class CheckpointError(LineError):
     """A checkpoint that cannot be read or belongs to another run."""
 
 

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import stat
 import tempfile
 import uuid
 import zipfile
@@ -30,6 +31,8 @@ LONGEST_TEXT = 2**25
 """Bytes of JSON or TOML: what it becomes in memory is twenty times as much."""
 LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 20.0}
 """What files may ask for, unless an environment variable of that name says otherwise."""
+_LEAST = {LOG_GIB: 1e-6, MODEL_GIB: 1.0, MODEL_SECONDS: 1.0}  # with less no log, and no MuJoCo, comes to an end
+_MOST = 1e6
 VARIABLES = {
     LOG_GIB: "GiB that a log's columns, or the arrays of a file, may take in memory; a file that has more itself may",
     MODEL_GIB: "GiB that MuJoCo may take for a model file and its first steps",
@@ -104,7 +107,14 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-class FileError(ValueError):
+class LineError(ValueError):
+    """Its message is one line that prints, whatever names of a file stand in it."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(shortened(message))
+
+
+class FileError(LineError):
     """A file that cannot be used; the message is one line with the file, what is wrong and the remedy."""
 
 
@@ -125,6 +135,8 @@ def reading(path: object, what: str, remedy: str, kind: type[ValueError] = FileE
         ValueError: of the kind.
     """
     try:
+        if isinstance(path, Path) and _is_stream(path):
+            raise ValueError("is a pipe, a socket or a device, no plain file")
         yield
     except (kind, FileError, ModuleNotFoundError):
         raise
@@ -134,10 +146,35 @@ def reading(path: object, what: str, remedy: str, kind: type[ValueError] = FileE
         raise kind(f"{path}: cannot be read as {what} ({reason(error)}); {remedy}") from error
 
 
+def _is_stream(path: Path) -> bool:
+    """Whether it is what may never come to an end."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # what reads it says why
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+def is_file(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a file; a name that the system does not take, or that it may not look up, is none."""
+    return os.path.isfile(path)
+
+
+def is_folder(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a folder, as ``is_file``."""
+    return os.path.isdir(path)
+
+
+def check_text_size(path: Path) -> None:
+    """Within ``reading``: ValueError for a file that is no text of ours, by its size."""
+    if path.stat().st_size > LONGEST_TEXT:
+        raise ValueError(f"has {path.stat().st_size} bytes, the most is {LONGEST_TEXT}")
+
+
 def shortened(text: str) -> str:
     """A line that prints, in which no word is longer than anybody reads."""
-    printed = "".join(c if c.isprintable() else "?" for c in text)
-    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...", printed)
+    printed = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
+    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...{word[0][-60:]}", printed)
 
 
 def reason(error: Exception) -> str:
@@ -160,27 +197,27 @@ def limit(name: str) -> float:
     """A limit on what files may ask for: the environment variable of that name, which no file can set, or its default.
 
     Raises:
-        FileError: for a variable that is no positive number.
+        FileError: for a variable that is no such number, or beyond sense.
     """
     given = os.environ.get(name, "")
     try:
         value = float(given) if given else LIMITS[name]
     except ValueError:
         value = math.nan
-    if not 0 < value < math.inf:
-        raise FileError(f"{name}={given}: expected a number above 0; {LIMITS[name]:g} is the default")
+    if not _LEAST[name] <= value <= _MOST:
+        expected = f"expected a number from {_LEAST[name]:g} to {_MOST:g}"
+        raise FileError(f"{name}={given}: {expected}; {LIMITS[name]:g} is the default")
     return value
 
 
 def read_text(path: Path, what: str, remedy: str, kind: type[ValueError] = FileError) -> str:
     """A file of UTF-8, of a size that is bounded; FileNotFoundError where it is missing, else as ``reading``."""
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file; expected {what}")
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"{shortened(str(path))}: no such file; expected {what}")
     with reading(path, what, remedy, kind):
         if not path.is_file():
-            raise ValueError("is no plain file")
-        if path.stat().st_size > LONGEST_TEXT:
-            raise ValueError(f"has {path.stat().st_size} bytes, the most is {LONGEST_TEXT}")
+            raise ValueError("is a folder, no file")
+        check_text_size(path)
         return path.read_text(encoding="utf-8")
 
 
@@ -246,13 +283,13 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[np.gene
     return np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
 
 
-class OutputError(ValueError):
+class OutputError(LineError):
     """An output folder that cannot be used."""
 
 
 def not_a_file(folder: Path) -> None:
     """Raises OutputError where the folder to write into is a file."""
-    if folder.exists() and not folder.is_dir():
+    if os.path.exists(folder) and not is_folder(folder):
         raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
 
 

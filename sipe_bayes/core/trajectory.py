@@ -7,6 +7,7 @@ masked, never invented.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -242,7 +243,7 @@ class Trajectories(Sequence[Trajectory]):
     def load(cls, path: str | Path) -> Trajectories:
         """Read what ``save`` wrote; runs no code from the file. Raises ValueError for another file."""
         needed = {f.name for f in fields(cls)} - {"states", "rewards"}
-        if not Path(path).exists():
+        if not os.path.exists(path):  # False where the system does not take the name
             raise FileNotFoundError(f"{path}: no such file; expected trajectories")
         with reading(path, "trajectories", "write them again with Trajectories.save"):
             arrays: dict[str, Any] = read_arrays(Path(path))

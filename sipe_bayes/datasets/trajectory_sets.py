@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import DATA, read_arrays, read_json, reading, to_json, write_bytes, write_text
+from sipe_bayes.core.files import DATA, LineError, read_arrays, read_json, reading, to_json, write_bytes, write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.acting import AGENTS, SPLITS, Agent, Split
 from sipe_bayes.envs.task import VARIANTS, Variant
@@ -66,7 +66,7 @@ _REMEDY = (
 )
 
 
-class TrajectorySetError(ValueError):
+class TrajectorySetError(LineError):
     """A file of a trajectory set, or the manifest, that cannot be used."""
 
 

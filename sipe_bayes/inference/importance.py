@@ -35,6 +35,7 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.search.gaussians import log_normal
 from sipe_bayes.posterior import GaussianMixture, Posterior
+from sipe_bayes.posterior.storage import ready_arviz
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,8 @@ def judged(target: Target, normal: GaussianMixture, seed: int, tuning: Importanc
 
 def pareto_shape(log_ratios: FloatArray) -> float:
     """Shape k of the generalised Pareto distribution of the largest of exp(log_ratios (M,))."""
-    from arviz import psislw  # heavy
+    ready_arviz()
+    from arviz import psislw
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of what is returned

@@ -26,7 +26,7 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray
-from sipe_bayes.core.files import reading, write_bytes
+from sipe_bayes.core.files import LineError, is_file, reading, write_bytes
 
 Controller = Callable[[FloatArray], FloatArray]
 """Actions (B, A) of observations (B, O)."""
@@ -34,7 +34,7 @@ Controller = Callable[[FloatArray], FloatArray]
 FORMAT = "sipe_bayes.policy/1"
 
 
-class PolicyError(ValueError):
+class PolicyError(LineError):
     """A policy's file that cannot be used."""
 
 
@@ -123,7 +123,7 @@ def load_policy(path: str | os.PathLike[str], task: str | None = None) -> Policy
         PolicyError: for a file that is cut short, altered, of other shapes than it says, or for another task.
     """
     file = Path(path)
-    if not file.is_file():
+    if not is_file(file):
         raise FileNotFoundError(f"{file}: no such policy; train one with `sipe train`")
     header, arrays = _read(file)
     with reading(file, "a policy's header", "save the policy again", PolicyError):

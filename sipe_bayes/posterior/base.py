@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import os
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
@@ -20,7 +19,7 @@ from sipe_bayes.core.html import html_table
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import at_least, whole
 from sipe_bayes.posterior.drawn import Drawn
-from sipe_bayes.posterior.storage import Header, draws_by_name, write_pair
+from sipe_bayes.posterior.storage import Header, draws_by_name, ready_arviz, write_pair
 
 if TYPE_CHECKING:
     import arviz
@@ -367,9 +366,9 @@ class Posterior(Drawn, TorchDistribution):
         Raises:
             ValueError: for other shapes, or a prior over other parameters.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # arviz < 1 announces its successor on import
-            import arviz
+        ready_arviz()
+        import arviz
+
         if prior is not None and prior.space.names != self.space.names:
             raise ValueError(f"prior: expected one over {list(self.space.names)}, got {list(prior.space.names)}")
         with torch.no_grad():

@@ -27,6 +27,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import torch_generator_from
 from sipe_bayes.posterior.base import Posterior
+from sipe_bayes.posterior.storage import ready_arviz
 
 if TYPE_CHECKING:
     import emcee
@@ -122,6 +123,7 @@ def mixing_of(chain: FloatArray) -> dict[str, float]:
         Over the parameters the largest R-hat ``rhat``, and the fewest effective draws ``ess`` of bulk and tails; the
         autocorrelation time ``autocorrelation_steps`` is that of the bulk.
     """
+    ready_arviz()
     import arviz
 
     draws = [column.T for column in np.moveaxis(chain, 2, 0)]

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Generator, Tensor
 
 from sipe_bayes.core.files import reading
 from sipe_bayes.core.parameters import ParameterSpace
@@ -35,7 +36,17 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
     header, tensors = read_pair(path)
     with reading(path, "a posterior", SAVE_AGAIN):
         space = ParameterSpace.from_dict(header["space"])
-        return _restored(header["family"], space, tensors, header["settings"])
+        posterior = _restored(header["family"], space, tensors, header["settings"])
+        _try(posterior)
+        return posterior
+
+
+def _try(posterior: Posterior) -> None:
+    """A draw, and its density: numbers of a file that no method can use are told here, and not where they are used."""
+    with torch.no_grad():
+        draws = posterior.sample((1,), generator=Generator().manual_seed(0))
+        if posterior.has_density:
+            posterior.log_prob(draws)
 
 
 def _restored(family: str, space: ParameterSpace, tensors: dict[str, Tensor], settings: dict[str, Any]) -> Posterior:

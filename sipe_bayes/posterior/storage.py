@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, cast
@@ -19,7 +20,7 @@ import safetensors.torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from sipe_bayes.core.files import FileError, read_json, reading, write_bytes
+from sipe_bayes.core.files import FileError, is_file, read_json, reading, scratch, shortened, write_bytes
 from sipe_bayes.core.parameters import Plain
 
 if TYPE_CHECKING:
@@ -73,10 +74,9 @@ def read_pair(path: str | os.PathLike[str]) -> tuple[Header, dict[str, Tensor]]:
     """
     tensor_path, header_path = pair_paths(path)
     for file in (header_path, tensor_path):
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"{file}: no such file; a saved posterior is {tensor_path.name} beside {header_path.name}"
-            )
+        if not is_file(file):
+            both = f"{tensor_path.name} beside {header_path.name}"
+            raise FileNotFoundError(shortened(f"{file}: no such file; a saved posterior is {both}"))
     header = read_json(header_path, "a posterior's header", SAVE_AGAIN)
     if header.get("format") != FORMAT:
         raise FileError(f"{header_path}: expected a posterior header of format {FORMAT!r}; {SAVE_AGAIN}")
@@ -98,6 +98,21 @@ def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tenso
         if x.shape[:2] != theta.shape[:2]:
             raise ValueError(f"{name}: expected {key} {(*theta.shape[:2], '...')}, chains and draws, got {x.shape}")
     return arrays
+
+
+def ready_arviz() -> None:
+    """Import ArviZ; it notes in the user's cache folder that it was, and where it cannot, in one that goes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # arviz < 1 announces its successor on import
+        try:
+            import arviz
+        except OSError:
+            cache = os.environ.get("XDG_CACHE_HOME")
+            with scratch() as folder:
+                os.environ["XDG_CACHE_HOME"] = str(folder)
+                import arviz  # noqa: F401
+            del os.environ["XDG_CACHE_HOME"]
+            os.environ |= {} if cache is None else {"XDG_CACHE_HOME": cache}
 
 
 def netcdf(data: arviz.InferenceData) -> bytes:

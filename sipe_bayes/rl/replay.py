@@ -25,7 +25,7 @@ from typing import Any, cast
 import numpy as np
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
-from sipe_bayes.core.files import read_arrays, reading, replacing
+from sipe_bayes.core.files import LineError, read_arrays, reading, replacing
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.simulation.episodes import Step
 
@@ -36,7 +36,7 @@ _DRAWS = 100  # times that places are drawn anew before a buffer counts as empty
 _STORED = ("observations", "actions", "rewards", "terminated", "transition", "ends", "achieved")
 
 
-class ReplayError(ValueError):
+class ReplayError(LineError):
     """A replay buffer's file that cannot be used."""
 
 

@@ -35,7 +35,7 @@ class Settings(Options):
         least=0,
     )
     end_hopeless: bool = option(False, "End an episode of the training where the robot has fallen, if the task knows.")
-    lanes: int = option(1, "Environments stepped together, before their updates.", least=1)
+    lanes: int = option(1, "Environments stepped together, before their updates.", least=1, most=100_000)
     updates_per_step: float = option(1.0, "Updates for each control step.", least=0)
     clip_targets: bool = option(False, "Clip targets to what rewards from -1 to 0 allow.")
     action_penalty: float = option(

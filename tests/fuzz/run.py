@@ -81,9 +81,10 @@ def targets() -> dict[str, tuple[Any, int]]:
     """Files and the command line."""
     from tests.fuzz.commands import COMMANDS
     from tests.fuzz.files import TARGETS
+    from tests.fuzz.kinds import KINDS
     from tests.fuzz.stored import STORED
 
-    return TARGETS | STORED | COMMANDS
+    return TARGETS | STORED | COMMANDS | KINDS
 
 
 class Player:

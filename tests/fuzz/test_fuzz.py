@@ -72,7 +72,7 @@ def failing(error: BaseException) -> Callable[[], object]:
     [
         (FileError("planted.json: cannot be read; write it anew"), "names nothing"),
         (FileError("log 'planted': cannot be read; write it anew"), ""),
-        (FileError("log 'planted': two\nlines"), "not one line"),
+        (ValueError("log 'planted': two\nlines"), "not one line"),
         (KeyError("cells"), "KeyError"),
         (MemoryError(), "MemoryError"),
         (AssertionError("exit code 3"), "AssertionError"),

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 
 from sipe_bayes.benchmark.leaderboard.task import VERSION, Problem, Task
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import FileError, read_json, reading, shortened, to_json, write_text
+from sipe_bayes.core.files import FileError, read_json, reading, to_json, write_text
 
 ENTRY, FOLDER = "entry.json", "tasks"
 FORMAT = "sipe_bayes.leaderboard/1"
@@ -27,9 +27,6 @@ _ROUNDING = 1e-5  # of a range: values are written with six digits, and clipped 
 
 class EntryError(FileError):
     """An entry that is not scored; the message is one line with the file, what is wrong and the remedy."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(shortened(message))  # names in it are the entry's
 
 
 @dataclass(frozen=True)

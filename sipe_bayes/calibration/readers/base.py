@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.core.files import LOG_GIB, limit
+from sipe_bayes.core.files import LOG_GIB, LineError, limit
 
 if TYPE_CHECKING:
     import pandas
@@ -21,7 +21,7 @@ WIDEST = 512
 """Columns of one array: a wider one is a picture or a map, which is no column of a log."""
 
 
-class LogError(ValueError):
+class LogError(LineError):
     """A log that cannot be used; the message is one line with the log, the value and the remedy."""
 
 

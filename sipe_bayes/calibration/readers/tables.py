@@ -17,7 +17,7 @@ from sipe_bayes.calibration.readers.numbered import gathered, starred
 from sipe_bayes.calibration.readers.parquet_table import read_parquet
 from sipe_bayes.calibration.readers.ros_bag import read_bag
 from sipe_bayes.calibration.readers.ulog import read_ulog
-from sipe_bayes.core.files import reading
+from sipe_bayes.core.files import is_file, is_folder, reading
 
 _TEXT = Format(read_csv, "as the first line says, or the last of those with `#` or `%` above the rows")
 _HDF5 = Format(read_hdf5, "the path of the dataset: `robot/arm/state[0]`")
@@ -82,13 +82,13 @@ def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
 
 def _kind(path: Path) -> str:
     """The key of ``READERS`` for a path."""
-    if path.is_dir():
+    if is_folder(path):
         folders = [kind for kind in READERS if not kind.startswith(".")]
         inner = next((kind for kind in folders if (path / kind).is_file()), None)
         if inner is None:
             raise LogError(f"{path}: a folder without {_one_of(folders)}; name the log's file")
         return inner
-    if not path.is_file():
+    if not is_file(path):
         raise LogError(f"{path}: no such file; {nearest_file(path)}")
     if path.suffix.lower() not in READERS:
         suffixes = _one_of(kind for kind in READERS if kind.startswith("."))

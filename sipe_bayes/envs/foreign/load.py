@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mujoco
 
+from sipe_bayes.core.files import LineError, is_file
 from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.foreign.trial import refusal
 
@@ -13,7 +14,7 @@ LEAST_TIMESTEP = 1e-6
 """Seconds of a physics step: a shorter one gives a control step more physics than anybody waits for."""
 
 
-class ModelError(ValueError):
+class ModelError(LineError):
     """An MJCF that does not compile, or that MuJoCo does not survive."""
 
 
@@ -26,7 +27,7 @@ def load_spec(source: str) -> mujoco.MjSpec:
         ModelError: with MuJoCo's first line, or what the trial came to.
     """
     text = source.lstrip().startswith("<")
-    if not text and not Path(source).is_file():
+    if not text and not is_file(source):
         raise ModelError(f"model: no file {source!r}; give the path of an MJCF file, or the MJCF text itself")
     why = "" if text else refusal(Path(source))
     if why:

@@ -21,7 +21,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from sipe_bayes.core.files import MODEL_GIB, MODEL_SECONDS, TRUST_MODELS, limit, scratch
+from sipe_bayes.core.files import LONGEST_TEXT, MODEL_GIB, MODEL_SECONDS, TRUST_MODELS, is_file, limit, scratch
 
 _STEPS = 5
 _START = 10.0  # s that a process may take until it reads the file
@@ -48,18 +48,18 @@ def refusal(path: Path) -> str:
         return ""
     try:
         files = list(_files(path))
-    except _OutsideError as error:
+    except _UnfitError as error:
         return str(error)
     except OSError as error:
-        return f"a file that it includes cannot be read ({error.strerror or error})"
+        return f"or a file that it includes cannot be read ({error.strerror or error}); correct it"
     digest = hashlib.sha256()
     for file in files:
         digest.update(str(file).encode() + file.read_bytes())
     return _tried(str(path.resolve()), digest.hexdigest(), limit(MODEL_SECONDS), limit(MODEL_GIB))
 
 
-class _OutsideError(Exception):
-    """An include that leaves the model's folder."""
+class _UnfitError(Exception):
+    """Files that are no model, or leave its folder."""
 
 
 def _files(path: Path) -> Iterator[Path]:
@@ -71,15 +71,17 @@ def _files(path: Path) -> Iterator[Path]:
             continue
         seen.add(file)
         if len(seen) > MOST_FILES:
-            raise _OutsideError(f"includes more than {MOST_FILES} files")
+            raise _UnfitError(f"includes more than {MOST_FILES} files")
+        if file.stat().st_size > LONGEST_TEXT:
+            raise _UnfitError(f"has, or includes, a file of more than {LONGEST_TEXT} bytes; put meshes into files")
         yield file
         for pair in _INCLUDE.findall(file.read_text(encoding="utf-8", errors="replace")):
             name = html.unescape(pair[0] or pair[1])
             places = {(folder / name).resolve() for folder in (root, file.parent)}
             if not all(place.is_relative_to(root) for place in places):
                 remedy = f"move it there, or set {TRUST_MODELS}=1 if you trust this model"
-                raise _OutsideError(f"includes {name!r} from outside its folder {root}; {remedy}")
-            waiting += [place for place in places if place.is_file()]
+                raise _UnfitError(f"includes {name!r} from outside its folder {root}; {remedy}")
+            waiting += [place for place in places if is_file(place)]
 
 
 @functools.cache
