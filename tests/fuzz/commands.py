@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from tests.fuzz.mutations import Change, Read, Target
 
@@ -65,6 +66,25 @@ class Reached(BaseException):
     """A command has taken what it was given and begins its work."""
 
 
+FOLDERS = (
+    *("case", "with space", "it's", 'a"b', "caf\u00e9", "cafe\u0301", "[x]*?", "%s{0}", "$HOME", "-x", "#a;b&c", "~"),
+    *("n" * 200, "<b>", "a\\b", "..x", "CON", "\u202ereversed", "\U0001f916"),
+)
+"""Names of the folder that a command runs in."""
+VARIABLES = {
+    "COLUMNS": ("0", "1", "20", "-5", "abc", "1000000000000"),
+    "TERM": ("dumb", "", "nonsense"),
+    "TMPDIR": ("/nonexistent", "/dev/null", ""),
+    "HOME": ("/nonexistent", "/dev/null", ""),
+    "SIPE_LOG_GIB": ("abc", "-1", "0", "nan", "1e300", "1e-300", " "),
+    "SIPE_MODEL_SECONDS": ("abc", "-1", "nan", "1e300", "1e-300"),
+    "SIPE_BAYES_DATA": ("/nonexistent", "/dev/null", "\n"),
+    "NO_COLOR": ("1",),
+    "FORCE_COLOR": ("1",),
+}
+"""Of the environment, with values that nobody means."""
+
+
 def _begin(*_: object, **__: object) -> Any:
     raise Reached
 
@@ -112,11 +132,9 @@ def commands() -> dict[str, Any]:
 
 def command_lines(folder: Path) -> Change:
     """Commands in a folder with a configuration, its model and its log."""
-    from sipe_bayes.core import files
     from tests.problems.swings import write_case
 
     known = commands()
-    case = folder / "case"
 
     def arguments(chance: random.Random) -> list[str]:
         words = chance.choice(sorted(known))
@@ -135,36 +153,45 @@ def command_lines(folder: Path) -> Change:
         return [*words.split(), *given]
 
     def change(chance: random.Random) -> Read:
-        shutil.rmtree(case, ignore_errors=True)
+        shutil.rmtree(folder / "around", ignore_errors=True)
+        case = folder / "around" / (chance.choice(FOLDERS) if chance.random() < 0.3 else "case")
         write_case(case)
         (case / "runs").mkdir()
-        words = arguments(chance)
+        words, variables = arguments(chance), dict[str, str]()
+        if chance.random() < 0.3:
+            name = chance.choice(sorted(VARIABLES))
+            variables[name] = chance.choice(VARIABLES[name])
         before = {path.relative_to(folder) for path in folder.rglob("*")}
 
         def read() -> None:
-            code, errors = _call(words, case)
+            code, errors = _call(words, case, variables)
             if code not in (0, 1, 2):
                 raise AssertionError(f"{words}: exit code {code}")
             if code == 2:
                 made = {path.relative_to(folder) for path in folder.rglob("*")} - before
                 if made:
                     raise AssertionError(f"{words}: refused, and made {made}")
-                raise files.FileError(errors.removesuffix("\n"))
+                raise ValueError(errors.removesuffix("\n"))
 
         return read
 
     return change
 
 
-def _call(words: list[str], folder: Path) -> tuple[int, str]:
-    """Exit code and standard error of ``sipe``."""
+def _call(words: list[str], folder: Path, variables: dict[str, str]) -> tuple[int, str]:
+    """Exit code and standard error of ``sipe`` in a folder, with some variables of the environment."""
     from sipe_bayes.cli.app import main
 
     errors, argv, back = io.StringIO(), sys.argv, os.getcwd()
     sys.argv = ["sipe", *words]
     os.chdir(folder)
     try:
-        with nothing_runs(), contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+        with (
+            mock.patch.dict(os.environ, variables),
+            nothing_runs(),
+            contextlib.redirect_stderr(errors),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             main()
     except SystemExit as ended:
         return int(ended.code or 0), errors.getvalue()

@@ -27,7 +27,9 @@ _STEPS = 5
 _START = 10.0  # s that a process may take until it reads the file
 MOST_FILES = 1000
 """That a model may include."""
-_INCLUDE = re.compile(r"<\s*(?:include|model)\b[^>]*?\bfile\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", re.DOTALL)
+# an element up to its end, whatever its attributes hold; possessive, so that no file makes it look twice
+_INCLUDE = re.compile(r"<\s*+(?:include|model)\b((?:[^<>\"']++|\"[^\"]*+\"|'[^']*+')*+)", re.IGNORECASE)
+_FILE = re.compile(r"\bfile\s*=\s*(?:\"([^\"]*)\"|'([^']*)')", re.IGNORECASE)
 
 
 def trusted() -> bool:
@@ -75,7 +77,8 @@ def _files(path: Path) -> Iterator[Path]:
         if file.stat().st_size > LONGEST_TEXT:
             raise _UnfitError(f"has, or includes, a file of more than {LONGEST_TEXT} bytes; put meshes into files")
         yield file
-        for pair in _INCLUDE.findall(file.read_text(encoding="utf-8", errors="replace")):
+        text = file.read_text(encoding="utf-8", errors="replace")
+        for pair in (pair for attributes in _INCLUDE.findall(text) for pair in _FILE.findall(attributes)):
             name = html.unescape(pair[0] or pair[1])
             places = {(folder / name).resolve() for folder in (root, file.parent)}
             if not all(place.is_relative_to(root) for place in places):
