@@ -90,7 +90,7 @@ def report_of(
 
 
 def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
-    """Of clocks beside the grid's, commands that end early, positions that jump, and joints that are logged slowly."""
+    """Of clocks beside the grid's, commands that end early, positions that jump, joints and bodies logged slowly."""
     noticed = []
     series = [*raw.measurements, *raw.commands]
     apart = sum(y.time is not raw.time for y in series)
@@ -106,7 +106,8 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
         if len(places):
             when = float(y.time[known[places[0] + 1]] - raw.time[0])
             noticed.append(finding(Code.LOG_JUMPS, log=log.name, channel=m.name, count=len(places), when=when))
-    rates = {m.name: _rate(y) for (m, _), y in zip(config.sources, raw.measurements, strict=True) if _of_joint(m)}
+    moving = [(m, y) for (m, _), y in zip(config.sources, raw.measurements, strict=True) if _of_joint(m) or _of_body(m)]
+    rates = {m.name: _rate(y) for m, y in moving}
     slow = {name: rate for name, rate in rates.items() if rate < THRESHOLDS.slow_log}
     if slow:
         rate = f"{min(slow.values()):.3g} Hz"
@@ -116,6 +117,10 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
 
 def _of_joint(measurement: Measurement) -> bool:
     return measurement.fit and measurement.target.startswith("joint:")
+
+
+def _of_body(measurement: Measurement) -> bool:
+    return measurement.fit and measurement.target.startswith("body:")
 
 
 def _rate(series: Series) -> float:

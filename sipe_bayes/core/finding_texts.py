@@ -297,7 +297,7 @@ class Code(Enum):
     LOG_WILD = caution("{channel}: {count} samples masked that no motion passes through: glitches or lost packets")
     LOG_SLOW = caution(
         "{channels} were recorded at {rate}: too slowly to see what friction and delays do, whose estimates will be "
-        "biased; log joints at 100 Hz or more"
+        "biased; log joints and bodies at 100 Hz or more"
     )
     LOG_CLIPPED = note("{channel}: {clipped} samples stuck at an extreme value, perhaps saturated")
 

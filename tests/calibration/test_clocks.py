@@ -317,7 +317,7 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> No
 def test_a_folder_has_the_digest_of_its_logs(tmp_path: Path) -> None:
     bag = ros_bag(tmp_path, ros_messages(regular(5)))
     before = digest(bag)
-    (bag / "notes.txt").write_text("nothing of the log")
+    (bag / "notes.md").write_text("nothing of the log")
     assert digest(bag) == before
     (bag / "metadata.yaml").write_text((bag / "metadata.yaml").read_text() + "\n")
     assert digest(bag) != before

@@ -13,6 +13,7 @@ from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.readers.base import LogError
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.rotations import between, quaternions
 from tests.problems.bodies import CUBE
 
@@ -136,3 +137,11 @@ def test_a_quaternion_sensor_needs_its_four_columns(tmp_path: Path) -> None:
 def test_columns_that_are_no_quaternion_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"columns \['x', 'b', 'c', 'd'\] are no quaternion: its length is"):
         prepare(write(tmp_path, CONFIG.replace('"a", "b"', '"x", "b"')))
+
+
+@pytest.mark.parametrize(("rate", "slow"), [(20.0, True), (60.0, False)])
+def test_a_body_that_is_filmed_slowly_is_named(tmp_path: Path, rate: float, slow: bool) -> None:
+    problem = prepare(write(tmp_path, time=np.arange(40) / rate))
+    texts = {item.text for report in problem.reports for item in report.findings if item.code is Code.LOG_SLOW}
+    assert bool(texts) == slow
+    assert all("cube.position, turn were recorded at 20 Hz" in text for text in texts)
