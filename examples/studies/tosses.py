@@ -44,7 +44,8 @@ _FAR = 6.0  # sds of the posterior: the fit is elsewhere
 
 def simulator(body: str) -> Simulator:
     """Of the body above a floor, its contact unknown."""
-    text = f"""<mujoco><option timestep="{1 / RATE / SUBSTEPS}" cone="elliptic" impratio="10"/><worldbody>
+    text = f"""<mujoco><option timestep="{1 / RATE / SUBSTEPS}" cone="elliptic" impratio="10"/>
+      <default><geom friction=".4"/></default><worldbody>
       <geom name="floor" type="plane" size="3 3 .1"/>
       <body name="body" pos="0 0 .3"><freejoint/>{BODIES[body]}</body></worldbody></mujoco>"""
     geoms = [f"geom:{name}" for name in ("floor", "one", "two") if f'name="{name}"' in text]
