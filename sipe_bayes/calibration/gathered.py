@@ -67,6 +67,7 @@ class Marginals:
         sd: (N,) in theta.
         contraction: (N,) 1 - sd / prior sd.
         draws: (n, N) in units.
+        natural: names of those whose lower bound is the smallest physical value.
     """
 
     space: ParameterSpace
@@ -74,14 +75,15 @@ class Marginals:
     sd: FloatArray
     contraction: FloatArray
     draws: FloatArray
+    natural: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, posterior: Posterior, prior: Posterior, seed: int) -> Marginals:
+    def of(cls, posterior: Posterior, prior: Posterior, seed: int, natural: frozenset[str]) -> Marginals:
         """Those of a posterior, which started from a prior."""
         sd = posterior.stddev.numpy()
         contraction = 1 - sd / np.maximum(prior.stddev.numpy(), 1e-300)
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
-        return cls(posterior.space, most_probable(posterior), sd, contraction, draws)
+        return cls(posterior.space, most_probable(posterior), sd, contraction, draws, natural)
 
     def summaries(self, further: Posterior | None = None) -> list[ParameterSummary]:
         """One for each parameter.
@@ -96,6 +98,9 @@ class Marginals:
         for j, p in enumerate(self.space):
             drawn, determined = self.draws[:, j], float(self.contraction[j])
             mean, sd, q05, q50, q95, best = (float(x) for x in (drawn.mean(), drawn.std(), *quantiles[:, j], mode[j]))
+            q05, q95 = min(q05, best), max(q95, best)  # quantiles of draws are a little off
+            if self._shows_none(j):
+                q05 = p.low
             marginal = (mean, sd, q05, q50, q95, best, p.default, determined, p.log is not None)
             ends = None
             if beyond is not None and p.log is None:
@@ -103,6 +108,15 @@ class Marginals:
                 ends = min(low, q05), max(high, q95)
             summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends))
         return summaries
+
+    @property
+    def _near(self) -> FloatArray:
+        """How near to a bound a theta (N,) sits on it."""
+        return THRESHOLDS.at_bound * np.minimum(1.0, THRESHOLDS.bound_sds * self.sd)
+
+    def _shows_none(self, j: int) -> bool:
+        """Whether a parameter is as small as nature lets it be."""
+        return self.space[j].name in self.natural and bool(self.theta[j] < self._near[j])
 
     def findings(self, dead: dict[str, list[tuple[float, float]]], ridges: Sequence[Ridge]) -> list[Finding]:
         """Of each parameter whether it does anything, is determined, and lies at a bound.
@@ -112,7 +126,7 @@ class Marginals:
             ridges: whose members are open by themselves, which is then worth no more than a note.
         """
         on_ridge = {name for ridge in ridges for name in ridge.parameters}
-        noticed, near = [], THRESHOLDS.at_bound * np.minimum(1.0, THRESHOLDS.bound_sds * self.sd)
+        noticed, near = [], self._near
         for j, p in enumerate(self.space):
             about = functools.partial(finding, parameters=[p.name], unit=p.unit)
             pieces = dead.get(p.name, [])
@@ -129,7 +143,8 @@ class Marginals:
             elif min(self.theta[j], 1 - self.theta[j]) < near[j]:
                 value = float(p.value(float(self.theta[j])))
                 bound = p.low if value - p.low < p.high - value else p.high
-                noticed.append(about(Code.MODE_AT_BOUND, bound=bound))
+                code = Code.AT_PHYSICAL_BOUND if self._shows_none(j) else Code.MODE_AT_BOUND
+                noticed.append(about(code, bound=bound))
         return noticed
 
 

@@ -41,9 +41,10 @@ from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
+from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
@@ -96,11 +97,13 @@ def calibrate(
     lacks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
     outside = _outside(problem, method, fit.windows, unknown)
     tell("simulating the posterior's band")
-    marginals = Marginals.of(posterior, problem.prior, method.seed)
+    marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
     missing = _missing(probed, alone, problem.prior, method.seed) if doubted else None
     predictions = _Predictions.of(problem, theta)
+    if lacks is not None and lacks.matters and follows(predictions.windows["train"], predictions.predicted["train"][0]):
+        outside = [replace(one, followed=True) for one in outside]
     bands = predictions.bands(posterior, missing, method.seed)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),

@@ -115,6 +115,7 @@ ADVICE: dict[Code, str] = {
         "The interval is about the prior's. `sipe suggest --for NAME` says what to send; or fix it at a measured value."
     ),
     Code.MODE_AT_BOUND: _BOUNDS,
+    Code.AT_PHYSICAL_BOUND: "Nothing to do: the model does without it. The interval is one-sided.",
     Code.RIDGE: "Only the combination acts on the motion. Use it, not its members.",
     Code.RIDGE_TO_RESOLVE: "Weigh, measure or look up one member, and take it out of the unknowns.",
     Code.RIDGE_EXPECTED: "The planned motion would tell the combination alone. Plan another, or fix a member.",
@@ -141,6 +142,10 @@ ADVICE: dict[Code, str] = {
     Code.OUTSIDE_PRIOR: (
         "No values within the bounds simulate such a log. First suspects: unit or sign of that channel, a delay, a "
         "model that was given wrong masses. Then the bounds."
+    ),
+    Code.OUTSIDE_PRIOR_FOLLOWED: (
+        "No values within the bounds simulate such a log, but units and signs are right, since simulations bend as it "
+        "does. What is left is the physics that the model lacks: `sipe discover`."
     ),
     Code.OUTSIDE_PRIOR_UNKNOWN: "Judge by the signals in the report.",
     Code.LOGS_DISAGREE: (

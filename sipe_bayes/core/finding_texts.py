@@ -205,6 +205,12 @@ class Code(Enum):
     MODE_AT_BOUND = caution(
         "{parameters} is at its bound {bound:.4g} {unit}: widen it, unless the bound is physical", "at a bound"
     )
+    AT_PHYSICAL_BOUND = Text(
+        Severity.NOTE,
+        "{parameters} is at {bound:.4g} {unit}, and can not be smaller: the logs show none of it up to the upper end "
+        "of its interval",
+        "none shows",
+    )
     RIDGE = note(_RIDGE + "is determined; {alone} not")
     RIDGE_TO_RESOLVE = caution("{ridge}: fix one of them at a measured value")
     RIDGE_EXPECTED = caution(_RIDGE + "would be determined; {alone} not")
@@ -255,6 +261,10 @@ class Code(Enum):
     OUTSIDE_PRIOR = blocking(
         "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s: widen the "
         "bounds, or correct the model, units or signs"
+    )
+    OUTSIDE_PRIOR_FOLLOWED = caution(
+        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s: the calibrated "
+        "model follows it, and what it lacks all the same is told beside this"
     )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")
     LOGS_DISAGREE = blocking(

@@ -67,6 +67,9 @@ class Thresholds(Options):
     misfit: float = option(
         0.05, "false alarms of residuals that are noise, and of logs that the prior gives", "p-value"
     )
+    followed: float = option(
+        0.5, "simulations that leave less follow a log: wrong units and signs leave about all", "of its bends"
+    )
     rounding: float = option(1e-5, "residuals below it are rounding, of which nothing is asked", "of what a log moves")
     small_misfit: float = option(
         0.1, "a cause that explains less of every channel's residual is small", "of the residual"

@@ -40,6 +40,7 @@ class PredictiveOptions(Options):
         least=0,
     )
     samples: int = option(50, "of a log: more are correlated, and distances in many dimensions alike", least=1)
+    fewest: int = option(5, "samples of a window from which its bends are told", least=3)
     neighbours: int = option(20, "of the local outlier factor, as its authors advise", least=1)
 
 
@@ -55,12 +56,14 @@ class OutsidePrior:
         log: its name.
         channel: where it is farthest.
         time: s, where it is farthest.
+        followed: whether the calibrated model follows the log all the same, but for what it is named to lack.
     """
 
     p: float
     log: str
     channel: str
     time: float
+    followed: bool = False
 
     @property
     def alarm(self) -> bool:
@@ -70,7 +73,8 @@ class OutsidePrior:
     @property
     def finding(self) -> Finding:
         """It as a finding."""
-        code = Code.OUTSIDE_PRIOR if self.alarm else Code.WITHIN_PRIOR
+        outside = Code.OUTSIDE_PRIOR_FOLLOWED if self.followed else Code.OUTSIDE_PRIOR
+        code = outside if self.alarm else Code.WITHIN_PRIOR
         return finding(code, log=self.log, p=self.p, channel=self.channel, time=self.time)
 
     @property
@@ -129,6 +133,32 @@ def outside_prior(windows: Windows, prior: Posterior, noise: Noise, *, seed: int
         begin = float(windows.start[chosen[k]] * windows.dt[chosen[k]])
         outcome.append(OutsidePrior(p, name, channel, begin + float(farthest[k, i])))
     return outcome
+
+
+def follows(windows: Windows, predicted: FloatArray) -> bool:
+    """Whether simulations bend as the logs do, in every channel: with a wrong unit or sign they do not.
+
+    What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
+    that is slightly off leaves such a line.
+
+    Args:
+        windows: of the logs.
+        predicted: (W, L, C).
+    """
+    for c in range(windows.observed.shape[2]):
+        pairs = []
+        for w, known in enumerate(windows.observed[..., c]):
+            if known.sum() > _OPTIONS.fewest:
+                time = np.flatnonzero(known).astype(float)
+                line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]
+                both = np.stack([windows.measured[w, known, c] - predicted[w, known, c], windows.measured[w, known, c]])
+                pairs.append(np.linalg.norm(both - both @ line @ line.T, axis=1))
+        if not pairs:
+            continue
+        left, whole = np.median(pairs, axis=0)
+        if not left < THRESHOLDS.followed * whole:
+            return False
+    return True
 
 
 def _piece(windows: Windows, number: int) -> Trajectory:

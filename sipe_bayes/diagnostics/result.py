@@ -48,7 +48,7 @@ class ParameterSummary:
         targets: what it writes to.
         mean: of the posterior.
         sd: its standard deviation.
-        q05: its 5 % quantile.
+        q05: its 5 % quantile; the bound where the mode sits on a physical one.
         q50: its median.
         q95: its 95 % quantile.
         mode: the best point's value.

@@ -100,6 +100,16 @@ def _absolute(parameter: Parameter, value: float) -> Parameter:
     return replace(parameter, low=low, high=high, prior_mean=mean, prior_sd=sd)
 
 
+def bounded_by_nature(model: mujoco.MjModel, space: ParameterSpace) -> frozenset[str]:
+    """Names of the parameters whose lower bound is the smallest physical value, as of friction that is 0."""
+    names = set()
+    for parameter in space:
+        specs = physical_targets(parameter.targets)
+        if specs and parameter.low <= max(bind(model, spec).minimum for spec in specs):
+            names.add(parameter.name)
+    return frozenset(names)
+
+
 def physical_targets(targets: Iterable[str]) -> list[str]:
     """Those that write a number of the model; a sensor's bias and its like do not."""
     return [target for target in targets if of_sensor(target) is None]

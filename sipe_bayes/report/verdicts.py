@@ -64,6 +64,8 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
         return Verdict("fair", "a point without uncertainty")
     if parameter.further is not None:
         return _with_what_is_lacking(parameter, findings)
+    if Code.AT_PHYSICAL_BOUND in codes and not findings.blocking:
+        return Verdict("good", f"{TEXTS[Code.AT_PHYSICAL_BOUND].row}, at most the upper end")
     partly = f"; {TEXTS[Code.DEAD_RANGE].row}" if Code.DEAD_RANGE in codes else ""
     if parameter.contraction < THRESHOLDS.well_determined:
         return Verdict("fair", "weakly determined" + partly)
@@ -95,8 +97,10 @@ def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: Band
     if bands is not None:
         share, error = 100 * bands.share, 100 * bands.error
         text = f"Use it to predict: its 90 % bands hold {share:.0f} ± {error:.0f} % of the held-out samples"
-        if abs(bands.share - THRESHOLDS.shown_interval) > 2 * bands.error + THRESHOLDS.band_off:
-            text = f"Do not rely on its bands: those of 90 % hold {share:.0f} ± {error:.0f} % of the held-out samples"
+        off = bands.share - THRESHOLDS.shown_interval
+        if abs(off) > 2 * bands.error + THRESHOLDS.band_off:
+            text = "Use it to predict, within less than its bands" if off > 0 else "Do not rely on its bands"
+            text += f": those of 90 % hold {share:.0f} ± {error:.0f} % of the held-out samples"
         widths = list(bands.half.items())[:_DOUBTS]
         half = ", ".join(f"± {number(width, 2)} {unit}".rstrip() + f" in {name}" for name, (width, unit) in widths)
         text += f" ({half})"

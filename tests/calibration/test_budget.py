@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 
-from sipe_bayes.calibration.gathered import most_probable
+from sipe_bayes.calibration.gathered import Marginals, most_probable
 from sipe_bayes.calibration.run import run
 from sipe_bayes.core.findings import Code, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.envs.unknowns import bounded_by_nature
+from sipe_bayes.posterior import GaussianMixture, uniform
+from tests.problems.made_up_logs import PENDULUM
 from tests.problems.swings import swing, write_case
 
 
@@ -38,6 +41,24 @@ def test_the_value_lies_within_every_interval() -> None:
     theta = most_probable(posterior)
     assert ((theta >= low) & (theta <= high)).all()
     assert abs(theta[0] - theta[1]) < 0.03
+
+
+def test_what_nature_bounds_is_told_apart_from_a_bound_that_was_chosen(tmp_path: Path) -> None:
+    """Friction of which none shows has a one-sided interval from 0 on, and is no warning; a mass of 0.2 kg is one."""
+    space = ParameterSpace([
+        Parameter("friction", high=0.5, unit="N m", targets=("joint:hinge.frictionloss",)),
+        Parameter("mass", low=0.2, high=0.8, unit="kg", targets=("body:rod.mass",)),
+    ])  # fmt: skip
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    natural = bounded_by_nature(model, space)
+    assert natural == {"friction"}
+    posterior = GaussianMixture(np.zeros(1), np.array([[-0.01, -0.01]]), 1e-4 * np.eye(2)[None], space)
+    marginals = Marginals.of(posterior, uniform(space), 0, natural)
+    codes = {item.code: item.parameters for item in marginals.findings({}, [])}
+    assert codes == {Code.AT_PHYSICAL_BOUND: ("friction",), Code.MODE_AT_BOUND: ("mass",)}
+    friction, mass = marginals.summaries()
+    assert friction.q05 == 0.0
+    assert 0.2 < mass.q05 <= mass.mode
 
 
 def test_findings_of_one_kind_about_many_logs_are_one_line() -> None:

@@ -73,7 +73,7 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
         doubts=(*dropped, *_unmatched(model, machine, matches, commands)),
-        notes=_unused(matches),
+        notes=_unused(matches, commands),
     )  # fmt: skip
     trained = _decided(draft, model, machine, sources, folder)
     trained = replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
@@ -166,9 +166,11 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
     return out
 
 
-def _unused(matches: Matches) -> tuple[str, ...]:
-    others = f" and {len(matches.left) - 12} others" if len(matches.left) > 12 else ""
-    return (f"not used: {', '.join(matches.left[:12])}{others}",) if matches.left else ()
+def _unused(matches: Matches, commands: Sequence[Reading]) -> tuple[str, ...]:
+    supplies = {reading.supply[0] for reading in commands if reading.supply}
+    left = [column for column in matches.left if column not in supplies]
+    others = f" and {len(left) - 12} others" if len(left) > 12 else ""
+    return (f"not used: {', '.join(left[:12])}{others}",) if left else ()
 
 
 def _split(

@@ -20,7 +20,9 @@ from sipe_bayes.envs.targets import bind
 _MOST = 12  # parameters that are asked for
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
-_APART = 0.15  # share of its effect that no other parameter has
+_APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
+_CLEAR = 5.0  # times as much as ``_WEAK``: what it has to move by itself where its share is small
+_MIXED = 0.15  # a share that is small
 _TELLING = 0.02  # of the squared miss, from which a delay is asked for
 
 
@@ -83,8 +85,12 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     fixed_scale = not driven or (bool(gains) and not known_force and any(a.drive != Drive.POSITION for a, _ in driven))
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
     free = [] if fixed_scale else [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
-    masses = [] if fixed_scale and len(joints) < 2 else _masses(model, [*behind, *free], first=fixed_scale)
-    return gains + masses + [u for joint in joints for u in _of_joint(model, joint, sizes)] + _contacts(model, machine)
+    sole = fixed_scale and len(joints) < 2
+    masses = [] if sole else _masses(model, [*behind, *free], first=fixed_scale)
+    of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
+    if sole:  # a rotor is so much more mass, to which the gain is relative
+        of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
+    return gains + masses + of_joints + _contacts(model, machine)
 
 
 def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) -> list[Unknown]:
@@ -227,7 +233,7 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit) -> list[Unknown]:
             basis = effects[:, kept]
             weights = np.linalg.lstsq(basis, effect, rcond=None)[0]
             alone = float(np.linalg.norm(effect - basis @ weights))
-            if alone < _APART * size or alone < _WEAK:
+            if alone < _APART * size or alone < _WEAK * (_CLEAR if alone < _MIXED * size else 1.0):
                 share = np.abs(weights) * np.linalg.norm(basis, axis=0)
                 names = " and ".join(unknowns[kept[i]].name for i in np.argsort(-share)[:2] if share[i] > 0.3 * size)
                 reason = f"shows as {names or unknowns[kept[int(np.argmax(share))]].name} does in these logs"

@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.evaluate import best_starts
+from sipe_bayes.diagnostics.evaluate import best_starts, both_predicted
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, outside_prior
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
@@ -230,6 +231,19 @@ def test_a_log_outside_the_prior_is_named_and_one_inside_is_not() -> None:
     assert other.p == pytest.approx(1 / 40)
     assert "log degrees is unlike simulations" in other.text
     assert "units or signs" in other.text
+
+
+def test_a_model_that_lacks_something_follows_a_log_and_one_in_a_wrong_unit_does_not() -> None:
+    """Another mass and damping bend as the log does; an angle in degrees, or turned round, is bent otherwise."""
+    simulator, theta = pendulum(), np.array([0.9, 0.3])
+    inside = log(simulator, [0.6, 0.08], 5, steps=300)
+    for factor, expected in ((1.0, True), (180 / np.pi, False), (-1.0, False)):
+        other = Trajectory(factor * inside.observations, inside.actions, inside.dt, channels=inside.channels)
+        windows = bind(get_estimator(simulator, "laplace").likelihood, simulator, Trajectories.stack([other]))
+        assert follows(windows, both_predicted(windows, theta)[0]) is expected, factor
+    followed = OutsidePrior(1 / 40, "log", "angle", 1.0, followed=True)
+    assert followed.alarm
+    assert followed.finding.severity is Severity.CAUTION
 
 
 def test_a_start_is_as_uncertain_as_its_estimate() -> None:
