@@ -42,7 +42,7 @@ from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missin
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
@@ -95,15 +95,13 @@ def calibrate(
     tell("checking what the model lacks")
     probed, residuals = _residuals(problem, method, fit, unknown)
     lacks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
-    outside = _outside(problem, method, fit.windows, unknown)
     tell("simulating the posterior's band")
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
     missing = _missing(probed, alone, problem.prior, method.seed) if doubted else None
     predictions = _Predictions.of(problem, theta)
-    if lacks is not None and lacks.matters and follows(predictions.windows["train"], predictions.predicted["train"][0]):
-        outside = [replace(one, followed=True) for one in outside]
+    outside = _outside(problem, method, fit, lacks, predictions, unknown)
     bands = predictions.bands(posterior, missing, method.seed)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
@@ -312,10 +310,14 @@ def _residuals(
     return probed, fitted_residuals(windows, theta, noise, starts)
 
 
-def _outside(problem: Problem, method: Estimator, fitted: Windows, unknown: list[Finding]) -> list[OutsidePrior]:
+def _outside(
+    problem: Problem, method: Estimator, fit: _Fit, lacks: Misfit | None, seen: _Predictions, unknown: list[Finding]
+) -> list[OutsidePrior]:
+    matters = lacks is not None and lacks.matters
+    followed = matters and follows(seen.windows["train"], seen.predicted["train"][0])
     noise = observation_noise(method.diagnostics, problem.train, problem.likelihood)
     try:
-        return outside_prior(fitted, problem.prior, noise, seed=method.seed)
+        return outside_prior(fit.windows, problem.prior, noise, seed=method.seed, followed=followed)
     except ValueError as error:
         unknown.append(finding(Code.OUTSIDE_PRIOR_UNKNOWN, reason=error))
         return []

@@ -83,7 +83,9 @@ class OutsidePrior:
         return self.finding.text
 
 
-def outside_prior(windows: Windows, prior: Posterior, noise: Noise, *, seed: int = 0) -> list[OutsidePrior]:
+def outside_prior(
+    windows: Windows, prior: Posterior, noise: Noise, *, seed: int = 0, followed: bool = False
+) -> list[OutsidePrior]:
     """For each log its place among simulations of the prior; those that diverge are left out.
 
     It is looked at in windows: commands of a controller, replayed over a whole log, drive every model but the true one
@@ -94,6 +96,7 @@ def outside_prior(windows: Windows, prior: Posterior, noise: Noise, *, seed: int
         prior: of the parameters.
         noise: (O,) of all channels.
         seed: of the simulations.
+        followed: whether the calibrated model follows the logs all the same.
 
     Returns:
         One for each log.
@@ -131,7 +134,7 @@ def outside_prior(windows: Windows, prior: Posterior, noise: Noise, *, seed: int
         p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
         channel = windows.simulator.environment.channels[windows.channels[i]]
         begin = float(windows.start[chosen[k]] * windows.dt[chosen[k]])
-        outcome.append(OutsidePrior(p, name, channel, begin + float(farthest[k, i])))
+        outcome.append(OutsidePrior(p, name, channel, begin + float(farthest[k, i]), followed))
     return outcome
 
 

@@ -21,8 +21,8 @@ _MOST = 12  # parameters that are asked for
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
 _APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
-_CLEAR = 5.0  # times as much as ``_WEAK``: what it has to move by itself where its share is small
-_MIXED = 0.15  # a share that is small
+_CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
+_MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
 _TELLING = 0.02  # of the squared miss, from which a delay is asked for
 
 
@@ -233,7 +233,7 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit) -> list[Unknown]:
             basis = effects[:, kept]
             weights = np.linalg.lstsq(basis, effect, rcond=None)[0]
             alone = float(np.linalg.norm(effect - basis @ weights))
-            if alone < _APART * size or alone < _WEAK * (_CLEAR if alone < _MIXED * size else 1.0):
+            if alone < _APART * size or (alone < _MIXED * size and alone < _CLEAR):
                 share = np.abs(weights) * np.linalg.norm(basis, axis=0)
                 names = " and ".join(unknowns[kept[i]].name for i in np.argsort(-share)[:2] if share[i] > 0.3 * size)
                 reason = f"shows as {names or unknowns[kept[int(np.argmax(share))]].name} does in these logs"

@@ -17,6 +17,7 @@ from sipe_bayes.calibration.init.unknowns import told_apart
         (0.09, 60.0, False),  # told to a fifth of its range
         (0.02, 600.0, False),  # the same but for rounding
         (0.4, 20.0, True),
+        (0.3, 8.0, True),  # weakly told, but what it would do is in others if it is left out
         (1.0, 2.0, False),
     ],
 )
