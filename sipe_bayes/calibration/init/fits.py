@@ -21,7 +21,7 @@ _PRIOR = 0.4  # sd in the cube of what a model does not know
 _LOOSE = 1e-6  # what starts that nothing tells are held by
 _LOST = 1e6  # of a simulation that has diverged
 _LEAST = 2e-3  # of the motion: noise is taken for no smaller
-_SETTLED = 0.1  # of the logarithm of what is left, of all channels together
+_SETTLED = 0.02  # of the logarithm of what is left, of all channels together
 _EVEN = 4.0  # both sides of the best delay are about as steep, or no parabola goes through them
 
 

@@ -255,7 +255,7 @@ def _unknowns(
     if trial.simulator.environment.rotations:
         return unknowns, 0.0, []
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
-    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=6)
+    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
     return [*late, *told_apart(unknowns, left)], samples, [note] if note and not late else []

@@ -26,7 +26,7 @@ _WORST = 30.0
 _BEST = 1e-3
 _LONGEST = 60  # physics steps of a control step, beyond which a clock is not believed
 _PAST = 64  # samples of commands before a window
-_STEPS = 1200  # physics steps of all windows
+_STEPS = 200  # physics steps, on average, of each window that is asked for
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Trial:
         self.logs = tuple(_bridged(log, environment.rotations) for log in logs)
         self.length = _length(self.logs, share)
         steps, _ = self.simulator.physics_steps(logs[0].dt)
-        count = int(np.clip(_STEPS / (self.length * steps), 6, windows))
+        count = int(np.clip(_STEPS * windows / (self.length * steps), 6, windows))
         self.places = _places(logs, self.length, count)  # of the logs as they are: gaps count
         time = np.linspace(-1, 1, self.length + 1)
         self._line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]

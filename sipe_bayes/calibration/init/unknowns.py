@@ -253,6 +253,9 @@ def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknow
     best, late = fit.best, fit.finer
     if not best or at_zero - 1 < _TELLING:
         return [], "commands arrive at once: a delay would not lessen what simulations miss"
+    if best == fit.delays[-1]:
+        why = "which other things than a delay do as well: look at the model and at what drives it; none is asked for"
+        return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
     high = _round(dt * max(2 * best, best + 3))
     targets = tuple(f"actuator:{name}.delay" for name in actuators)
     note = (

@@ -7,7 +7,7 @@ import pytest
 
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import Fit
-from sipe_bayes.calibration.init.unknowns import told_apart
+from sipe_bayes.calibration.init.unknowns import delay_of, told_apart
 
 
 @pytest.mark.parametrize(
@@ -30,3 +30,12 @@ def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(share: floa
     first, second = told_apart(unknowns, fit)
     assert not first.left_out
     assert (not second.left_out) is kept, second.left_out
+
+
+@pytest.mark.parametrize(("miss", "asked"), [([1.4, 1.1, 1.0, 1.2], True), ([1.5, 1.04, 1.02, 1.0], False)])
+def test_a_delay_at_the_end_of_those_tried_is_none(miss: list[float], asked: bool) -> None:
+    """A force that the model lacks is met the better the later commands come."""
+    fit = Fit((0, 14, 15, 16), np.array(miss), np.zeros(0), np.zeros((400, 0)), np.ones(1))
+    unknowns, note = delay_of(["motor"], fit, 0.005)
+    assert bool(unknowns) is asked
+    assert ("none is asked for" in note) is not asked
