@@ -29,6 +29,7 @@ from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
+from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, Posterior
@@ -118,7 +119,8 @@ class _Model:
         """All parameters of the structure."""
         simulator = self.structures.simulator(self.one)
         prior = self.structures.search.fitting.prior_of(simulator)
-        return Marginals.of(self.structures.posterior_of(self.one), prior, seed).summaries()
+        natural = bounded_by_nature(simulator.model, simulator.space)
+        return Marginals.of(self.structures.posterior_of(self.one), prior, seed, natural).summaries()
 
     @functools.cached_property
     def probed(self) -> ProbedLogs | None:

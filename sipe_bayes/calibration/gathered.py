@@ -78,7 +78,7 @@ class Marginals:
     natural: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, posterior: Posterior, prior: Posterior, seed: int, natural: frozenset[str]) -> Marginals:
+    def of(cls, posterior: Posterior, prior: Posterior, seed: int, natural: frozenset[str] = frozenset()) -> Marginals:
         """Those of a posterior, which started from a prior."""
         sd = posterior.stddev.numpy()
         contraction = 1 - sd / np.maximum(prior.stddev.numpy(), 1e-300)
