@@ -137,7 +137,7 @@ def one_row(name: str, seed: int) -> dict[str, Any]:
         "model": name,
         "seed": seed,
         "c2st": c2st(posterior, draws),
-        "c2st_same": c2st(posterior, posterior.sample((len(draws),), torch.Generator().manual_seed(seed)).numpy()),
+        "c2st_same": c2st(posterior, posterior.sample((len(draws),), torch.Generator().manual_seed(1000 + seed)).numpy()),
         "mean_off": ((mean - draws.mean(0)) / draws.std(0)).round(3).tolist(),
         "sd_ratio": (sd / draws.std(0)).round(3).tolist(),
         "z": ((mean - truth) / sd).round(2).tolist(),
