@@ -179,6 +179,10 @@ class Code(Enum):
         "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse "
         "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim"
     )
+    BEYOND_START_NOISE = blocking(
+        "simulations leave {times:.1f} times the noise that the measurements of their known starts have: the search "
+        "ended in a wrong valley, or the model lacks something; give a larger budget and more restarts"
+    )
     NOT_LOOKED_AROUND = blocking(
         "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow; "
         "give a larger budget, and the same folder goes on"

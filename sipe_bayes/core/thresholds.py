@@ -115,6 +115,9 @@ class Thresholds(Options):
         0.5, "weights of which more is effective are nearly alike, whatever the shape of their tail", "of the draws"
     )
 
+    start_noise: float = option(
+        1e-3, "below it noise of what simulations leave would not be as small as that of known starts", "probability"
+    )
     contradiction: float = option(
         1e-3, "below it two starts of a search that ended as far apart would contradict each other", "probability"
     )

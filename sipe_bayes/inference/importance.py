@@ -184,6 +184,8 @@ def draw(
 
 def weights(draws: Draws, prior: Posterior) -> FloatArray:
     """Of the draws (M,), which sum to one; all zero where no draw is worth anything."""
+    if not draws.batches:
+        return np.zeros(0)
     points, terms = draws.points, []
     base = prior.log_prob(torch.from_numpy(points)).numpy()
     batches = zip(draws.share, draws.mass, draws.means, draws.covariances, strict=True)

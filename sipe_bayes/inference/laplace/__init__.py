@@ -22,7 +22,8 @@ mean lies beyond it, and the truncated density is right up to the bound.
 
 **Steps** (``estimator.Laplace``):
 
-1. Choose starting points: the model as given and the best of a few draws from the prior (``screening``).
+1. Choose starting points: the model as given and the best of a few draws from the prior (``screening``); where windows
+   begin at known states of a model with contact, by single control steps first (``contact_starts``).
 2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
 3. Record where that ends (``window_optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
    over a handful of weighted noise values.
@@ -76,6 +77,6 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
   predicts best.
 - Whether the posterior is normal is not asked where starts are estimated or states inferred, where there are several
   optima, where residuals are as small as the simulation's rounding or intervals as small as the search resolves, where
-  the intervals are guessed, or where the budget has no room left for draws (2 N + 1 rollouts to ask, and some hundreds
-  where it is not).
+  the intervals are guessed. Where the budget has no room for it (2 N + 1 rollouts to ask, and some hundreds for draws
+  where it is none), a finding says so.
 """

@@ -44,12 +44,14 @@ class LaplaceState:
         search: the state of its ``Strategy``.
         draws: those that take the normal's place; None before them, and where it stands.
         judgements: of the normals of a chain's optima, best first.
+        unjudged: whether the budget left no room to see whether the posterior of windows is a normal.
         done: whether all have ended.
     """
 
     search: WindowState | StateSpaceState | KnownStartState
     draws: Draws | None = None
     judgements: tuple[Judgement, ...] = ()
+    unjudged: bool = False
     done: bool = False
 
 
@@ -147,18 +149,19 @@ class Laplace(Estimator[LaplaceState]):
         if windows.num_start or windows.settings.noise == "sandwich":
             return ended
         kept = distinct(state.search.optima)
-        batches = tuning.hopeless_after * importance.batch_size(n, tuning)
-        least = importance.probe_size(n) + batches
         if len(kept) != 1 or not isinstance(kept[0], WindowOptimum) or kept[0].guessed:
             return ended
+        assert isinstance(state.search, WindowState)
         if np.sqrt(np.diag(kept[0].covariance)).min() < 10 * SHORTEST:
             return ended  # an sd that the look around the optimum may have set
-        if not windows.has_room(least):
-            return ended
+        if not windows.has_room(importance.probe_size(n)):
+            return replace(ended, unjudged=True)
         target = self._target(windows, kept[0])
-        if target.silent or importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
+        if target.silent:
             return ended
-        return replace(state, draws=Draws.none(n))
+        if importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
+            return replace(ended, search=_looked_around(state.search, kept[0]))
+        return replace(state, draws=Draws.none(n), done=not windows.has_room(importance.batch_size(n, tuning)))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where windows of the logs lead."""
@@ -241,6 +244,8 @@ class Laplace(Estimator[LaplaceState]):
             distance = contradiction([one for one in state.search.optima if isinstance(one, ChainOptimum)])
             if distance is not None:
                 self.find(Code.STARTS_CONTRADICT, distance=distance)
+        if state.unjudged:
+            self.find(Code.NOT_JUDGED)
         if isinstance(state.search, WindowState) and len(state.search.wild):
             wild = state.search.wild
             channels = ", ".join(self.simulator.environment.channels[c] for c in np.unique(wild[:, 2]))
@@ -288,3 +293,11 @@ class Laplace(Estimator[LaplaceState]):
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
         return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open
+
+
+def _looked_around(search: WindowState, optimum: WindowOptimum) -> WindowState:
+    """The search where an optimum's normal stands: its budget left no room for a look around, and this was one."""
+    if optimum.finding is None or optimum.finding.code is not Code.NOT_LOOKED_AROUND:
+        return search
+    optima = tuple(replace(one, finding=None) if one is optimum else one for one in search.optima)
+    return replace(search, optima=optima)

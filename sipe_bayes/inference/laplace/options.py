@@ -68,6 +68,24 @@ class GrowingTuning(Options):
 
 
 @dataclass(frozen=True)
+class ContactTuning(Options):
+    """How starting points through contact are found from known states; see ``contact_starts``."""
+
+    candidates: int = option(60, "points among which they are chosen, by one control step: it is cheap", least=1)
+    followed: int = option(6, "of them that go downhill: half of them come to the same place", least=1)
+    freedom: float = option(4.0, "degrees of freedom of Student's t: bears windows beyond an impact", above=0)
+    growth: float = option(1.25, "how much longer a beginning is than the one before", above=1)
+    widest: float = option(0.02, "differences at first: contact jumps over shorter ones", "of the cube", above=0)
+    narrowest: float = option(1e-4, "the last ones at least: what follows goes further", "of the cube", above=0)
+    finer: float = option(8.0, "factor by which they shrink where nothing is left to gain over them", above=1)
+    enough: float = option(1e-3, "gain of a step below which nothing is", "of the energy", above=0)
+    most_steps: int = option(40, "steps on one beginning", least=1)
+    hopeless: float = option(0.1, "how much worse a place is that is left aside", "nats of a sample", above=0)
+    attempts: int = option(4, "how often it begins anew while more than the starts' noise is left", least=1)
+    budget_share: float = option(0.6, "of the budget in all: the rest is the search's", above=0, below=1)
+
+
+@dataclass(frozen=True)
 class ScoutTuning(Options):
     """How other values that fit as well are looked for; see ``scouting``."""
 
@@ -90,6 +108,7 @@ class LaplaceTuning(Options):
     screening: ScreeningTuning = option(ScreeningTuning(), "how starting points are chosen")
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
+    contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
     scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
     pattern: PatternTuning = option(PatternTuning(), "how the surroundings of an optimum are looked at")

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, QuadraticModel
 from sipe_bayes.inference.laplace.options import WindowTuning
 from sipe_bayes.likelihood.moments import Moments
@@ -20,6 +22,7 @@ from sipe_bayes.likelihood.noise import Noise, pooled
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
 
 _SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
 
@@ -161,3 +164,29 @@ def misfit(windows: Windows, residual: FloatArray) -> float:
 def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
     """Whether a step gained what the linearisation foretold."""
     return abs(fit.gained - fit.expected) < tuning.foretold * max(fit.expected, tuning.tolerance)
+
+
+def start_noise(windows: Windows) -> FloatArray:
+    """Noise (W, C) of the measurements of known starts; NaN where a channel measures no coordinate of the state."""
+    out = np.full((windows.num_windows, len(windows.channels)), np.nan)
+    if windows.num_start or not isinstance(windows.simulator, Simulator):
+        return out
+    columns = windows.simulator.environment.state_columns(windows.simulator.model)
+    for c, channel in enumerate(windows.channels):
+        if (column := columns[channel]) is not None:
+            out[:, c] = windows.measured[:, 0, c] - windows.reference[:, column]
+    return out
+
+
+def beyond_start_noise(windows: Windows, sd: FloatArray) -> float | None:
+    """How many times noise sds (C,) are the noise of the measurements of known starts; None where no more than it.
+
+    A thousandth of a channel's spread is no matter, whatever the noise of the starts.
+    """
+    noise, spread = start_noise(windows), np.maximum(windows.spread, 1e-300)
+    known = np.isfinite(noise) & np.isnan(windows.fixed_sd)
+    if not known.any():
+        return None
+    share = np.where(known, noise**2 + (1e-3 * spread) ** 2, 0.0) / np.maximum(sd, 1e-300) ** 2
+    count, total = int(known.sum()), float(share.sum())
+    return float(np.sqrt(count / total)) if chi2.cdf(total, count) < THRESHOLDS.start_noise else None

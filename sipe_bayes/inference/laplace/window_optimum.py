@@ -13,6 +13,7 @@ from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.window_energy import (
     WindowEnergy,
     beyond_rounding,
+    beyond_start_noise,
     free_noise,
     misfit,
     noise_at_least,
@@ -171,6 +172,8 @@ def judged(
         reason = finding(Code.SEARCH_UNSETTLED, steps=ending.steps)
     elif unsmooth:
         reason = finding(Code.NOT_SMOOTH, gain=ending.refused)
+    elif (times := beyond_start_noise(windows, optimum.sd)) is not None:
+        reason = finding(Code.BEYOND_START_NOISE, times=times)
     if around is not None:
         covariance = around.covariance
         reason = finding(Code.ROUGH_EVERYWHERE) if around.rough else reason

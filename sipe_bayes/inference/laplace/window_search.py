@@ -38,6 +38,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.contact_starts import starting_points
 from sipe_bayes.inference.laplace.growing_windows import (
     ManyStarts,
     counted,
@@ -53,7 +54,6 @@ from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST, pattern_size
 from sipe_bayes.inference.laplace.scouting import may_scout, scouted
-from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.window_energy import (
     LinearisedWindows,
@@ -119,8 +119,7 @@ class WindowSearch:
 
     def start(self) -> WindowState:
         """The first state: at the first starting point."""
-        initial = self.problem.options.initial
-        points = screen(self.problem, self.windows) if initial is None else initial
+        points = starting_points(self.problem, self.windows)
         return WindowState(points, 0, self._begin(points[0]))
 
     def step(self, state: WindowState) -> WindowState:
@@ -383,11 +382,12 @@ class WindowSearch:
         return not self.windows.num_start and not state.optima
 
     def _leaves_no_room(self) -> bool:
-        """Whether the budget has no room for another step, and where it takes less than half of it, a look around."""
+        """Whether the budget has no room for another step, and where there is still some, for a look around."""
         windows, tuning = self.windows, self._tuning
         step = windows.num_theta + tuning.windows.trials
         look = pattern_size(windows.num_theta, tuning.pattern)
-        looks = 2 * look * len(windows.trajectories) < windows.budget
+        cost = look * len(windows.trajectories)
+        looks = 2 * cost < windows.budget and windows.rollouts + cost <= windows.budget
         return not windows.has_room(step + look if looks else step)
 
     @property
