@@ -66,7 +66,9 @@ def train(
     checkpoint_every: Annotated[int, typer.Option(help="Steps between checkpoints.")] = 25_000,
     episodes: Annotated[int, typer.Option(help="Episodes of the cards' evaluation.")] = 100,
     threads: Annotated[int, typer.Option(help="Native threads, of simulation and networks.")] = 1,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda; default cuda where there is a GPU.")] = None,
+    device: Annotated[
+        str, typer.Option(help="cpu; or cuda, cuda:1: worlds, replay buffer and networks on a GPU, with the extra gpu.")
+    ] = "cpu",
     **settings: object,
 ) -> None:
     """Train an agent by DDPG: expert, suboptimal agent and their cards, learning curve, checkpoint."""
@@ -95,7 +97,7 @@ def train(
                 evaluation_episodes=evaluation_episodes,
                 checkpoint_every=checkpoint_every,
                 threads=threads,
-                device=device or ("cuda" if torch.cuda.is_available() else "cpu"),
+                device=device,
                 report=progress,
             )
         for name, card in _write_cards(folder, task, seed, steps, chosen, episodes, demonstrations).items():

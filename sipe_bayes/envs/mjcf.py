@@ -258,6 +258,8 @@ class MjcfEnvironment(Environment):
 
     def sensing(self, values: FloatArray, log: str | None = None) -> Sensing:
         """What of the sensors is among the parameters, as it holds in ``log``; see ``Environment.sensing``."""
+        if not self._sensed:
+            return self.exact_sensing
         out, table = Sensing.of_bias(np.zeros(len(self.measurements))), self._resolve(log)
         for j, attribute, channels in self._sensed:
             if j in table and attribute == "scale":

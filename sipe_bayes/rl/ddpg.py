@@ -173,7 +173,7 @@ class Network:
 
 
 class Agent:
-    """Actor, critic, their targets and optimisers; what goes in and comes out are numpy's arrays.
+    """Actor, critic, their targets and optimisers.
 
     Args:
         observation_size: O.
@@ -209,16 +209,15 @@ class Agent:
 
     def act(self, observations: FloatArray) -> FloatArray:
         """Actions (B, A) of observations (B, O), without noise."""
-        x = self._on_device(self._normalised(observations.astype(np.float32)))
+        x = self._normalised(torch.from_numpy(observations.astype(np.float32)).to(self._device))
         return np.asarray(self._bounded(self.actor.forward(x)[0].tanh_()).cpu().numpy(), float)
 
     def update(self, batch: Batch) -> None:
-        """One step of the critic, the actor and the targets."""
-        seen = (self._normalised(x) for x in (batch.observations, batch.next_observations))
-        given = (*seen, batch.actions, batch.returns, batch.discounts)
-        observations, following, actions, returns, discounts = (self._on_device(x) for x in given)
+        """One step of the critic, the actor and the targets; the batch lies on the agent's device."""
+        observations, following = (self._normalised(x) for x in (batch.observations, batch.next_observations))
+        actions = batch.actions
         # the critic follows its target
-        targets = self._targets(following, returns, discounts)
+        targets = self._targets(following, batch.returns, batch.discounts)
         pairs = torch.cat([observations, actions], 1)
         values, tape = self.critic.forward(pairs)
         self.critic.backward(tape, (values - targets).mul_(2 / len(values)))
@@ -259,11 +258,8 @@ class Agent:
             tensors |= {f"{name}.{k}": moments[k] for k in ("exp_avg", "exp_avg_sq", "step")}
         return tensors
 
-    def _normalised(self, observations: Float32Array) -> Float32Array:
+    def _normalised(self, observations: Tensor) -> Tensor:
         return observations if self.normaliser is None else self.normaliser.apply(observations)
-
-    def _on_device(self, array: Float32Array) -> Tensor:
-        return torch.from_numpy(array).to(self._device)
 
     def _bounded(self, squashed: Tensor) -> Tensor:
         return squashed * self._half + self._middle

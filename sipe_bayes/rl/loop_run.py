@@ -146,7 +146,7 @@ class _Recorder:
         self._trainer.advance()
         row = (replay.head - 1) % replay.rows
         for env, begun in list(self._running.items()):
-            begun.actions.append(replay.actions[row, env].astype(float))
+            begun.actions.append(replay.actions[row, env].double().cpu().numpy())
             if len(begun.actions) == self._steps or replay.ends[row, env] >= 0:
                 self.episodes.append(self._running.pop(env))
 

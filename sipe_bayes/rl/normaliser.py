@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from sipe_bayes.core.arrays import Float32Array, FloatArray
+from sipe_bayes.core.arrays import FloatArray
 
 _LEAST = 1e-2  # spread below which a channel counts as constant and is not blown up
 
@@ -45,9 +47,10 @@ class Normaliser:
         squares = before.squares + (((observations - mean) ** 2).sum(0) + apart**2 * before.count * number / count)
         self.restore(Moments(count, before.mean + apart * number / count, squares))
 
-    def apply(self, observations: Float32Array) -> Float32Array:
-        """Observations (B, O), shifted, scaled and clipped."""
-        return np.clip((observations - self.mean) / self.scale, -self.clip, self.clip)
+    def apply(self, observations: Tensor) -> Tensor:
+        """Observations (B, O) in float32, shifted, scaled and clipped."""
+        mean, scale = (torch.from_numpy(x).to(observations.device) for x in (self.mean, self.scale))
+        return ((observations - mean) / scale).clamp_(-self.clip, self.clip)
 
     def state(self) -> Moments:
         """From which ``restore`` goes on."""

@@ -20,11 +20,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.files import LineError, read_arrays, reading, replacing
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.simulation.episodes import Step
@@ -42,7 +45,7 @@ class ReplayError(LineError):
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions to learn from.
+    """Transitions to learn from, in float32 where they are learnt from.
 
     Args:
         observations: (B, O).
@@ -52,11 +55,11 @@ class Batch:
         next_observations: (B, O).
     """
 
-    observations: Float32Array
-    actions: Float32Array
-    returns: Float32Array
-    discounts: Float32Array
-    next_observations: Float32Array
+    observations: Tensor
+    actions: Tensor
+    returns: Tensor
+    discounts: Tensor
+    next_observations: Tensor
 
 
 class Replay:
@@ -72,6 +75,7 @@ class Replay:
         goal_size: G; the desired goal is the observation's last numbers.
         hindsight: k, 0 for none.
         goal_reward: what the task gives for a goal.
+        device: torch's name of where observations, actions and rewards lie.
 
     Raises:
         ValueError: for a capacity without room, or hindsight without goals.
@@ -88,6 +92,7 @@ class Replay:
         goal_size: int = 0,
         hindsight: int = 0,
         goal_reward: GoalReward | None = None,
+        device: str = "cpu",
     ) -> None:
         if capacity < 2 * num_envs:
             raise ValueError(f"capacity: expected at least 2 steps for each of {num_envs} environments, got {capacity}")
@@ -95,11 +100,11 @@ class Replay:
             raise ValueError(f"hindsight: expected 0 for a task without goals, got {hindsight}")
         self.rows, self.num_envs, self.goal_size = capacity // num_envs, num_envs, goal_size
         self.discount, self.n_step, self.hindsight, self._goal_reward = discount, n_step, hindsight, goal_reward
-        shape = (self.rows, num_envs)
-        self.observations = np.zeros((*shape, observation_size), np.float32)
-        self.actions = np.zeros((*shape, action_size), np.float32)
-        self.rewards = np.zeros(shape, np.float32)
-        self.achieved = np.zeros((*shape, goal_size), np.float32)
+        self._device, shape = device, (self.rows, num_envs)
+        self.observations, self.actions, self.rewards, self.achieved = (
+            torch.from_numpy(np.zeros((*shape, *more), np.float32)).to(device)  # NumPy takes memory as it is filled
+            for more in ((observation_size,), (action_size,), (), (goal_size,))
+        )
         self.terminated, self.transition = np.zeros(shape, bool), np.zeros(shape, bool)
         self.ends = np.full(shape, -1)  # the step of the episode's last observation; -1 while it runs
         self.head = 0  # the step of the newest observation, of which nothing followed yet
@@ -123,7 +128,8 @@ class Replay:
             step: what followed.
         """
         row = self.head % self.rows
-        self.actions[row], self.rewards[row] = actions, step.rewards
+        self._keep(self.actions, row, actions)
+        self._keep(self.rewards, row, step.rewards)
         self.terminated[row], self.transition[row] = step.terminated, step.valid & ~self._over
         ended = (step.terminated | step.truncated) & ~self._over
         for env in np.flatnonzero(ended):
@@ -153,11 +159,12 @@ class Replay:
             raise ValueError("trajectories: expected rewards, got none; record them from a task")
         count = trajectories.valid.sum(1) - 1
         steps = np.arange(horizon)[:, None]
-        self.observations[: horizon + 1] = np.nan_to_num(trajectories.observations.swapaxes(0, 1))
-        self.actions[:horizon] = trajectories.actions.swapaxes(0, 1)
-        self.rewards[:horizon] = trajectories.rewards.swapaxes(0, 1)
+        after, before = slice(0, horizon + 1), slice(0, horizon)
+        self._keep(self.observations, after, np.nan_to_num(trajectories.observations.swapaxes(0, 1)))
+        self._keep(self.actions, before, trajectories.actions.swapaxes(0, 1))
+        self._keep(self.rewards, before, trajectories.rewards.swapaxes(0, 1))
         if self.goal_size:
-            self.achieved[: horizon + 1] = np.nan_to_num(np.asarray(achieved).swapaxes(0, 1))
+            self._keep(self.achieved, after, np.nan_to_num(np.asarray(achieved).swapaxes(0, 1)))
         self.transition[:horizon] = steps < count
         self.ends[:horizon] = np.where(steps < count, count, -1)
         self.head = horizon
@@ -174,34 +181,34 @@ class Replay:
         """
         # which transitions, and where their episodes end
         steps, envs = self._draw(rng, count)
-        rows = steps % self.rows
-        ends = self.ends[rows, envs]
+        ends = self.ends[steps % self.rows, envs]
         ends = np.where(ends < 0, self.head, ends)
         last = np.minimum(steps + self.n_step, ends)  # the step at which the value of what follows is asked for
-        observations, following = self.observations[rows, envs], self.observations[last % self.rows, envs]
+        observations, following = (self._at(self.observations, when, envs) for when in (steps, last))
         goals = None
         if self.hindsight:
             goals = self._relabel(rng, steps, envs, ends, observations, following)
         # sum the rewards up to there, those of other goals where hindsight has exchanged them
-        returns, factor = np.zeros(count), np.ones(count)
+        returns, factor = torch.zeros(count, dtype=torch.float64, device=self._device), np.ones(count)
         for ahead in range(self.n_step):
-            at = steps + ahead
-            inside = at < ends
-            here = at % self.rows
-            rewards: FloatArray | Float32Array = self.rewards[here, envs]
+            inside = steps + ahead < ends
+            rewards = self._at(self.rewards, steps + ahead, envs)
             if goals is not None and self._goal_reward is not None:
-                reached = self.achieved[(at + 1) % self.rows, envs]
-                rewards = self._goal_reward(cast(FloatArray, reached), cast(FloatArray, goals))  # single precision
-            returns += np.where(inside, factor * rewards, 0.0)
+                reached = self._at(self.achieved, steps + ahead + 1, envs)
+                given: Any = (reached.cpu().numpy(), goals.cpu().numpy())  # single precision
+                rewards = self._on_device(self._goal_reward(*given))
+            returns += self._on_device(np.where(inside, factor, 0.0)) * rewards
             factor = np.where(inside, factor * self.discount, factor)
         factor *= ~self.terminated[(last - 1) % self.rows, envs]
-        actions = self.actions[rows, envs]
-        return Batch(observations, actions, returns.astype(np.float32), factor.astype(np.float32), following)
+        actions = self._at(self.actions, steps, envs)
+        return Batch(observations, actions, returns.float(), self._on_device(factor).float(), following)
 
     def save(self, path: Path) -> None:
         """Write an npz file of what is filled, atomically."""
         used = min(self.head + 1, self.rows)
-        arrays = {name: getattr(self, name)[:used] for name in _STORED}
+        arrays: dict[str, Any] = {
+            name: np.asarray(torch.as_tensor(getattr(self, name)[:used]).cpu()) for name in _STORED
+        }
         arrays |= {"head": np.array(self.head), "starts": self._starts, "over": self._over, "rows": np.array(self.rows)}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -222,14 +229,26 @@ class Replay:
                         f"{name}: expected {expected} of {self.rows} rows, got {arrays[name].shape} of {rows}"
                     )
         for name, value in stored.items():
-            getattr(self, name)[:used] = value
+            own = getattr(self, name)
+            own[:used] = torch.from_numpy(value).to(self._device) if isinstance(own, Tensor) else value
         self.head, self._starts, self._over = head, starts.copy(), over.copy()
 
     def _observe(self, observations: FloatArray, achieved: FloatArray | None) -> None:
         row = self.head % self.rows
-        self.observations[row], self.transition[row], self.ends[row] = observations, False, -1
-        if self.goal_size:
-            self.achieved[row] = achieved
+        self.transition[row], self.ends[row] = False, -1
+        self._keep(self.observations, row, observations)
+        if achieved is not None and self.goal_size:
+            self._keep(self.achieved, row, achieved)
+
+    def _keep(self, stored: Tensor, rows: int | slice, values: FloatArray) -> None:
+        stored[rows].copy_(torch.from_numpy(values.astype(np.float32)))
+
+    def _at(self, stored: Tensor, steps: IntArray, envs: IntArray) -> Tensor:
+        """What is stored (n, ...) of steps (n,) of environments (n,)."""
+        return stored.flatten(0, 1).index_select(0, self._on_device(steps % self.rows * self.num_envs + envs))
+
+    def _on_device(self, array: NDArray[np.generic]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
 
     def _draw(self, rng: np.random.Generator, count: int) -> tuple[IntArray, IntArray]:
         """Steps and columns (count,) of transitions: places are drawn anew until enough of them hold one."""
@@ -251,13 +270,13 @@ class Replay:
         steps: IntArray,
         envs: IntArray,
         ends: IntArray,
-        observations: Float32Array,
-        following: Float32Array,
-    ) -> Float32Array:
+        observations: Tensor,
+        following: Tensor,
+    ) -> Tensor:
         """Goals (B, G), most of them reached later, also written into the observations."""
         later = steps + 1 + (rng.random(len(steps)) * (ends - steps)).astype(int)
         chosen = rng.random(len(steps)) < self.hindsight / (self.hindsight + 1)
-        reached = self.achieved[later % self.rows, envs]
-        goals: Float32Array = np.where(chosen[:, None], reached, observations[:, -self.goal_size :])
+        reached = self._at(self.achieved, later, envs)
+        goals = torch.where(self._on_device(chosen)[:, None], reached, observations[:, -self.goal_size :])
         observations[:, -self.goal_size :] = following[:, -self.goal_size :] = goals
         return goals

@@ -152,7 +152,7 @@ def train(
         evaluation_episodes: of each point.
         checkpoint_every: control steps between checkpoints.
         threads: of the simulation.
-        device: where the networks learn, "cpu" or "cuda"; a run may go on on the other.
+        device: what steps the environments and learns, as ``Simulator`` has them; evaluations are on the processor.
         report: is told how far it is.
 
     Returns:

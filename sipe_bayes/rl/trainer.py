@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories
@@ -72,10 +73,11 @@ class Trainer:
         randomization: what each episode draws; without one it runs in the published model.
         demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is taken.
         threads: of the simulation.
-        device: of the networks.
+        device: that is simulated, remembered and learnt on, as ``Simulator`` has them.
 
     Raises:
-        ValueError: for settings that do not fit the task, or demonstrations without a share of them.
+        ValueError: for settings that do not fit the task, demonstrations without a share of them, or a task that the
+            device can not simulate.
     """
 
     def __init__(
@@ -99,10 +101,11 @@ class Trainer:
         streams = np.random.SeedSequence(seed).spawn(5 + settings.lanes)
         initial, self._noise, self._picks, self._draws, *starts, last = (np.random.default_rng(s) for s in streams)
         size = len(task.channels)
-        self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial, device)
+        self._device = "cpu" if device == "warp:cpu" else device  # torch's name of it
+        self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial, self._device)
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
-        self.simulator = Simulator(task, threads)
+        self.simulator = Simulator(task, threads, device)
         self.episodes = Episodes(self.simulator, task.theta("default"), starts, True, settings.end_hopeless)
         self.draws = None if randomization is None else Draws(self.simulator, randomization.posterior)
         self._disturbances = None
@@ -208,7 +211,7 @@ class Trainer:
             return self.replay.sample(self._picks, count)
         shown = self.settings.demonstrated
         parts = [b.sample(self._picks, n) for b, n in ((self.replay, count - shown), (self._shown, shown)) if n]
-        return Batch(*(np.concatenate([getattr(p, name) for p in parts]) for name in Batch.__annotations__))
+        return Batch(*(torch.cat([getattr(p, name) for p in parts]) for name in Batch.__annotations__))
 
     def _buffer(self, capacity: int, num_envs: int) -> Replay:
         task, settings = self.task, self.settings
@@ -220,7 +223,7 @@ class Trainer:
         goals, reward = task.goal_size, task.goal_reward if task.goal_size else None
         k = settings.hindsight if goals else 0
         size = (len(task.channels), task.num_actions)
-        return Replay(*size, capacity, num_envs, settings.discount, settings.n_step, goals, k, reward)
+        return Replay(*size, capacity, num_envs, settings.discount, settings.n_step, goals, k, reward, self._device)
 
     def _demonstrated(self, given: Trajectories) -> Replay:
         batch, horizon = given.actions.shape[:2]

@@ -19,6 +19,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 
 SHARE = 1 / 256
+_RESOLVED = 1e-4  # a thousand times the rounding of float32
 
 
 @dataclass(frozen=True)
@@ -103,9 +104,14 @@ class Audit:
 
 
 def spread(observations: FloatArray, valid: BoolArray) -> FloatArray:
-    """What each channel of (B, T+1, O) varies by (O,), where it was simulated; its size where it does not vary."""
+    """What each channel of (B, T+1, O) varies by (O,), where it was simulated, as far as float32 resolves that.
+
+    At least a ten-thousandth of its size, and of what the middle one of the channels varies by: below, a difference is
+    the rounding of one number.
+    """
     seen = np.where(valid[..., None] & np.isfinite(observations), observations, np.nan)
     if not np.isfinite(seen).any():
         return np.ones(observations.shape[-1])
     sd, size = np.nanstd(seen, axis=(0, 1)), np.nanmax(np.abs(seen), axis=(0, 1))
-    return np.where(sd > 1e-6 * size, sd, np.where(size > 0, size, 1.0))
+    unit = np.maximum(sd, _RESOLVED * np.maximum(size, np.median(sd)))
+    return np.where(unit > 0, unit, 1.0)

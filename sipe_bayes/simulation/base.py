@@ -15,8 +15,8 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import cores, most_threads, whole
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.task import Task
+from sipe_bayes.simulation.device import Device, Processor
 from sipe_bayes.simulation.engine import Engine
-from sipe_bayes.simulation.model_pool import ModelPool
 
 MOST_STEPS = 10_000
 """Physics steps of a control step: beyond, nobody waits for a fit."""
@@ -27,7 +27,7 @@ class Simulated:
 
     failure: ClassVar[str] = "diverged"  # what is said of simulations that are not valid to their end
 
-    def __init__(self, environment: Environment, num_threads: int | None = None) -> None:
+    def __init__(self, environment: Environment, num_threads: int | None = None, device: str = "cpu") -> None:
         if not isinstance(environment, Environment):
             hint = f"sipe.make_task({environment!r})" if isinstance(environment, str) else "one of sipe.make_task(name)"
             raise ValueError(f"environment: expected an Environment, got {environment!r}; give {hint}")
@@ -37,12 +37,14 @@ class Simulated:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # divergence must show
         self.engine = Engine(environment, self.model, self.num_threads)
-        self.pool = ModelPool(environment, self.model)
+        self.device = device
+        self.runs: Device = Processor(self.engine) if device == "cpu" else on_gpu(self.engine, device)
+        self.pool = self.runs.pool()
         self.diverged = 0
         self.control_steps = 0
 
     def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
-        return type(self), (self.environment, self.num_threads)
+        return type(self), (self.environment, self.num_threads, self.device)
 
     @property
     def task(self) -> Task:
@@ -141,3 +143,15 @@ class Simulated:
     def written(self, theta: FloatArray, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
         """A model of one's own with theta (N,) written in; see ``ModelPool.written``."""
         return self.pool.written(theta, model)
+
+
+def on_gpu(engine: Engine, device: str) -> Device:
+    """The engine of a GPU; raises ValueError without the packages, the device or what the model needs."""
+    try:
+        from sipe_bayes.simulation.gpu.devices import warp_name
+
+        name = warp_name(device)
+        from sipe_bayes.simulation.gpu.engine import GpuEngine
+    except ModuleNotFoundError as error:
+        raise ValueError(f"device: {error.name} is not installed; `pip install 'sipe-bayes[gpu]'`") from None
+    return GpuEngine(engine, name)

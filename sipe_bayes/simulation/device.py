@@ -27,13 +27,15 @@ class Batch(NamedTuple):
     """T control steps of B simulations to come.
 
     Args:
-        slots: (B,), where the device's pool holds their parameters.
+        pool: of the device, which holds their parameters.
+        slots: (B,), where.
         skip: physics steps of a control step.
         timesteps: (B,) seconds of their physics steps.
         actions: (B, T, A).
         start: states (B, S) to begin at.
     """
 
+    pool: ModelPool
     slots: IntArray
     skip: int
     timesteps: FloatArray
@@ -44,9 +46,8 @@ class Batch(NamedTuple):
 class Device(Protocol):
     """Written parameters, and simulations with them."""
 
-    @property
     def pool(self) -> ModelPool:
-        """What is written where."""
+        """Room for written parameters."""
 
     @property
     def own_slots(self) -> bool:
@@ -59,8 +60,11 @@ class Device(Protocol):
     def most(self, horizon: int, skip: int) -> int:
         """How many simulations of ``horizon`` control steps of ``skip`` physics steps memory holds at once."""
 
-    def advance(self, batch: Batch) -> Motion:
-        """Simulate."""
+    def advance(self, batch: Batch, first: bool = True) -> Motion:
+        """Simulate; without ``first`` the derived quantities of sample 0 may be missing."""
+
+    def sensors(self, pool: ModelPool, slots: IntArray, states: FloatArray) -> FloatArray:
+        """What is derived (B, D) of states (B, S) without control, for parameters in slots (B,)."""
 
 
 class Processor:
@@ -68,13 +72,16 @@ class Processor:
 
     Args:
         engine: runs written models.
-        pool: writes them.
     """
 
-    def __init__(self, engine: Engine, pool: ModelPool) -> None:
-        self.engine, self.pool = engine, pool
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
 
     wave = 1
+
+    def pool(self) -> ModelPool:
+        """See ``Device``."""
+        return ModelPool(self.engine.environment, self.engine.model)
 
     @property
     def own_slots(self) -> bool:
@@ -90,7 +97,11 @@ class Processor:
         held = min(MEMORY.numbers // width, MEMORY.model_bytes // mujoco.mj_sizeModel(engine.model))
         return max(engine.num_threads, held)
 
-    def advance(self, batch: Batch) -> Motion:
+    def advance(self, batch: Batch, first: bool = True) -> Motion:
         """See ``Device``."""
-        models = self.pool.models(batch.slots)
-        return self.engine.advance(Run(batch.skip, models, batch.timesteps, batch.actions, batch.start))
+        models = batch.pool.models(batch.slots)
+        return self.engine.advance(Run(batch.skip, models, batch.timesteps, batch.actions, batch.start), first)
+
+    def sensors(self, pool: ModelPool, slots: IntArray, states: FloatArray) -> FloatArray:
+        """See ``Device``."""
+        return self.engine.sensors(pool.models(slots), states)

@@ -17,7 +17,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.envs.task import Transition
 from sipe_bayes.simulation.base import Simulated
-from sipe_bayes.simulation.engine import Run
+from sipe_bayes.simulation.device import Batch
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Episodes:
         end_hopeless: end episodes where ``Task.hopeless`` says so.
 
     Raises:
-        ValueError: for an environment that is no task, or no generator.
+        ValueError: for an environment that is no task, no generator, more simulations than a GPU has room for, or wrong
+            theta.
     """
 
     def __init__(
@@ -72,12 +73,15 @@ class Episodes:
             raise ValueError("count: expected at least 1, got 0")
         self.task, self.simulator, self.count = task, simulator, len(generators)
         self.generators, self.allow_outside, self.end_hopeless = list(generators), allow_outside, end_hopeless
-        self._skip, self._timestep = simulator.physics_steps(simulator.dt)
-        self.theta = np.full((self.count, len(simulator.space)), np.nan)
-        self._models: list[mujoco.MjModel | None] = [None] * self.count
-        self.set_theta(np.arange(self.count), theta)
+        self._skip, timestep = simulator.physics_steps(simulator.dt)
+        room = None if simulator.device == "cpu" else simulator.runs.most(1, self._skip)
+        if room is not None and self.count > room:
+            raise ValueError(f"count: {simulator.device} has room for {room} simulations at a time, got {self.count}")
+        self._timesteps = np.full(self.count, timestep)
+        self._pool, self._slots = simulator.runs.pool(), np.zeros(self.count, int)
+        self.theta = simulator.check_theta(theta, allow_outside, self.count)
+        self._write(np.arange(self.count))
         derived = simulator.engine.derived_size if task.needs_derived else 0
-        self._timesteps = np.full(self.count, self._timestep)
         self.states = np.zeros((self.count, simulator.state_size))
         self.goals = np.zeros((self.count, task.goal_size)) if task.goal_size else None
         self.derived = np.zeros((self.count, derived)) if task.needs_derived else None
@@ -88,8 +92,8 @@ class Episodes:
 
     @property
     def models(self) -> list[mujoco.MjModel]:
-        """One for each simulation, with its parameters."""
-        return [model for model in self._models if model is not None]
+        """One for each simulation, with its parameters; on the processor."""
+        return self._pool.models(self._slots)
 
     def set_theta(self, chosen: IntArray, theta: FloatArray) -> None:
         """Give simulations their parameters, which hold from the next physics step on.
@@ -101,21 +105,25 @@ class Episodes:
         Raises:
             ValueError: for theta of another shape, outside, or unphysical; nothing is changed then.
         """
-        rows = self.simulator.check_theta(theta, self.allow_outside, len(chosen))
-        groups: dict[bytes, list[int]] = {}
-        for index, row in enumerate(rows):
-            groups.setdefault(row.tobytes(), []).append(index)
-        for group in groups.values():  # all of them before any model is touched
-            self.simulator.check_physical(rows[group[0]])
-        indices = chosen.tolist()
-        replaced = set(indices)
-        kept = {id(m) for i, m in enumerate(self._models) if i not in replaced}
-        free = {id(m): m for i in indices if (m := self._models[i]) is not None and id(m) not in kept}
-        spare = list(free.values())
-        for group in groups.values():
-            model = self.simulator.written(rows[group[0]], spare.pop() if spare else None)
-            for index in group:
-                self._models[indices[index]], self.theta[indices[index]] = model, rows[index]
+        before = self.theta.copy()
+        self.theta[chosen] = self.simulator.check_theta(theta, self.allow_outside, len(chosen))
+        try:
+            self._write(chosen)
+        except ValueError:
+            self.theta = before
+            self._write(chosen)
+            raise
+
+    def _write(self, chosen: IntArray) -> None:
+        """Into one slot where all simulations are alike, else into one for each; raises ValueError where unphysical."""
+        alone = self.simulator.runs.own_slots or (self.theta != self.theta[0]).any()
+        slots = np.arange(self.count) if alone else np.zeros(self.count, int)
+        changed = chosen if np.array_equal(slots, self._slots) else np.arange(self.count)
+        self._slots, changed = slots, changed if alone else changed[:1]
+        self._pool.put(slots[changed], self.theta[changed], self._timesteps[changed], [None] * len(changed))
+        physical = self._pool.physical(slots[changed])
+        if not physical.all():
+            self.simulator.check_physical(self.theta[changed][~physical][0])
 
     def begin(self, chosen: BoolArray) -> None:
         """Begin a new episode in the marked simulations (B,)."""
@@ -130,8 +138,7 @@ class Episodes:
         states, goals = self.states[indices], None if self.goals is None else self.goals[indices]
         derived = None
         if self.derived is not None:
-            models = self.models
-            derived = self.simulator.engine.sensors([models[i] for i in indices], states)
+            derived = self.simulator.runs.sensors(self._pool, self._slots[indices], states)
             self.derived[indices] = derived
         self.observations[indices] = self.task.observe(self.simulator.model, states, derived, goals)
         self.elapsed[indices], self.over[indices] = 0, False
@@ -186,14 +193,13 @@ class Episodes:
         self, chosen: IntArray | None, actions: FloatArray
     ) -> tuple[FloatArray, BoolArray, BoolArray, BoolArray | None]:
         """Rewards, terminated, valid and success of the ``chosen`` simulations, None for all."""
-        task, models = self.task, self.models
+        task = self.task
         index: slice | IntArray = slice(None) if chosen is None else chosen
-        models = models if chosen is None else [models[i] for i in chosen]
         before = self.states[index]
         goals = None if self.goals is None else self.goals[index]
         old = None if self.derived is None else self.derived[index]
-        run = Run(self._skip, models, self._timesteps[index], actions[:, None], before)
-        states, derived, valid = self.simulator.engine.advance(run, first=False)
+        given = Batch(self._pool, self._slots[index], self._skip, self._timesteps[index], actions[:, None], before)
+        states, derived, valid = self.simulator.runs.advance(given, first=False)
         after, new = states[:, 1], None if derived is None else derived[:, 1]
         valid = np.asarray(valid.all(1))
         observations = task.observe(self.simulator.model, after, new, goals)

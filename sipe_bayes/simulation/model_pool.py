@@ -54,15 +54,37 @@ class ModelPool:
         differs = (theta[1:] != theta[:-1]).any(1) | (timesteps[1:] != timesteps[:-1]) | (named[1:] != named[:-1])
         first = np.flatnonzero(np.concatenate([[True], differs | own]))
         index: dict[bytes, int] = {}
-        slots = np.empty(len(first), int)
-        for i, at in enumerate(first):
-            timestep, log = float(timesteps[at]), logs[int(at)]
-            key = theta[at].tobytes() + timestep.hex().encode() + str(log).encode() + str(i if own else "").encode()
+        slots, rows = np.empty(len(first), int), list[int]()
+        for i, at in enumerate(first.tolist()):
+            key = _key(theta[at], timesteps[at], logs[at]) + (str(i).encode() if own else b"")
             if key not in index:
                 index[key] = len(index)
-                self._fill(index[key], key, theta[at], timestep, log)
+                rows.append(at)
             slots[i] = index[key]
+        self.put(np.arange(len(rows)), theta[rows], timesteps[rows], [logs[at] for at in rows])
         return np.repeat(slots, np.diff(first, append=len(theta)))
+
+    def put(self, slots: IntArray, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]) -> None:
+        """Write into chosen slots; what they hold already costs nothing.
+
+        Args:
+            slots: (n,), each once; of those behind the last one the next.
+            theta: (n, N).
+            timesteps: (n,) seconds of their physics steps.
+            logs: n names.
+        """
+        while len(self.slots) <= slots.max(initial=-1):
+            self.slots.append(Slot(self.fresh(), self.environment.exact_sensing))
+        keys = [_key(*row) for row in zip(theta, timesteps, logs, strict=True)]
+        new = [i for i, (k, key) in enumerate(zip(slots.tolist(), keys, strict=True)) if self.slots[k].key != key]
+        for i, values in zip(new, self._values(theta[new]), strict=True):
+            index = int(slots[i])
+            slot = self.slots[index]
+            slot.key = b""
+            slot.physical = self._write(slot.model, values, float(timesteps[i]), logs[i])
+            slot.sensing = self.environment.sensing(values, logs[i])
+            self.keep(index)
+            slot.key = keys[i]
 
     def fresh(self) -> mujoco.MjModel:
         """The model of a new slot."""
@@ -85,7 +107,7 @@ class ModelPool:
 
     def check_physical(self, theta: FloatArray) -> None:
         """Raises ValueError for theta (N,) that no model can have."""
-        if not self.environment.write(self._trial, self._values(theta), None):
+        if not self.environment.write(self._trial, self._values(theta[None])[0], None):
             space = self.environment.space
             named = ", ".join(f"{p.name} = {p.value(t):.4g} {p.unit}" for p, t in zip(space, theta, strict=True))
             raise ValueError(f"theta: unphysical parameters ({named}); choose values within the bounds")
@@ -94,7 +116,7 @@ class ModelPool:
         """``model``, or else a new copy, with theta (N,); raises ValueError for an unphysical one, nothing written."""
         self.check_physical(theta)
         model = copy.copy(self.model) if model is None else model
-        self._write(model, self._values(theta), float(self.model.opt.timestep), None)
+        self._write(model, self._values(theta[None])[0], float(self.model.opt.timestep), None)
         return model
 
     @cached_property
@@ -106,22 +128,14 @@ class ModelPool:
     def _scratch(self) -> mujoco.MjData:
         return mujoco.MjData(self.model)
 
-    def _fill(self, index: int, key: bytes, theta: FloatArray, timestep: float, log: str | None) -> None:
-        if index == len(self.slots):
-            self.slots.append(Slot(self.fresh(), Sensing.of_bias(np.zeros(len(self.environment.channels)))))
-        slot = self.slots[index]
-        if slot.key == key:
-            return
-        slot.key = b""
-        values = self._values(theta)
-        slot.physical = self._write(slot.model, values, timestep, log)
-        slot.sensing = self.environment.sensing(values, log)
-        self.keep(index)
-        slot.key = key
-
     def _values(self, theta: FloatArray) -> FloatArray:
-        # a number at a time: the last bit of a vectorised exponential may depend on the length of the batch
-        return np.array([p.value(t) for p, t in zip(self.environment.space, theta.tolist(), strict=True)])
+        """Values (n, N) of theta (n, N), each as alone: the last bit of an exponential may depend on the batch."""
+        values = np.empty(theta.shape)
+        for j, parameter in enumerate(self.environment.space):
+            column = theta[:, j]
+            alone = parameter.scale == "log"
+            values[:, j] = [parameter.value(t) for t in column.tolist()] if alone else parameter.value(column)
+        return values
 
     def _write(self, model: mujoco.MjModel, values: FloatArray, timestep: float, log: str | None) -> bool:
         """Write values (N,) and return whether they are physical."""
@@ -130,3 +144,8 @@ class ModelPool:
         if physical and self.environment.needs_constants:
             mujoco.mj_setConst(model, self._scratch)
         return physical
+
+
+def _key(theta: FloatArray, timestep: float, log: str | None) -> bytes:
+    """What tells the contents of slots apart."""
+    return theta.tobytes() + float(timestep).hex().encode() + str(log).encode()

@@ -15,7 +15,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
@@ -27,8 +26,8 @@ from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.task import Task
 from sipe_bayes.simulation.audit import Audit
 from sipe_bayes.simulation.base import Simulated
-from sipe_bayes.simulation.device import Batch, Device, Processor
-from sipe_bayes.simulation.engine import HUGE, Engine
+from sipe_bayes.simulation.device import Batch
+from sipe_bayes.simulation.engine import HUGE
 from sipe_bayes.simulation.episodes import Episodes, Step
 
 _WAVE_NUMBERS = 2**26  # of states and observations that are asked for at once, 512 MiB
@@ -53,13 +52,8 @@ class Simulator(Simulated):
     episodes: Episodes | None = None
 
     def __init__(self, environment: Environment, num_threads: int | None = None, device: str = "cpu") -> None:
-        super().__init__(environment, num_threads)
-        self.device = device
-        self.runs: Device = Processor(self.engine, self.pool) if device == "cpu" else on_gpu(self.engine, device)
+        super().__init__(environment, num_threads, device)
         self.audit = None if device == "cpu" else Audit()
-
-    def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
-        return type(self), (self.environment, self.num_threads, self.device)
 
     @cached_property
     def on_processor(self) -> Simulator:
@@ -128,11 +122,9 @@ class Simulator(Simulated):
         motion = _Recorded.empty(batch, horizon, self)
         with quiet:
             for skip, chunk in self._chunks(steps, horizon):
-                slots = self.runs.pool.take(
-                    theta[chunk], timesteps[chunk], [names[i] for i in chunk], self.runs.own_slots
-                )
+                slots = self.pool.take(theta[chunk], timesteps[chunk], [names[i] for i in chunk], self.runs.own_slots)
                 targets = None if goals is None else goals[chunk]
-                given = Batch(slots, skip, timesteps[chunk], actions[chunk], initial_state[chunk])
+                given = Batch(self.pool, slots, skip, timesteps[chunk], actions[chunk], initial_state[chunk])
                 self._run(motion, chunk, given, targets)
         valid = np.logical_and.accumulate(motion.valid, axis=1)
         self.diverged += int((~valid[:, -1]).sum())
@@ -208,12 +200,8 @@ class Simulator(Simulated):
             allow_outside: whether theta may leave [0, 1].
 
         Raises:
-            ValueError: for a count that is not theta's, wrong theta, or another device than the processor.
+            ValueError: for a count that is not theta's, more than a GPU has room for, or wrong theta.
         """
-        if self.device != "cpu":
-            raise ValueError(
-                f"device: closed loop is stepped on the processor, not on {self.device!r}; use simulator.on_processor"
-            )
         space = self.space
         given = space.default_theta if theta is None else space.check_shape(theta)
         num_envs = (1 if given.ndim == 1 else len(given)) if count is None else count
@@ -291,30 +279,19 @@ class Simulator(Simulated):
 
     def _run(self, motion: _Recorded, chunk: IntArray, batch: Batch, goals: FloatArray | None) -> None:
         """Simulate ``chunk`` into ``motion``."""
-        pool = self.runs.pool
+        pool = batch.pool
         run = pool.physical(batch.slots) & np.isfinite(batch.start).all(1)
         if not run.any():
             return
         at, skip, slots, timesteps = chunk[run], batch.skip, batch.slots[run], batch.timesteps[run]
-        states, derived, valid = self.runs.advance(Batch(slots, skip, timesteps, batch.actions[run], batch.start[run]))
+        given = Batch(pool, slots, skip, timesteps, batch.actions[run], batch.start[run])
+        states, derived, valid = self.runs.advance(given)
         targets = None if goals is None else goals[run, None]
         observations = self.environment.observe(self.model, states, derived, targets)
         seen = pool.sensing(slots).seen(observations, skip * timesteps)
         motion.states[at], motion.observations[at], motion.valid[at] = states, seen, valid
         if derived is not None and motion.derived is not None:
             motion.derived[at] = derived
-
-
-def on_gpu(engine: Engine, device: str) -> Device:
-    """The engine of a GPU; raises ValueError without the packages, the device or what the model needs."""
-    try:
-        from sipe_bayes.simulation.gpu.devices import warp_name
-
-        name = warp_name(device)
-        from sipe_bayes.simulation.gpu.engine import GpuEngine
-    except ModuleNotFoundError as error:
-        raise ValueError(f"device: {error.name} is not installed; `pip install 'sipe-bayes[gpu]'`") from None
-    return GpuEngine(engine, name)
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def test_updates_are_stable_baselines_3s() -> None:
         actions = rng.uniform(-1, 1, (BATCH, done)).astype(np.float32)
         rewards, over = rng.standard_normal(BATCH).astype(np.float32), rng.random(BATCH) < 0.2
         discounts = np.float32(settings.discount) * ~over
-        agent.update(Batch(observations, actions, rewards, discounts, following))
+        agent.update(Batch(*map(torch.from_numpy, (observations, actions, rewards, discounts, following))))
         arrays = (observations, actions, following, np.float32(over)[:, None], rewards[:, None])
         given.append(ReplayBufferSamples(*(torch.from_numpy(a) for a in arrays)))
         model.train(1, BATCH)

@@ -96,11 +96,11 @@ def test_relabelled_rewards_are_those_of_the_goals_that_are_seen() -> None:
     for _ in range(130):
         trainer.advance()
     batch = trainer.replay.sample(np.random.default_rng(0), 4000)
-    goals, after = batch.observations[:, -3:], batch.next_observations[:, -3:]
-    np.testing.assert_array_equal(goals, after)
-    achieved = batch.next_observations[:, 25:28]
-    np.testing.assert_array_equal(batch.returns, task.goal_reward(achieved, goals))
+    seen, after, returns = (x.numpy() for x in (batch.observations, batch.next_observations, batch.returns))
+    goals = seen[:, -3:]
+    np.testing.assert_array_equal(goals, after[:, -3:])
+    np.testing.assert_array_equal(returns, task.goal_reward(after[:, 25:28], goals))
     assert (batch.discounts == np.float32(0.99)).all()  # nothing ends the bootstrap: episodes run out of time only
-    before = task.goal_reward(batch.observations[:, 25:28], goals)
-    assert (before != batch.returns).mean() > 0.01  # the object moved, so the two can be told apart
-    assert 0.2 < (batch.returns == 0).mean() < 0.95
+    before = task.goal_reward(seen[:, 25:28], goals)
+    assert (before != returns).mean() > 0.01  # the object moved, so the two can be told apart
+    assert 0.2 < (returns == 0).mean() < 0.95

@@ -126,13 +126,14 @@ def test_the_estimator_gets_the_reference_under_the_actions_of_training(environm
     )
     np.testing.assert_array_equal(replayed.observations, given.observations)
     replay = run.trainer.replay
+    actions, seen = replay.actions.numpy(), replay.observations.numpy()
     for i in range(2):
-        begins = np.argwhere((replay.actions == given.actions[i, 0].astype(np.float32)).all(-1))
+        begins = np.argwhere((actions == given.actions[i, 0].astype(np.float32)).all(-1))
         (row, lane), *more = begins.tolist()
         assert not more
-        np.testing.assert_array_equal(replay.actions[row : row + HORIZON, lane], np.float32(given.actions[i]))
-        np.testing.assert_array_equal(replay.observations[row, lane], np.float32(given.observations[i, 0]))
-        assert not np.array_equal(replay.observations[row + HORIZON, lane], np.float32(given.observations[i, -1]))
+        np.testing.assert_array_equal(actions[row : row + HORIZON, lane], np.float32(given.actions[i]))
+        np.testing.assert_array_equal(seen[row, lane], np.float32(given.observations[i, 0]))
+        assert not np.array_equal(seen[row + HORIZON, lane], np.float32(given.observations[i, -1]))
     assert (run.trainer.episodes.theta != 0.25).all()
     run.iterate(None)
     np.testing.assert_array_equal(run.trainer.episodes.theta, 0.25)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,11 +67,17 @@ def filled(lanes: int, steps: int, capacity: int = 1000, world: World | None = N
     return replay
 
 
-def places(batch: Batch) -> set[tuple[int, int, int]]:
+def sample(replay: Replay, rng: np.random.Generator, count: int) -> Any:
+    """A batch of NumPy's arrays."""
+    batch = replay.sample(rng, count)
+    return Batch(*(getattr(batch, name).numpy() for name in Batch.__annotations__))
+
+
+def places(batch: Any) -> set[tuple[int, int, int]]:
     return {tuple(row) for row in batch.observations[:, :3].astype(int).tolist()}
 
 
-def check(batch: Batch, n_step: int, newest: dict[int, tuple[int, int]]) -> None:
+def check(batch: Any, n_step: int, newest: dict[int, tuple[int, int]]) -> None:
     """Every row against the world's own rules; newest: (episode, time) that each lane has come to."""
     for k, (lane, episode, time, goal) in enumerate(batch.observations.tolist()):
         length = 4 + int(lane)
@@ -93,7 +100,7 @@ def check(batch: Batch, n_step: int, newest: dict[int, tuple[int, int]]) -> None
 @pytest.mark.parametrize("n_step", [1, 3])
 def test_transitions_are_those_that_happened(lanes: int, n_step: int) -> None:
     world = World(lanes)
-    batch = filled(lanes, 21, world=world, n_step=n_step).sample(np.random.default_rng(0), 2000)
+    batch = sample(filled(lanes, 21, world=world, n_step=n_step), np.random.default_rng(0), 2000)
     newest = {i: (int(world.episode[i]), int(world.time[i])) for i in range(lanes)}
     check(batch, n_step, newest)
     everything = {
@@ -108,7 +115,7 @@ def test_transitions_are_those_that_happened(lanes: int, n_step: int) -> None:
 def test_a_full_ring_forgets_the_oldest() -> None:
     world = World(2)
     replay = filled(2, 500, 60, world)
-    batch = replay.sample(np.random.default_rng(0), 2000)
+    batch = sample(replay, np.random.default_rng(0), 2000)
     check(batch, 1, {i: (int(world.episode[i]), int(world.time[i])) for i in range(2)})
     assert min(e for _, e, _ in places(batch)) > 70
     assert len(places(batch)) == len(replay) <= 60
@@ -116,7 +123,7 @@ def test_a_full_ring_forgets_the_oldest() -> None:
 
 def test_transitions_are_equally_likely() -> None:
     replay = filled(2, 40)
-    batch = replay.sample(np.random.default_rng(0), 40_000)
+    batch = sample(replay, np.random.default_rng(0), 40_000)
     _, counts = np.unique(batch.observations, axis=0, return_counts=True)
     expected = 40_000 / len(replay)
     chi = float(((counts - expected) ** 2 / expected).sum())
@@ -127,10 +134,10 @@ def test_transitions_are_equally_likely() -> None:
 
 def test_hindsight_takes_a_later_goal_of_the_same_episode() -> None:
     world = World(3)
-    drawn = filled(3, 30, world=world, hindsight=4, n_step=2).sample(np.random.default_rng(0), 20_000)
+    drawn = sample(filled(3, 30, world=world, hindsight=4, n_step=2), np.random.default_rng(0), 20_000)
     relabelled = drawn.observations[:, 3] < 1000
     assert abs(relabelled.mean() - 0.8) < 5 * np.sqrt(0.8 * 0.2 / 20_000)
-    chosen = Batch(*(getattr(drawn, name)[relabelled] for name in Batch.__annotations__))
+    chosen: Any = Batch(*(getattr(drawn, name)[relabelled] for name in Batch.__annotations__))
     check(chosen, 2, {i: (int(world.episode[i]), int(world.time[i])) for i in range(3)})
     first = chosen.observations[(chosen.observations[:, 0] == 0) & (chosen.observations[:, 2] == 0)]
     finished = first[first[:, 1] < world.episode[0]]
@@ -140,7 +147,7 @@ def test_hindsight_takes_a_later_goal_of_the_same_episode() -> None:
 
 
 def test_a_diverged_step_is_not_sampled() -> None:
-    batch = filled(2, 30, world=World(2, (1, 1, 2)), n_step=3).sample(np.random.default_rng(0), 2000)
+    batch = sample(filled(2, 30, world=World(2, (1, 1, 2)), n_step=3), np.random.default_rng(0), 2000)
     found = places(batch)
     assert (1, 1, 1) in found
     assert (1, 1, 2) not in found
@@ -157,7 +164,7 @@ def test_demonstrations_are_sampled_as_far_as_they_are_valid() -> None:
     ]
     replay = Replay(2, 1, 100, 2, DISCOUNT)
     replay.add_trajectories(Trajectories.stack(items))
-    batch = replay.sample(rng, 500)
+    batch = sample(replay, rng, 500)
     assert len(replay) == 8
     assert len(np.unique(batch.observations, axis=0)) == 8
     for k, observation in enumerate(batch.observations):
@@ -178,7 +185,7 @@ def test_file_round_trip_goes_on_where_it_was(tmp_path: Path) -> None:
             actions, step = 10.0 * world.time[:, None] + world.episode[:, None], world.step()
             replay.add(actions, step)
             other.add(actions, step)
-        a, b = (r.sample(np.random.default_rng(1), 200) for r in (replay, other))
+        a, b = (sample(r, np.random.default_rng(1), 200) for r in (replay, other))
         for name in Batch.__annotations__:
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 

@@ -36,8 +36,8 @@ def batch(seed: int) -> Batch:
         rng.standard_normal(shape).astype(np.float32)
         for shape in ((BATCH, SEEN), (BATCH, DONE), BATCH, BATCH, (BATCH, SEEN))
     )
-    observations, actions, returns, discounts, following = draws
-    return Batch(observations, actions, returns, np.abs(discounts) / 3, following)
+    observations, actions, returns, discounts, following = map(torch.from_numpy, draws)
+    return Batch(observations, actions, returns, discounts.abs() / 3, following)
 
 
 def plain(sizes: tuple[int, ...], layer_norm: bool) -> nn.Sequential:
@@ -65,7 +65,7 @@ class PlainDdpg:
 
     def update(self, given: Batch) -> None:
         actor, critic, target_actor, target_critic = self.networks
-        s, a, r, d, after = (torch.from_numpy(getattr(given, name)) for name in Batch.__annotations__)
+        s, a, r, d, after = (getattr(given, name) for name in Batch.__annotations__)
         with torch.no_grad():
             y = r + d * target_critic(torch.cat([after, self.squash(target_actor(after))], 1))[:, 0]
             if self.settings.clip_targets:
@@ -132,7 +132,8 @@ def test_actor_finds_the_best_action_of_a_known_reward() -> None:
         observations = rng.uniform(-1, 1, (128, SEEN)).astype(np.float32)
         actions = rng.uniform(-2, 3, (128, DONE)).astype(np.float32)
         returns = -((actions - best(observations)) ** 2).sum(1).astype(np.float32)
-        agent.update(Batch(observations, actions, returns, np.zeros(128, np.float32), observations))
+        seen, done, earned = map(torch.from_numpy, (observations, actions, returns))
+        agent.update(Batch(seen, done, earned, torch.zeros(128), seen))
     assert error(held_out) < 0.25 < 0.5 < before, (error(held_out), before)
 
 
@@ -209,9 +210,9 @@ def test_normaliser_has_the_moments_of_all_it_saw() -> None:
     np.testing.assert_allclose(found.scale, together.std(0), rtol=1e-5)
     other = Normaliser(SEEN, 2.0)
     other.restore(found.state())
-    values = together.astype(np.float32)
+    values = torch.from_numpy(together.astype(np.float32))
     np.testing.assert_array_equal(other.apply(values), found.apply(values))
-    assert np.abs(found.apply(100 * values)).max() == 2
+    assert found.apply(100 * values).abs().max() == 2
 
 
 VARIED = Settings(
@@ -338,7 +339,7 @@ def test_demonstrations_fill_their_share_of_a_batch() -> None:
     assert trainer.agent.updates == 10  # 59 steps and the one that began the second episode
     known = {row.tobytes() for row in np.float32(shown.observations[:, :, :25]).reshape(-1, 25)}
     drawn = trainer._batch()
-    assert sum(row[:25].tobytes() in known for row in drawn.observations) == 10
+    assert sum(row[:25].tobytes() in known for row in drawn.observations.numpy()) == 10
     with pytest.raises(ValueError, match="give both or neither"):
         Trainer(task, settings)
 

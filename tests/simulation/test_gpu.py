@@ -1,7 +1,7 @@
 """The engine of a GPU, run on Warp's own processor device: as MuJoCo in float64, or finding where it is not.
 
-Warp compiles what the arm needs once, for 20 s on one core, and keeps it; one model serves all of these tests. The
-other environments are in ``examples/studies/gpu_agreement.py``.
+Warp compiles what the arm needs once, for 20 s on one core, and 1 to 5 s more for each task, and keeps it. Longer
+rollouts of every task are in ``examples/studies/gpu_agreement.py``.
 """
 
 from __future__ import annotations
@@ -9,15 +9,23 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 import sipe_bayes as sipe
 from sipe_bayes.core.findings import Code
+from sipe_bayes.envs.registry import TASKS
 from sipe_bayes.inference.registry import get_estimator
 from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.models.policy import load_policy
+from sipe_bayes.rl.settings import Settings as Learning
+from sipe_bayes.rl.train import train
+from sipe_bayes.rl.trainer import Trainer
 from sipe_bayes.simulation.audit import spread
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.small_models import CASES, HINGE, PENDULUM, Case, draw, p
@@ -174,10 +182,86 @@ def test_no_such_device(device: Any) -> None:
         Simulator(CASES["pendulum"].environment(), 1, device)
 
 
-def test_closed_loop_is_refused(arm: Simulator) -> None:
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_agrees_or_is_refused_by_name(name: str) -> None:
+    """The middle of the unit cube, and every parameter by itself at 0.9; three control steps."""
+    task = sipe.make_task(name)
+    if name.startswith("Fetch"):
+        with pytest.raises(ValueError, match=f"control of {name} has a memory"):
+            Simulator(task, 1, DEVICE)
+        return
+    if name.startswith("Humanoid"):
+        with pytest.raises(ValueError, match="PGS solver"):
+            Simulator(task, 1, DEVICE)
+        task = with_newton(task)
+    simulator, rng, size = Simulator(task, 1, DEVICE), np.random.default_rng(0), len(task.space)
+    theta = np.full((1 + size, size), 0.5)
+    theta[1 + np.arange(size), np.arange(size)] = 0.9
+    actions = rng.uniform(task.action_low, task.action_high, (1, 3, task.num_actions))
+    starts, goals = task.initial_states(rng, 1)
+    single, again, double = (
+        s.rollout(theta, actions, starts, goals=goals) for s in (simulator, simulator, simulator.on_processor)
+    )
+    np.testing.assert_array_equal(single.observations, again.observations)
+    assert single.valid.all()
+    assert error(single, double).max() < 1e-3
+    moves = [run.observations[1:] - run.observations[:1] for run in (single, double)]
+    assert np.abs(moves[0] - moves[1]).max() < 1e-2 * np.abs(moves[1]).max()
+
+
+def with_newton(task: Any) -> Any:
+    """A task whose model is solved by Newton's method."""
+
+    def compiled(self: Any) -> Any:
+        model = type(task).compile(self)
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        return model
+
+    kind = type(f"Newton{type(task).__name__}", (type(task),), {"compile": compiled})
+    return kind(**{f.name: getattr(task, f.name) for f in fields(task)})
+
+
+def test_closed_loop_is_the_processors_and_its_own_open_loop() -> None:
+    """With theta that change on the way, and rollouts in between."""
     task = sipe.make_task("Pendulum")
-    with pytest.raises(ValueError, match="on_processor"):
-        Simulator(task, 1, DEVICE).reset()
+    simulator, rng = Simulator(task, 1, DEVICE), np.random.default_rng(0)
+    theta, actions = rng.random((3, len(task.space))), rng.uniform(-2, 2, (6, 3, 1))
+    ends = []
+    for engine in (simulator, simulator.on_processor, simulator):
+        seen = [engine.reset(theta, seed=4).observations]
+        episodes = engine.episodes
+        assert episodes is not None
+        start = episodes.states.copy()
+        for t in range(6):
+            step = engine.step(actions[t])
+            seen.append(step.observations)
+            if t == 2:
+                whole = engine.rollout(theta, actions[:3].swapaxes(0, 1), start)
+                np.testing.assert_array_equal(whole.observations[:, -1], step.observations)
+                episodes.set_theta(np.array([1]), 1 - theta[1])
+        assert step.valid.all()
+        ends.append((np.stack(seen), step.rewards))
+    np.testing.assert_array_equal(ends[0][0], ends[2][0])
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-5)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-4)
+    with pytest.raises(ValueError, match="unphysical|theta"):
+        episodes.set_theta(np.array([0]), np.full(len(task.space), -5.0))
+
+
+def test_an_agent_learns_from_worlds_of_the_device(tmp_path: Path) -> None:
+    settings = Learning(hidden=(8, 8), batch=16, start_steps=32, lanes=16, updates_per_step=0.25, normalise=True)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    pace = {"evaluate_every": 96, "evaluation_episodes": 1, "checkpoint_every": 96, "device": DEVICE}
+    train("Pendulum", 192, 0, whole, settings, **pace)
+    train("Pendulum", 96, 0, parts, settings, **pace)
+    train("Pendulum", 192, 0, parts, settings, resume=True, **pace)
+    weights = [load_policy(folder / "policies" / "192.safetensors", "Pendulum").layers for folder in (whole, parts)]
+    for one, other in zip(*weights, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+    with pytest.raises(ValueError, match="another run"):
+        train("Pendulum", 192, 0, parts, settings, resume=True, **{**pace, "device": "cpu"})
+    with pytest.raises(ValueError, match="FetchPush has a memory"):
+        Trainer(sipe.make_task("FetchPush"), settings, device=DEVICE)
 
 
 def test_nothing_of_warp_is_imported_on_the_processor() -> None:

@@ -21,6 +21,7 @@ from sipe_bayes.simulation.engine import HUGE, Engine, Motion
 from sipe_bayes.simulation.gpu.fields import FieldPool
 from sipe_bayes.simulation.gpu.unsupported import Unsupported, check_supported, joined
 from sipe_bayes.simulation.gpu.worlds import Capacity, Recipe, Recording, Worlds, bytes_of_a_world
+from sipe_bayes.simulation.model_pool import ModelPool
 
 _BITS = mujoco_warp.OverflowType
 _SOLVER = int(_BITS.ITERATIONS) | int(_BITS.LS_ITERATIONS)  # it stopped where MuJoCo's own would have
@@ -52,16 +53,16 @@ class GpuEngine:
         environment = engine.environment
         check_supported(environment, engine)
         self.environment, self.engine, self.device = environment, engine, device
-        self.pool = FieldPool(environment, engine.model)
+        self._pool = FieldPool(environment, engine.model)
         names = tuple(environment.data_fields) if environment.data_fields else ("sensordata",)
         derived = names if environment.needs_derived else ()
         late = environment.derived_late or bool(environment.data_fields)
         place = warp.get_device(device)
         self._memory = int(_SHARE * place.free_memory) if place.is_cuda else _HOST
         self._least = _LEAST if place.is_cuda else 1
-        self.recipe = Recipe(
-            self.pool.base, joined(engine.model), environment.control_spec, derived, late, bool(environment.data_fields)
-        )
+        base, resting = self._pool.base, bool(environment.data_fields)
+        self.recipe = Recipe(base, joined(engine.model), environment.control_spec, derived, late, resting)
+        self._width = int(mujoco.mj_stateSize(engine.model, environment.control_spec))
         self.capacity = first_capacity(engine.model)
         self._worlds: OrderedDict[int, Worlds] = OrderedDict()
         try:
@@ -71,20 +72,37 @@ class GpuEngine:
         except (NotImplementedError, ValueError) as error:
             raise Unsupported(f"mujoco-warp can not simulate the model: {error}".rstrip(".")) from None
 
+    def pool(self) -> FieldPool:
+        """See ``Device``."""
+        return self._pool.another()
+
     def most(self, horizon: int, skip: int) -> int:
         """See ``Device``."""
         state = self.engine.physics_size + self.engine.derived_size + int(self.engine.model.nu) + 1
         return max(1, min(_MOST, self._memory // (_SIZES * (2 * self._bytes + 4 * (horizon + 1) * state))))
 
-    def advance(self, batch: Batch) -> Motion:
+    def advance(self, batch: Batch, first: bool = True) -> Motion:
         """See ``Device``; states are as they were last where a simulation is no longer valid."""
-        start, commands = batch.start, self.environment.control(self.engine.model, batch.start, batch.actions)
+        return self._run(batch, self.environment.control(self.engine.model, batch.start, batch.actions))
+
+    def sensors(self, pool: ModelPool, slots: IntArray, states: FloatArray) -> FloatArray:
+        """See ``Device``."""
+        batch = Batch(pool, slots, 1, np.ones(len(states)), np.empty((len(states), 0, 0)), states)
+        motion = self._run(batch, np.empty((len(states), 0, self._width)))
+        assert motion.derived is not None
+        return motion.derived[:, 0]
+
+    def _run(self, batch: Batch, commands: FloatArray) -> Motion:
+        """What a batch does under commands (B, T, U)."""
+        start, pool = batch.start, batch.pool
+        assert isinstance(pool, FieldPool)
         count = padded(len(start), self._least)
         index = np.minimum(np.arange(count), len(start) - 1)
-        rows = self.pool.rows(batch.slots[index])
         given = np.ascontiguousarray(commands[index].swapaxes(0, 1), np.float32)
         while True:
-            recording = self._of(count).run(rows, batch.skip, start[index].astype(np.float32), given)
+            worlds = self._of(count)
+            worlds.write(pool, batch.slots[index])
+            recording = worlds.run(batch.skip, start[index].astype(np.float32), given)
             motion, flags = self._motion(batch, recording)
             if not self._grow(motion, flags):
                 return motion
@@ -94,8 +112,7 @@ class GpuEngine:
         if count not in self._worlds:
             while len(self._worlds) >= _SIZES:
                 self._worlds.popitem(last=False)
-            differing = self.pool.rows(np.zeros(1, int))
-            self._worlds[count] = Worlds(self.recipe, differing, count, self.capacity, self.device)
+            self._worlds[count] = Worlds(self.recipe, self._pool.fields, count, self.capacity, self.device)
         self._worlds.move_to_end(count)
         return self._worlds[count]
 

@@ -7,6 +7,7 @@ the unit cube once.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -50,11 +51,25 @@ class FieldPool(ModelPool):
         Unsupported: for a parameter that mujoco-warp does not let differ between worlds.
     """
 
+    version: int
+    _room: int
+    _rows: dict[Field, Float32Array]
+    _options: list[Field]
+    _arrays: list[tuple[Field, NDArray[np.generic]]]
+    _targets: list[tuple[Float32Array, NDArray[np.generic]]]
+
     def __init__(self, environment: Environment, model: mujoco.MjModel) -> None:
         super().__init__(environment, model)
         self.written_model = super().fresh()
         self.fields, self.base = self._varying()
-        self._rows = {field: np.empty((0, *field.of(model).shape), np.float32) for field in self.fields}
+        self._empty()
+
+    def another(self) -> FieldPool:
+        """One with slots of its own."""
+        other = copy.copy(self)
+        other.slots = []
+        other._empty()
+        return other
 
     def fresh(self) -> mujoco.MjModel:
         """All slots share one model."""
@@ -62,17 +77,30 @@ class FieldPool(ModelPool):
 
     def keep(self, index: int) -> None:
         """Keep the fields of the model that has been written."""
-        for field, rows in self._rows.items():
-            now = field.of(self.written_model)
-            if index >= len(rows):
-                more = np.empty((max(64, 2 * len(rows), index + 1), *now.shape), np.float32)
+        self.version += 1
+        if index >= self._room:
+            self._room = max(64, 2 * self._room, index + 1)
+            for field, rows in self._rows.items():
+                more = np.empty((self._room, *rows.shape[1:]), np.float32)
                 more[: len(rows)] = rows
-                rows = self._rows[field] = more
+                self._rows[field] = more
+            self._targets = [(self._rows[field], now) for field, now in self._arrays]
+        for rows, now in self._targets:
             rows[index] = now
+        for field in self._options:
+            self._rows[field][index] = field.of(self.written_model)
 
     def rows(self, slots: IntArray) -> dict[Field, Float32Array]:
         """The fields of slots (W,), each (W, ...)."""
         return {field: rows[slots] for field, rows in self._rows.items()}
+
+    def _empty(self) -> None:
+        """No rows yet; ``version`` counts what has been written into them."""
+        self.version, self._room = 0, 0
+        self._rows = {field: np.empty((0, *field.of(self.model).shape), np.float32) for field in self.fields}
+        self._options = [field for field in self.fields if field.option]
+        self._arrays = [(field, field.of(self.written_model)) for field in self.fields if not field.option]  # views
+        self._targets = []
 
     def _varying(self) -> tuple[list[Field], mujoco.MjModel]:
         """The fields that can differ, and a model that is zero in them only where it always is.
@@ -84,7 +112,7 @@ class FieldPool(ModelPool):
         different: dict[Field, None] = {}
         places: FloatArray | None = None
         for theta in _examples(len(self.environment.space)):
-            values = self._values(theta)
+            values = self._values(theta[None])[0]
             if not self._write(model, values, float(self.model.opt.timestep), None):
                 continue
             if not first:

@@ -5,7 +5,7 @@ On CUDA a control step is captured once as a graph: commands in, k physics steps
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ import numpy as np
 import warp
 from numpy.typing import NDArray
 
-from sipe_bayes.core.arrays import Float32Array
-from sipe_bayes.simulation.gpu.fields import Field
+from sipe_bayes.core.arrays import Float32Array, IntArray
+from sipe_bayes.simulation.gpu.fields import Field, FieldPool
 from sipe_bayes.simulation.gpu.kernels import keep_flags, stream_in, stream_out, stream_out_first, tick
 
 _PARTS = {  # of states and commands, by the bits that put them in order
@@ -92,9 +92,7 @@ class Worlds:
         device: Warp's name of it.
     """
 
-    def __init__(
-        self, recipe: Recipe, differing: Mapping[Field, Float32Array], count: int, capacity: Capacity, device: str
-    ) -> None:
+    def __init__(self, recipe: Recipe, differing: Sequence[Field], count: int, capacity: Capacity, device: str) -> None:
         self.recipe, self.count, self.capacity = recipe, count, capacity
         self.device = warp.get_device(device)
         with warp.ScopedDevice(self.device):
@@ -115,14 +113,26 @@ class Worlds:
             self._derived = self._columns(recipe.derived)
             self._moment = warp.zeros(1, dtype=int)
         self._horizon, self._graphs = -1, dict[int, warp.Graph]()
+        self._written: tuple[FieldPool, int, bytes] | None = None
 
-    def run(
-        self, rows: Mapping[Field, Float32Array], skip: int, start: Float32Array, commands: Float32Array
-    ) -> Recording:
+    def write(self, pool: FieldPool, slots: IntArray) -> None:
+        """The fields of slots (W,), unless the worlds have them already."""
+        wanted = (pool, pool.version, slots.tobytes())
+        if self._written is not None and self._written[0] is pool and self._written[1:] == wanted[1:]:
+            return
+        self._written = None
+        with warp.ScopedDevice(self.device):
+            for field, values in pool.rows(slots).items():
+                if field.name == "impratio":
+                    values = np.sqrt(1 / np.maximum(values, mujoco.mjMINVAL)).astype(np.float32)
+                target = getattr(self.model.opt if field.option else self.model, _option(field))
+                target.assign(values.reshape(target.shape + getattr(target.dtype, "_shape_", ())))
+        self._written = wanted
+
+    def run(self, skip: int, start: Float32Array, commands: Float32Array) -> Recording:
         """Simulate.
 
         Args:
-            rows: the fields of each world, (W, ...).
             skip: physics steps of a control step.
             start: (W, S).
             commands: (T, W, U).
@@ -130,10 +140,10 @@ class Worlds:
         horizon = len(commands)
         with warp.ScopedDevice(self.device):
             self._make_room(horizon)
-            self._write(rows)
             self._begin(start)
-            graph = self._graph(skip, start)
-            self._commands[:horizon].assign(commands)
+            graph = self._graph(skip, start) if horizon else None
+            if horizon:
+                self._commands[:horizon].assign(commands)
             if self.recipe.resting:
                 self._forward()
             for _ in range(horizon):
@@ -141,7 +151,7 @@ class Worlds:
                     self._control_step(skip)
                 else:
                     warp.capture_launch(graph)
-            if self.recipe.derived and not self.recipe.late:
+            if self.recipe.derived and (not self.recipe.late or (not horizon and not self.recipe.resting)):
                 self._forward()
             recorded = (self._kept, self._kept_derived, self._flags)
             states, derived, flags = (kept[: horizon + 1].numpy() for kept in recorded)
@@ -168,14 +178,6 @@ class Worlds:
         self._kept = warp.zeros((horizon + 1, self.count, _width(self._state)), dtype=float)
         self._kept_derived = warp.zeros((horizon + 1, self.count, max(1, _width(self._derived))), dtype=float)
         self._flags = warp.zeros((horizon + 1, self.count), dtype=int)
-
-    def _write(self, rows: Mapping[Field, Float32Array]) -> None:
-        for field, values in rows.items():
-            if field.name == "impratio":
-                values = np.sqrt(1 / np.maximum(values, mujoco.mjMINVAL)).astype(np.float32)
-            target = getattr(self.model.opt if field.option else self.model, _option(field))
-            inner = getattr(target.dtype, "_shape_", ())
-            target.assign(values.reshape(target.shape + inner))
 
     def _begin(self, start: Float32Array) -> None:
         mujoco_warp.reset_data(self.model, self.data)
