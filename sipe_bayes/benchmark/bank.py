@@ -40,11 +40,13 @@ class Bank:
     variant: Variant
     seed: int
     steps: int
+    device: str = "cpu"
 
     @property
     def id(self) -> str:
-        """Such as ``Door/in_distribution/seed0/100``."""
-        return f"{self.task}/{self.variant}/seed{self.seed}/{self.steps}"
+        """Such as ``Door/in_distribution/seed0/100``, with the device where it is not the processor."""
+        own = f"{self.task}/{self.variant}/seed{self.seed}/{self.steps}"
+        return own if self.device == "cpu" else f"{own}/{self.device}"
 
 
 @dataclass(frozen=True)
@@ -65,13 +67,15 @@ def _shard(path: Path) -> _Shard:
 class _Blocks(Cache):
     """A cache whose blocks are made in any order."""
 
-    def block(self, number: int, rows: int) -> Simulations:
-        """The first rows of a block, read or made."""
-        self._blocks = [self._none()] * number
-        self._blocks.append(self._read(number) or self._none())
-        if len(self._blocks[number]) < rows:
-            self._extend({number: rows})
-        return self._blocks[number]
+    def fill(self, rows: dict[int, int]) -> list[Simulations]:
+        """The first rows of blocks, read or made together."""
+        self._blocks = [self._none()] * (max(rows) + 1)
+        for number in rows:
+            self._blocks[number] = self._read(number) or self._none()
+        short = {number: wanted for number, wanted in rows.items() if len(self._blocks[number]) < wanted}
+        if short:
+            self._extend(short)
+        return [self._blocks[number] for number in rows]
 
     def path(self, number: int) -> str:
         """Of a block, in the folder of results."""
@@ -81,7 +85,7 @@ class _Blocks(Cache):
 @lru_cache(maxsize=2)
 def _opened(bank: Bank, folder: Path) -> _Blocks:
     log = recorded(bank.task, bank.variant, bank.seed, bank.steps)
-    simulator = Simulator(make_task(bank.task), num_threads=1)
+    simulator = Simulator(make_task(bank.task), 1, bank.device)
     starts = first_states(simulator, log.trajectories)
     return _Blocks(simulator, prior(simulator.space), log.trajectories, starts, bank.seed, folder)
 
@@ -102,15 +106,16 @@ def known_place(bank: Bank, folder: Path) -> Path | None:
     return folders.pop() if len(folders) == 1 else None
 
 
-def shards(bank: Bank, budget: int, made: Path | None, size: int = 4) -> list[Unit]:
+def shards(bank: Bank, budget: int, made: Path | None, size: int | None = None) -> list[Unit]:
     """What is to be simulated of the first rows of a bank.
 
     Args:
         bank: which.
         budget: rows.
         made: where blocks lie already.
-        size: blocks of a shard.
+        size: blocks of a shard; default 4, or 80 for a GPU, which takes them all at once.
     """
+    size = size or (4 if bank.device == "cpu" else 80)
     rows = [min(BLOCK, budget - start) for start in range(0, whole("budget", budget), BLOCK)]
     missing = [k for k, count in enumerate(rows) if made is None or _rows(made / f"block-{k:06d}.npz") < count]
     return [
@@ -144,7 +149,7 @@ def _simulate(bank: Bank, blocks: list[tuple[int, int]]) -> Done:
     with TemporaryDirectory() as made_in:
         made = _opened.__wrapped__(bank, Path(made_in))
         assert made.folder is not None
-        invalid = sum(int((~made.block(k, rows).valid).sum()) for k, rows in blocks)
+        invalid = sum(int((~part.valid).sum()) for part in made.fill(dict(blocks)))
         files = [(made.path(k), (made.folder / f"block-{k:06d}.npz").read_bytes()) for k, _ in blocks]
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     rows = sum(count for _, count in blocks)

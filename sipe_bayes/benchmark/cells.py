@@ -116,6 +116,7 @@ class Cell:
         steps: control steps of the trajectory; None for an episode or its first 250, the humanoid's and the hand's
             first 100.
         training: control steps of the agent's training, of the settings with a policy.
+        device: that simulates, as ``Simulator`` has them.
     """
 
     task: str
@@ -127,6 +128,7 @@ class Cell:
     budget: int = 1000
     steps: int | None = None
     training: int = 100_000
+    device: str = "cpu"
 
     @property
     def id(self) -> str:
@@ -344,17 +346,22 @@ def matches(cell_id: str, pattern: str) -> bool:
 
 
 def changed(
-    cells: Sequence[Cell], budget: int | None = None, steps: int | None = None, training: int | None = None
+    cells: Sequence[Cell],
+    budget: int | None = None,
+    steps: int | None = None,
+    training: int | None = None,
+    device: str = "cpu",
 ) -> list[Cell]:
-    """Cells with another budget, length or training, where one is given.
+    """Cells with another budget, length, training or device, where one is given.
 
     Args:
         cells: which cells.
         budget: rollouts.
         steps: control steps of the trajectory.
         training: control steps of the agent's training.
+        device: that simulates, as ``Simulator`` has them.
     """
-    asked = {"budget": budget, "steps": steps, "training": training}
+    asked = {"budget": budget, "steps": steps, "training": training, "device": device}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     return [replace(cell, **given) for cell in cells]
 

@@ -61,7 +61,7 @@ class EstimateMeasurement(Measurement[Record]):
     def measured(self, cell: Cell, record: Record, folder: Path) -> tuple[Record, Files, str]:
         """See ``Measurement``."""
         log = recorded(cell.task, cell.variant, cell.seed, cell.horizon, cell.split)
-        simulator = Simulator(make_task(cell.task), num_threads=1)
+        simulator = Simulator(make_task(cell.task), 1, cell.device)
         if cell.estimator in BASELINES:
             record, space = replace(record, seconds=0.0, cpu_seconds=0.0), simulator.space
             posterior: Posterior = prior(space) if cell.estimator == "prior" else Dirac([0.5] * len(space), space)

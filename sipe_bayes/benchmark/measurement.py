@@ -117,6 +117,7 @@ def entries(cell: Cell, command: str) -> dict[str, object]:
         "versions": versions(),
         "checksums": {"source": source()},
         "command": command,
+        "device": cell.device,
     }
 
 

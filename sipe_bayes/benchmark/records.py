@@ -73,13 +73,14 @@ class Record:
         versions: of the packages that numbers depend on.
         checksums: of model, log and this package's source.
         command: that made the record.
+        device: that simulated.
     """
 
     FOLDER: ClassVar[str] = ""  # of records and plan, in a folder of results
     NONE: ClassVar[str] = "no records; make some with `sipe benchmark run --suite quick"
     NEVER: ClassVar[str] = "no run was started in it; start one with `sipe benchmark run --suite quick"
     # alike in all runs of a cell in one folder:
-    FIXED: ClassVar[tuple[str, ...]] = ("budget", "steps", "training", "agent", "versions")
+    FIXED: ClassVar[tuple[str, ...]] = ("budget", "steps", "training", "agent", "device", "versions")
 
     id: str
     task: str
@@ -112,6 +113,7 @@ class Record:
     versions: dict[str, str] = field(default_factory=dict)
     checksums: dict[str, str] = field(default_factory=dict)
     command: str = ""
+    device: str = "cpu"
 
     @property
     def done(self) -> bool:

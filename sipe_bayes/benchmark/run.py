@@ -220,7 +220,7 @@ def bank_of(cell: Cell) -> Bank | None:
     alone = cell.estimator in BASELINES or cell.with_policy or cell.split != "reference"
     if alone or not issubclass(estimator_class(cell.estimator), PriorSampling):
         return None
-    return Bank(cell.task, cell.variant, cell.seed, cell.horizon)
+    return Bank(cell.task, cell.variant, cell.seed, cell.horizon, cell.device)
 
 
 def _carried_out(units: Sequence[Unit], order: Order) -> int:

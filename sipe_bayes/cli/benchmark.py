@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sipe_bayes.cli.check import SimulatedOn
 from sipe_bayes.cli.errors import check_least, check_one_of, command_line, exit_on_error
 from sipe_bayes.cli.studies import (
     Address,
@@ -70,14 +71,15 @@ def run(
     jobs: Jobs = None,
     executor: Where = "pool",
     address: Address = None,
+    device: SimulatedOn = "cpu",
     retry_failed: Retry = False,
 ) -> None:
     """Measure the cells of a suite that have no record yet; exit code 1 if one failed."""
     with exit_on_error("; the same command goes on"):
         check_least(1, budget=budget, steps=steps, training=training, jobs=jobs)
         study = _study()
-        cells = chosen(study, suite, select, budget, steps, training)
-        measure(study, cells, out, executor_of(executor, jobs, address), retry_failed)
+        cells = chosen(study, suite, select, budget, steps, training, device)
+        measure(study, cells, out, executor_of(executor, jobs, address, device), retry_failed)
 
 
 def simulate(
@@ -96,6 +98,7 @@ def simulate(
     jobs: Jobs = None,
     executor: Where = "pool",
     address: Address = None,
+    device: SimulatedOn = "cpu",
 ) -> None:
     """Simulate the prior for the estimators that learn from it, in shards, which `sipe benchmark run --out` finds."""
     with exit_on_error("; the same command goes on"):
@@ -109,9 +112,9 @@ def simulate(
         check_one_of("variant", variant, VARIANTS)
         (replayed,) = (v for v in VARIANTS if v == variant)
         horizon = Cell(environment, "prior", variant=replayed, seed=seed, steps=steps).horizon
-        which = bank.Bank(environment, replayed, seed, horizon)
+        which = bank.Bank(environment, replayed, seed, horizon, device)
         if not verify:
-            order = runs.Order(out, executor_of(executor, jobs, address), command_line(), report=say)
+            order = runs.Order(out, executor_of(executor, jobs, address, device), command_line(), report=say)
             runs.simulate(which, budget, order)
         wrong = bank.verify(which, budget, out)
     for line in wrong:

@@ -22,7 +22,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object and 
 OneSuite = Annotated[str | None, typer.Argument(help="Without one, the suites.")]
 Select = Annotated[list[str] | None, typer.Option(help="As of `run`.")]
 Retry = Annotated[bool, typer.Option("--retry-failed", help="Measure failed cells again.")]
-Jobs = Annotated[int | None, typer.Option(help="Processes of one thread each; default all cores.")]
+Jobs = Annotated[int | None, typer.Option(help="Processes of one thread each; default all cores, 1 on a GPU.")]
 Where = Annotated[
     str, typer.Option(help="pool: processes of this machine; ray: a cluster; inline: this process alone.")
 ]
@@ -61,13 +61,14 @@ def chosen(
     budget: int | None,
     steps: int | None,
     training: int | None,
+    device: str = "cpu",
 ) -> Sequence[Cell]:
     """The cells of a suite that the options ask for; raises ValueError where none is named, as most take hours."""
     from sipe_bayes.benchmark.cells import changed
 
     if suite is None:
         raise ValueError("--suite: expected the name of one, such as --suite quick; the cells command lists them")
-    return changed(study.select(suite, select or ()), budget, steps, training)
+    return changed(study.select(suite, select or ()), budget, steps, training, device)
 
 
 def measure(study: Study, cells: Sequence[Cell], out: Path, start: Callable[[], Executor], retry_failed: bool) -> None:
@@ -87,8 +88,11 @@ def measure(study: Study, cells: Sequence[Cell], out: Path, start: Callable[[], 
         raise typer.Exit(1)
 
 
-def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[], Executor]:
-    """What makes the executor of a name; raises ValueError for options that do not go together."""
+def executor_of(name: str, jobs: int | None, address: str | None, device: str = "cpu") -> Callable[[], Executor]:
+    """What makes the executor of a name; raises ValueError for options that do not go together.
+
+    Processes of one machine share its GPU: by default there is one. On a cluster each unit has a GPU to itself.
+    """
     from sipe_bayes.core.validation import cores
 
     if address is not None and name != "ray":
@@ -98,12 +102,12 @@ def executor_of(name: str, jobs: int | None, address: str | None) -> Callable[[]
     if name == "ray":
         from sipe_bayes.benchmark.executors.ray_executor import RayExecutor
 
-        return lambda: RayExecutor(address)
+        return lambda: RayExecutor(address, on_gpus=device.startswith("cuda"))
     from sipe_bayes.benchmark.executors.pool import Inline, Pool
 
     if name not in ("pool", "inline"):
         raise ValueError(f"--executor {name}: expected pool, ray or inline")
-    return Inline if name == "inline" else lambda: Pool(jobs or cores())
+    return Inline if name == "inline" else lambda: Pool(jobs or (cores() if device == "cpu" else 1))
 
 
 def say(line: str) -> None:

@@ -206,9 +206,8 @@ class Replay:
     def save(self, path: Path) -> None:
         """Write an npz file of what is filled, atomically."""
         used = min(self.head + 1, self.rows)
-        arrays: dict[str, Any] = {
-            name: np.asarray(torch.as_tensor(getattr(self, name)[:used]).cpu()) for name in _STORED
-        }
+        filled = {name: torch.as_tensor(getattr(self, name)[:used]) for name in _STORED}
+        arrays: dict[str, Any] = {name: part.cpu().numpy() for name, part in filled.items()}
         arrays |= {"head": np.array(self.head), "starts": self._starts, "over": self._over, "rows": np.array(self.rows)}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)

@@ -148,7 +148,7 @@ def test_demonstrations_are_learnt_from_and_tell_runs_apart() -> None:
     for run, i in ((one, 0), (other, 1)):
         run.iterate(None)
         known = {row.tobytes() for row in np.float32(shown.actions[i])}
-        assert sum(row.tobytes() in known for row in run.trainer._batch().actions) >= 2  # of 8
+        assert sum(row.tobytes() in known for row in run.trainer._batch().actions.numpy()) >= 2  # of 8
     with pytest.raises(ValueError, match=r"demonstration_share: 0\.25 with demonstrations missing"):
         LoopRun(told(of), "default", plan, 1)
 

@@ -160,7 +160,7 @@ def test_observations_are_noisy_by_an_episode_of_its_own() -> None:
     np.testing.assert_allclose(share[:, 0], share[:, 1], rtol=0.5)
     assert ((share > 0) & (share < 1.25)).all()
     assert np.ptp(share[:, 0]) > 0.2
-    kept = trainer.replay.observations[: trainer.replay.head + 1]
+    kept = trainer.replay.observations[: trainer.replay.head + 1].numpy()
     np.testing.assert_array_equal(kept[1:], np.array(found.seen, np.float32))
 
 
@@ -168,7 +168,7 @@ def test_one_number_leaves_the_desired_goal_alone() -> None:
     task = sipe.make_task("FetchPush")
     trainer = Trainer(task, replace(SMALL, start_steps=10**9), 0, Randomization(prior(task.space), 0.1))
     trainer.advance()
-    noise = trainer.replay.observations[1] - trainer.episodes.observations.astype(np.float32)
+    noise = trainer.replay.observations[1].numpy() - trainer.episodes.observations.astype(np.float32)
     assert (noise[:, -3:] == 0).all()
     assert (noise[:, :-3] != 0).all()
 

@@ -23,12 +23,15 @@ class RayExecutor:
         address: HOST:PORT of a cluster, or None for one on this machine.
         retries: times that a unit is begun again when its node dies.
         patience: seconds for the cluster's port to answer.
+        on_gpus: whether each unit gets a GPU of the cluster to itself, beside its CPU.
 
     Raises:
-        ValueError: where there is no such cluster.
+        ValueError: where there is no such cluster, or no GPU in it.
     """
 
-    def __init__(self, address: str | None = None, retries: int = 5, patience: float = 5.0) -> None:
+    def __init__(
+        self, address: str | None = None, retries: int = 5, patience: float = 5.0, on_gpus: bool = False
+    ) -> None:
         if address is not None:
             _check_answers(address, patience)
         try:
@@ -43,8 +46,13 @@ class RayExecutor:
             )
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ValueError(f"--address {address}: {error}; start a cluster with `ray start --head`") from None
-        self.workers = int(ray.cluster_resources().get("CPU", 1))
-        remote = ray.remote(num_cpus=1, max_retries=retries, runtime_env={"env_vars": ONE_THREAD})
+        self.workers = int(ray.cluster_resources().get("GPU" if on_gpus else "CPU", 0 if on_gpus else 1))
+        if not self.workers:
+            ray.shutdown()
+            raise ValueError("--executor ray: the cluster has no GPU; leave --device out, or start nodes that have one")
+        remote = ray.remote(
+            num_cpus=1, num_gpus=int(on_gpus), max_retries=retries, runtime_env={"env_vars": ONE_THREAD}
+        )
         self._call = remote(_call)
         self._running: dict[Any, Unit] = {}
 
