@@ -2,6 +2,7 @@
 
     python examples/studies/gpu_speed.py                    # HumanoidJoints and HalfCheetahLinks on cuda
     python examples/studies/gpu_speed.py --million          # a million rollouts of 200 half-cheetah steps
+    python examples/studies/gpu_speed.py --train            # DDPG on HalfCheetahLinks, 4,096 lanes
     python examples/studies/gpu_speed.py --device warp:cpu --worlds 64 --steps 4 --task Pendulum  # a try
 
 `writing` is the processor's share: theta written into fields one after the other. `bare` is mujoco-warp's own step on
@@ -24,6 +25,8 @@ from gpu_agreement import newton
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
+from sipe_bayes.rl.settings import Settings
+from sipe_bayes.rl.trainer import Trainer
 from sipe_bayes.simulation.gpu.devices import warp_name
 
 RESULT = Path(__file__).parent / "results" / "gpu_speed.json"
@@ -78,7 +81,7 @@ def measured(name: str, worlds: int, steps: int, device: str) -> dict[str, Any]:
     ours = min(seconds(simulator, inputs) for _ in range(3))
     grown = before - memory(device)
     begin = time.perf_counter()
-    simulator.runs.pool.take(inputs[0][::-1], np.full(worlds, simulator.model.opt.timestep), [None] * worlds)
+    simulator.pool.take(inputs[0][::-1], np.full(worlds, simulator.model.opt.timestep), [None] * worlds)
     writing = time.perf_counter() - begin
     alone, physics = bare(simulator, worlds, steps, warp_name(device)), worlds * steps * task.frame_skip
     few = tuple(x[:PROCESSOR] for x in inputs)
@@ -122,6 +125,31 @@ def million(device: str, rollouts: int, steps: int) -> dict[str, Any]:
     }
 
 
+def trained(name: str, lanes: int, device: str, steps: int) -> dict[str, Any]:
+    """Control steps a second of a training: worlds, replay buffer and networks on the device; four updates a step."""
+    task = sipe.make_task(name)
+    settings = Settings(
+        lanes=lanes,
+        capacity=2 * lanes * task.episode_steps,
+        start_steps=0,
+        batch=min(4096, lanes),
+        updates_per_step=4 / lanes,
+        normalise=True,
+    )
+    trainer = Trainer(task, settings, device=device)
+    for _ in range(3):  # compiles
+        trainer.advance()
+    begin = time.perf_counter()
+    for _ in range(steps):
+        trainer.advance()
+    return {
+        "lanes": lanes,
+        "batch": settings.batch,
+        "updates": 4 * steps,
+        "control_steps_per_s": round(lanes * steps / (time.perf_counter() - begin)),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
@@ -129,6 +157,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="*", default=[4096, 16384, 65536])
     parser.add_argument("--steps", type=int, default=100, help="control steps")
     parser.add_argument("--million", type=int, nargs="?", const=1_000_000, default=0)
+    parser.add_argument("--train", action="store_true")
     given = parser.parse_args()
     if given.device.startswith("cuda") and not warp.is_cuda_available():
         print(f"{given.device}: there is no such GPU here, nothing is measured")
@@ -138,7 +167,11 @@ def main() -> None:
     if given.million:
         rows["HalfCheetahLinks, a million"] = made = million(given.device, given.million, 200)
         print(json.dumps(made), flush=True)
-    for name in [] if given.million else given.task:
+    if given.train:
+        for lanes in given.worlds:
+            rows[f"training, {lanes} lanes"] = made = trained("HalfCheetahLinks", lanes, given.device, given.steps)
+            print(lanes, json.dumps(made), flush=True)
+    for name in [] if given.million or given.train else given.task:
         for worlds in given.worlds:
             rows[f"{name}, {worlds} worlds"] = row = measured(name, worlds, given.steps, given.device)
             print(name, worlds, json.dumps(row), flush=True)

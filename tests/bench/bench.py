@@ -26,6 +26,7 @@ import arm
 import batch
 import ddpg
 import envs
+import executors
 import fits
 import laws
 import mdn
@@ -244,7 +245,7 @@ def chain() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
-        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws"),
+        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws", "executors"),
         *("discover", "transfer", "shapes"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
@@ -269,6 +270,8 @@ def main() -> None:
             fits.table()
         elif name == "ddpg":
             ddpg.table(given.pairs, side_by_side)
+        elif name == "executors":
+            executors.table()
         elif name == "laws":
             laws.table(given.pairs, side_by_side)
         elif name == "discover":
