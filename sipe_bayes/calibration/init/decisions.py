@@ -56,6 +56,7 @@ class Layout:
 
     channels: tuple[tuple[int, ...], ...]  # of each reading; empty where the trial has none
     commands: tuple[int | None, ...]
+    minus: tuple[tuple[int, int], ...] = ()  # as assumptions have it
 
     def assumption(self, trial: Trial, draft: Draft, readings: Sequence[Reading]) -> Assumption:
         """What other units and signs mean for what was read as the draft says."""
@@ -67,7 +68,7 @@ class Layout:
             command = self.commands[k]
             if command is not None:
                 driven[command] *= factor
-        return replace(trial.given, observed=tuple(observed), driven=tuple(driven))
+        return replace(trial.given, observed=tuple(observed), driven=tuple(driven), minus=self.minus)
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def _is_tried(draft: Draft, reading: Reading) -> bool:
 
 
 @dataclass(frozen=True)
-class _Ranking:
+class Ranking:
     """Answers that were tried (H tuples), the logarithm of what each misses in all channels together (H,)."""
 
     answers: list[tuple[Answer, ...]]
@@ -160,6 +161,7 @@ class _Ranking:
 
     @property
     def best(self) -> int:
+        """Which misses least."""
         return int(np.argmin(self.scores))
 
     def gap(self, question: int, answer: Answer) -> float:
@@ -179,7 +181,7 @@ def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draf
     if not asked:
         return draft
     case = Case(draft, machine, trial, layout, trial.theta)
-    ranking = _ranked(case, asked)
+    ranking = ranked(case, asked)
     flies = bool(trial.simulator.environment.rotations)  # what its contacts do is not seen in short windows
     rivals = [] if flies else _rivals(ranking, len(trial.given.observed))
     if rivals:
@@ -208,7 +210,7 @@ def _turned(sign: Answer) -> int:
     return -1 if sign == 1 else 1
 
 
-def _mirrored(asked: Sequence[Question], ranking: _Ranking, readings: Sequence[Reading]) -> list[str]:
+def _mirrored(asked: Sequence[Question], ranking: Ranking, readings: Sequence[Reading]) -> list[str]:
     """Signs that may be turned round together."""
     groups: list[frozenset[int]] = []
     for q, question in enumerate(asked):
@@ -236,7 +238,7 @@ def _answered(readings: Sequence[Reading], asked: Sequence[Question], answers: S
     return tuple(out)
 
 
-def _ranked(case: Case, asked: Sequence[Question]) -> _Ranking:
+def ranked(case: Case, asked: Sequence[Question]) -> Ranking:
     """All combinations, or where they are too many the best that changing one or two answers at a time leads to."""
     count = int(np.prod([len(q.answers) for q in asked]))
     if count <= _MOST:
@@ -252,7 +254,7 @@ def _ranked(case: Case, asked: Sequence[Question]) -> _Ranking:
         tried = _tried(case, asked, fresh)
         seen |= dict(zip(tried.answers, tried.scores.tolist(), strict=True))
         now = min(seen, key=lambda a: seen[a])
-    return _Ranking(list(seen), np.array(list(seen.values())))
+    return Ranking(list(seen), np.array(list(seen.values())))
 
 
 def _neighbours(now: tuple[Answer, ...], asked: Sequence[Question]) -> list[tuple[Answer, ...]]:
@@ -268,12 +270,12 @@ def _neighbours(now: tuple[Answer, ...], asked: Sequence[Question]) -> list[tupl
     return out
 
 
-def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[Answer, ...]]) -> _Ranking:
+def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[Answer, ...]]) -> Ranking:
     sets = [_answered(case.draft.readings, asked, a) for a in answers]
     misses = np.concatenate([case.misses(sets[i : i + 64]) for i in range(0, len(sets), 64)])
     scores = np.log(misses).sum(axis=-1) + np.array([_odd_sizes(case, readings) for readings in sets])
     scores += [_unlikely(asked, a) for a in answers]
-    return _Ranking(answers, scores)
+    return Ranking(answers, scores)
 
 
 def _odd_sizes(case: Case, readings: Sequence[Reading]) -> float:
@@ -288,7 +290,7 @@ def _odd_sizes(case: Case, readings: Sequence[Reading]) -> float:
     return odd
 
 
-def _rivals(ranking: _Ranking, channels: int) -> list[int]:
+def _rivals(ranking: Ranking, channels: int) -> list[int]:
     """Combinations that miss hardly more than the best, and are no mirror images; the best ones where all miss much."""
     order = [int(i) for i in np.argsort(ranking.scores, kind="stable")]
     behind = ranking.scores - ranking.scores[order[0]]
@@ -303,7 +305,7 @@ def _rivals(ranking: _Ranking, channels: int) -> list[int]:
     return list(dict.fromkeys([*near[:_FITTED], *(i for i in units.values() if behind[i] < _FAR)]))
 
 
-def _fitted(case: Case, asked: Sequence[Question], ranking: _Ranking, rivals: list[int]) -> tuple[_Ranking, FloatArray]:
+def _fitted(case: Case, asked: Sequence[Question], ranking: Ranking, rivals: list[int]) -> tuple[Ranking, FloatArray]:
     """The ranking with the model's unknowns fitted to the rivals, and these of the best.
 
     The others stay as far behind the worst of the rivals as they were.
@@ -321,14 +323,14 @@ def _fitted(case: Case, asked: Sequence[Question], ranking: _Ranking, rivals: li
     rest = [i for i in range(len(ranking.answers)) if i not in rivals]
     shift = max(scores) - float(ranking.scores[rivals].max())
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
-    ranked = _Ranking(answers, np.array(scores + (ranking.scores[rest] + shift).tolist()))
+    ranked = Ranking(answers, np.array(scores + (ranking.scores[rest] + shift).tolist()))
     return ranked, thetas[int(np.argmin(scores))]
 
 
 def _with_evidence(
     case: Case,
     asked: Sequence[Question],
-    ranking: _Ranking,
+    ranking: Ranking,
     q: int,
     readings: list[Reading],
     base: FloatArray,

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from sipe_bayes.calibration.init.absolute import absolute_angles
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
@@ -227,6 +228,7 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
     rest = tuple(r for r in draft.measurements if r not in part.measurements)
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
     trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
+    against_world = absolute_angles(part, model, machine, trial, layout)
     part = decide(part, machine, trial, layout)
     logs = loaded(part, sources, folder)
     unknowns, delay, notes = _unknowns(part, model, machine, logs, folder)
@@ -234,7 +236,7 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
     window, why = _window(machine, logs, trial)
     return replace(
         part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
-        notes=(*draft.notes, *notes), doubts=(*part.doubts, *doubts), delay=delay,
+        notes=(*draft.notes, *notes), doubts=(*against_world, *part.doubts, *doubts), delay=delay,
     )  # fmt: skip
 
 

@@ -40,6 +40,7 @@ class Assumption:
         delay: control steps by which commands arrive later.
         channels: the column that each channel is read from.
         actuators: the column that each actuator is driven by.
+        minus: pairs of channels, the second of which is taken off the first.
     """
 
     observed: tuple[float, ...]
@@ -48,6 +49,7 @@ class Assumption:
     delay: int = 0
     channels: tuple[int, ...] = ()
     actuators: tuple[int, ...] = ()
+    minus: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def as_given(cls, channels: int, actuators: int) -> Assumption:
@@ -187,6 +189,8 @@ def _bridged(log: Trajectory, triples: Sequence[tuple[int, int, int]]) -> Trajec
 
 def _read_as(log: Trajectory, assumption: Assumption) -> Trajectory:
     observations = log.observations[:, list(assumption.channels)] * np.array(assumption.observed)
+    for one, other in assumption.minus:
+        observations[:, one] -= observations[:, other]
     return Trajectory(observations, log.actions, log.dt * assumption.clock)
 
 

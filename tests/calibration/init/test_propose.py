@@ -75,6 +75,21 @@ def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
     assert {"upper_arm_mass", "forearm_mass", "shoulder_damping"} <= {unknown.name for unknown in draft.proposed}
 
 
+def test_angles_against_the_world_are_told_from_those_of_joints(tmp_path: Path) -> None:
+    """As a camera sees a chain of links, both columns turned round; a joint's own angle is none, nor a difference."""
+    truth = make_log(tmp_path, KINDS["arm"], 0, 5)
+    assert {truth.columns[q, f"joint:{joint}.position"][1] for q, joint in (("q1", "shoulder"), ("q2", "elbow"))} == {
+        -1
+    }
+    table = pd.read_csv(tmp_path / "log.csv").drop(columns=["dq1", "dq2"])
+    said = []
+    for seen in (table["q2"], table["q1"] + table["q2"], table["q1"] - table["q2"]):
+        table.assign(q2=seen).to_csv(tmp_path / "log.csv", index=False)
+        draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+        said.append(any("'q2' looks like the angle of a link against the world" in d for d in draft.open_doubts))
+    assert said == [False, True, False]
+
+
 def test_where_nothing_shows_all_is_asked_for(tmp_path: Path) -> None:
     (tmp_path / "model.xml").write_text(PENDULUM)
     time = np.arange(200) * 0.01
