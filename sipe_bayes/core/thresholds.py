@@ -152,11 +152,6 @@ class Thresholds(Options):
         "false alarms of invalid simulations that lie all over the prior; rare, as each parameter is a chance",
         "p-value",
     )
-    unlike: float = option(
-        1.0,
-        "a log with a larger outlier factor is further from the simulations than any of them from the others",
-        "of the simulations' largest",
-    )
     first_sample_sds: float = option(
         3.0, "a log that begins further from all simulations has another start", "sds of the noise"
     )

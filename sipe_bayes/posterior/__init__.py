@@ -1,5 +1,6 @@
 """Posteriors: probability distributions over a simulator's normalised parameters theta in [0, 1]^N."""
 
+from sipe_bayes.posterior.averaged import Averaged
 from sipe_bayes.posterior.base import NoDensityError, Posterior
 from sipe_bayes.posterior.dirac import Dirac
 from sipe_bayes.posterior.flow import Flow
@@ -11,6 +12,7 @@ from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
 __all__ = [
     "FAMILIES",
+    "Averaged",
     "Dirac",
     "Flow",
     "GaussianMixture",

@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 
 from sipe_bayes.core.files import reading
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.posterior.averaged import Averaged
 from sipe_bayes.posterior.base import Posterior
 from sipe_bayes.posterior.dirac import Dirac
 from sipe_bayes.posterior.flow import Flow
@@ -24,7 +25,7 @@ from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
 FAMILIES: dict[str, type[Posterior]] = {
     family.__name__: family
-    for family in (Dirac, Particles, GaussianMixture, IndependentPrior, SurrogatePosterior, Flow)
+    for family in (Dirac, Particles, GaussianMixture, IndependentPrior, SurrogatePosterior, Flow, Averaged)
 }
 
 

@@ -11,6 +11,7 @@ import torch
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import (
+    Averaged,
     Dirac,
     GaussianMixture,
     IndependentPrior,
@@ -73,6 +74,7 @@ EXAMPLES: dict[str, Callable[[int], Posterior]] = {
     ),
     "SurrogatePosterior": lambda n: example_surrogate(space_of(n)),
     "Flow": example_flow,
+    "Averaged": lambda n: Averaged([random_mixture(n, 1, seed) for seed in (1, 2)]),
 }
 
 

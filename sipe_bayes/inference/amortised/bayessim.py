@@ -7,7 +7,8 @@ draws from a proposal p~ instead of the prior p, the answer is q p / p~.
 
 - ``features``: "mlp" (two layers of 24 tanh units) or "random_fourier" (quasi-Monte Carlo, Matern-5/2), then a linear
   layer.
-- ``summary``: "statistics", or "learned": a network on each control step, averaged, trained with the mixture.
+- ``summary``: "statistics"; "learned": a network on each control step, averaged, trained with the mixture; or
+  "regressed": what a regression on the simulations makes of the log (``models.regressed``).
 - ``rounds`` > 1 draws later rounds where the answer so far has its mass: truncated proposals, for which the correction
   p / p~ is one (``inference.amortised.rounds``), instead of dividing mixtures, which need not leave a density.
 
@@ -28,12 +29,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, from_numpy, nn
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import seed_integer
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.rounds import Rounds, RoundsOptions, RoundsState
-from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.models.mixture_density import Features, MixtureDensity
 from sipe_bayes.models.training import TrainedNetwork, Training, check_device, restore, train
 from sipe_bayes.models.transitions import StepEmbedding, control_steps
@@ -46,7 +46,11 @@ class BayesSimOptions(RoundsOptions):
 
     components: int = option(5, "of the mixture", least=1)
     features: Features = option("mlp", "what a linear layer makes the mixture of", among=get_args(Features))
-    summary: str = option("statistics", "what the features are of", among=("statistics", "learned"))
+    summary: str = option(
+        "statistics",
+        'what the features are of; "regressed": theta as regressed on the simulations',
+        among=("statistics", "learned", "regressed"),
+    )
     hidden: int | None = option(
         None, "units of each of the network's two layers, default 24, or random features, default 500", least=2
     )
@@ -76,18 +80,22 @@ class BayesSim(Rounds[TrainedNetwork]):
     state_type: ClassVar = RoundsState[TrainedNetwork]
     options: BayesSimOptions
 
-    def train(self, simulations: Simulations, trajectories: Trajectories) -> TrainedNetwork:
+    @property
+    def regresses(self) -> bool:
+        """See the base's."""
+        return self.options.summary == "regressed"
+
+    def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> TrainedNetwork:
         """The network, of greatest likelihood of held-out simulations."""
-        device, seed = self.options.device, seed_integer([self.seed, 2])
-        inputs = from_numpy(self._inputs(simulations.observations, trajectories)).to(device)
-        theta = torch.tensor(simulations.theta, dtype=torch.float32, device=device)
+        device, seed = self.options.device, seed_integer([self.seed, 2, *member])
+        rows, targets = from_numpy(inputs).to(device), torch.tensor(theta, dtype=torch.float32, device=device)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             network = self._network().to(device)
-        network.fit_inputs(inputs, theta)
+        network.fit_inputs(rows, targets)
         trained = train(
             network,
-            lambda rows: -network.log_prob(inputs[rows], theta[rows]),
+            lambda chosen: -network.log_prob(rows[chosen], targets[chosen]),
             len(theta),
             self.options.training or Training(),
             torch.Generator().manual_seed(seed),
@@ -95,17 +103,16 @@ class BayesSim(Rounds[TrainedNetwork]):
         self.still_improving(trained.converged, trained.passes, "epochs", "training.epochs")
         return trained
 
-    def infer(self, learned: TrainedNetwork, trajectories: Trajectories) -> GaussianMixture:
+    def infer_network(self, trained: TrainedNetwork, inputs: Float32Array) -> GaussianMixture:
         """The mixture that the network makes of the log; raises ValueError where it has no whole control step."""
         network = self._network()
-        restore(network, learned.weights)
-        inputs = from_numpy(self._inputs(trajectories.observations[None], trajectories))
-        if not inputs.isfinite().any():
+        restore(network, trained.weights)
+        if not np.isfinite(inputs).any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
-        self.diagnostics |= learned.summary("epochs")
-        return GaussianMixture(*network.mixture(inputs), self.space)
+        self.diagnostics |= trained.summary("epochs")
+        return GaussianMixture(*network.mixture(from_numpy(inputs)), self.space)
 
-    def _inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> NDArray[np.float32]:
+    def inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> Float32Array:
         """What the network reads of n simulations: statistics (n, I) or control steps (n, M, F)."""
         if self.options.summary == "learned":
             seen = np.where(np.isfinite(trajectories.observations), observations, np.nan)
@@ -115,7 +122,7 @@ class BayesSim(Rounds[TrainedNetwork]):
     def _network(self) -> _Summarised:
         environment, options = self.simulator.environment, self.options
         o, a = len(environment.channels), environment.num_actions
-        embedding, size = None, o * a + 2 * o
+        embedding, size = None, len(self.space) if self.regresses else o * a + 2 * o
         if options.summary == "learned":
             embedding = StepEmbedding(2 * o + a, options.summary_features, options.summary_hidden)
             size = options.summary_features

@@ -137,48 +137,6 @@ class Experiment:
         return None if same else "starting states"
 
 
-@dataclass(frozen=True)
-class Looks:
-    """What tells a log from n simulations.
-
-    Attributes:
-        statistics: (n, F).
-        samples: (n, K), some of theirs as they are.
-    """
-
-    statistics: FloatArray
-    samples: FloatArray
-
-    def unlikeness(self, log: Looks) -> float:
-        """How far a log (n = 1) is from all simulations, the larger of ``outlier_factor`` of both looks."""
-        looks = ((self.statistics, log.statistics), (self.samples, log.samples))
-        return max(outlier_factor(seen, one[0]) for seen, one in looks)
-
-
-def outlier_factor(seen: FloatArray, log: FloatArray, neighbours: int = 20) -> float:
-    """Local outlier factor of a log among simulations, over the largest of the simulations' own.
-
-    M. Breunig et al. 2000, "LOF: Identifying Density-Based Local Outliers" (https://doi.org/10.1145/342009.335388).
-
-    Args:
-        seen: (n, F) of simulations.
-        log: (F,).
-        neighbours: that densities are taken from; twenty is the usual choice.
-
-    Returns:
-        Above 1 by chance once in n + 1 logs, of two looks twice as often; 0 where nothing varies.
-    """
-    from sklearn.neighbors import LocalOutlierFactor
-
-    sd = seen.std(0)
-    varies = sd > 1e-9 * (np.abs(seen).max(0) + 1e-30)
-    if not varies.any() or not np.isfinite(log).all():
-        return 0.0
-    scaled, point = seen[:, varies] / sd[varies], log[varies] / sd[varies]
-    factor = LocalOutlierFactor(min(neighbours, len(scaled) - 1), novelty=True).fit(scaled)
-    return float(-factor.score_samples(point[None])[0] / np.max(-factor.negative_outlier_factor_))
-
-
 def measured(trajectories: Trajectories) -> BoolArray:
     """(R, T+1): samples of which all channels were measured."""
     return np.asarray(np.isfinite(trajectories.observations).all(-1))

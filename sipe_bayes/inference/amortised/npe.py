@@ -11,8 +11,8 @@ correction, and the trained flow conditions on other logs without training again
 
 ``rounds`` > 1: truncated proposals, see ``inference.amortised.rounds``.
 
-Trajectories enter as sets of control steps (s, a, s' - s) through ``models.transitions.StepEmbedding``, or as they are
-(``embedding="none"``).
+Trajectories enter as sets of control steps (s, a, s' - s) through ``models.transitions.StepEmbedding``, as theta that a
+regression on the simulations makes of them (``embedding="regressed"``, ``models.regressed``), or as they are ("none").
 
 Deviations:
 
@@ -34,12 +34,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, from_numpy
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, Float32Array, FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import seed_integer
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.rounds import Rounds, RoundsOptions, RoundsState
-from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
 from sipe_bayes.models.training import Weights, check_device, weights
 from sipe_bayes.models.transitions import MOST_STEPS, Standardise, StepEmbedding, control_steps
@@ -55,8 +54,9 @@ class NPEOptions(RoundsOptions):
 
     embedding: str = option(
         "transitions",
-        'for trajectories of any length; "none": every finite sample as it is, for functions with few outputs',
-        among=("transitions", "none"),
+        'of control steps, of any number; "regressed": theta as regressed on the simulations, for motions; '
+        '"none": every finite sample as it is, for functions with few outputs',
+        among=("transitions", "regressed", "none"),
     )
     embedding_features: int = option(32, "numbers that the embedding summarises a log in", least=1)
     transforms: int = option(5, "layers of the spline flow", least=1)
@@ -121,12 +121,17 @@ class NPE(Rounds[TrainedFlow]):
             raise ValueError("trajectories: samples are missing, which embedding='none' cannot take; use 'transitions'")
         return super().start(trajectories)
 
-    def train(self, simulations: Simulations, trajectories: Trajectories) -> TrainedFlow:
+    @property
+    def regresses(self) -> bool:
+        """See the base's."""
+        return self.options.embedding == "regressed"
+
+    def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> TrainedFlow:
         """The flow with its embedding, of greatest likelihood of held-out simulations."""
-        line = to_line(from_numpy(simulations.theta))
+        line = to_line(from_numpy(theta))
         mean, sd = line.mean(0), line.std(0).clamp_min(1e-6)
-        x = from_numpy(self._features(simulations.observations, trajectories))
-        with seeded(seed_integer([self.seed, 4])), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        x, seed = from_numpy(inputs), seed_integer([self.seed, 4, *member])
+        with seeded(seed), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             net, summary = self._optimise(((line - mean) / sd).float(), x)
         epochs = int(summary["epochs_trained"][-1])
@@ -135,27 +140,28 @@ class NPE(Rounds[TrainedFlow]):
         loss = float(summary["best_validation_loss"][-1])
         return TrainedFlow(weights(net), mean.numpy(), sd.numpy(), x.shape[-1], len(x), epochs, loss, converged)
 
-    def infer(self, learned: TrainedFlow, trajectories: Trajectories) -> Posterior:
+    def infer_network(self, trained: TrainedFlow, inputs: Float32Array) -> Posterior:
         """The flow given the log; raises ValueError for one of another size, or without a whole control step."""
-        x = from_numpy(self._features(trajectories.observations[None].astype(np.float32), trajectories))
-        if x.shape[-1] != learned.features:
+        x = from_numpy(inputs)
+        if x.shape[-1] != trained.features:
             raise ValueError(
-                f"trajectories: expected {learned.features} numbers as in training, got {x.shape[-1]}; "
+                f"trajectories: expected {trained.features} numbers as in training, got {x.shape[-1]}; "
                 "embedding='none' takes logs of one length only"
             )
         if self.options.embedding == "transitions" and not x.isfinite().any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
         names = ("simulations", "epochs", "validation_loss", "converged")
-        self.diagnostics |= {name: getattr(learned, name) for name in names}
+        self.diagnostics |= {name: getattr(trained, name) for name in names}
         embedding = self._embedding(x.shape[-1])
-        embedding.load_state_dict(_part(learned.weights, "_embedding_net."))
+        embedding.load_state_dict(_part(trained.weights, "_embedding_net."))
         with torch.no_grad():
             context = embedding(x)[0].double()
-        flow = _part(learned.weights, "net.")
-        return Flow(flow, context, learned.line_mean, learned.line_sd, self.space, **self.options.architecture)
+        flow = _part(trained.weights, "net.")
+        return Flow(flow, context, trained.line_mean, trained.line_sd, self.space, **self.options.architecture)
 
-    def _features(self, observations: NDArray[np.float32], trajectories: Trajectories) -> NDArray[np.float32]:
+    def inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> Float32Array:
         """What the embedding takes: control steps (n, M, F), or all samples (n, F); without what the log lacks."""
+        observations = observations.astype(np.float32, copy=False)
         if self.options.embedding == "none":
             return np.ascontiguousarray(observations[:, _inside(trajectories)]).reshape(len(observations), -1)
         actions = trajectories.actions
@@ -165,7 +171,7 @@ class NPE(Rounds[TrainedFlow]):
         return control_steps(seen, actions, trajectories.length, most)
 
     def _embedding(self, features: int) -> Standardise | StepEmbedding:
-        if self.options.embedding == "none":
+        if self.options.embedding != "transitions":
             return Standardise(features)
         return StepEmbedding(features, self.options.embedding_features)
 

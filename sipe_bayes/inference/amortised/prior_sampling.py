@@ -45,8 +45,9 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.inference.amortised.experiment import Experiment, Looks, measured
+from sipe_bayes.inference.amortised.experiment import Experiment, measured
 from sipe_bayes.inference.amortised.held_back import HeldBack, parted, scored
+from sipe_bayes.inference.amortised.outside import Outside
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
@@ -59,7 +60,7 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 _ROWS = 100  # simulations whose control steps are held at once, for memory alone
-_SEEN, _SAMPLES = 500, 50  # simulations that a log is compared with, and samples of each, for time alone
+_SEEN = 500  # simulations that a log is compared with, for time alone
 
 L = TypeVar("L")
 S = TypeVar("S", bound="PriorSamplingState[Any]")
@@ -72,14 +73,14 @@ class Learned(Generic[L]):
     Attributes:
         content: the method's own part of it.
         experiment: what its simulations replayed.
-        looks: what tells a log from its simulations.
+        outside: what tells a log from its simulations.
         log: digest of the trajectories that were in hand.
         held_back: what simulations that were not trained on say of the posteriors; None without.
     """
 
     content: L
     experiment: Experiment
-    looks: Looks
+    outside: Outside
     log: str
     held_back: HeldBack | None = None
 
@@ -187,12 +188,12 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         other = learned.experiment.other(trajectories, noise_level(trajectories, self.likelihood))
         if other is not None:
             self.find(Code.OTHER_EXPERIMENT, differs=other)
-        unlikeness = float("nan")
+        p = float("nan")
         if np.array_equal(measured(trajectories), learned.experiment.measured):
-            unlikeness = learned.looks.unlikeness(self._looks(trajectories.observations[None], trajectories))
-        self.diagnostics["unlikeness"] = unlikeness
-        if unlikeness > THRESHOLDS.unlike:
-            self.find(Code.UNLIKE_SIMULATIONS)
+            p = learned.outside.p_value(*self._looks(trajectories.observations[None], trajectories))
+            if learned.outside.alarm(p):
+                self.find(Code.UNLIKE_SIMULATIONS, p=p)
+        self.diagnostics["p_of_simulations"] = p
         inferred = self.infer(learned.content, trajectories)
         if learned.held_back is None:
             return inferred
@@ -279,8 +280,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         """The simulations of the prior that replay these trajectories."""
         if self._cached is None or self._cached[0] is not trajectories:
             starts = first_states(self.simulator, trajectories)
-            made = Cache(self.simulator, self.prior, trajectories, starts, self.seed, self.cache)
-            self._cached = (trajectories, made)
+            self._cached = trajectories, Cache(self.simulator, self.prior, trajectories, starts, self.seed, self.cache)
         return self._cached[1]
 
     def judge(self, made: Simulations) -> None:
@@ -328,23 +328,23 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         noise = (sd * rng.standard_normal(made.observations.shape)).astype(np.float32)
         return replace(made, observations=made.observations + noise)
 
-    def _looks(self, observations: NDArray[np.floating], trajectories: Trajectories) -> Looks:
-        """Statistics, and up to 50 samples as they are (of what the log has)."""
-        trajectory, sample = np.nonzero(measured(trajectories))
-        kept = np.linspace(0, len(sample) - 1, min(_SAMPLES, len(sample))).round().astype(int)
-        samples = observations[:, trajectory[kept], sample[kept]].reshape(len(observations), -1)
-        return Looks(self.statistics(observations, trajectories), samples.astype(float))
+    def _looks(self, observations: NDArray[np.floating], trajectories: Trajectories) -> tuple[FloatArray, FloatArray]:
+        """Samples (n, D) and statistics (n, E) of what the log has."""
+        seen = np.where(np.isfinite(trajectories.observations), observations, np.nan).astype(float)
+        return seen.reshape(len(seen), -1), self.statistics(observations, trajectories)
 
     def _trained(self, state: S, trajectories: Trajectories) -> S:
         simulations = self.simulations(state, trajectories)
         self._check_units(simulations)
-        looks = self._looks(simulations.observations[-_SEEN:], trajectories)
+        noise = noise_level(trajectories, self.likelihood)
+        known = isinstance(self.simulator, CallableSimulator) or trajectories.states is not None
+        every = np.tile(noise, trajectories.observations[..., 0].size)
+        outside = Outside.of(*self._looks(simulations.observations[-_SEEN:], trajectories), every, known)
         simulations, kept_back = parted(simulations, self.options.calibration)
         content = self.train(simulations, trajectories)
         held_back = scored(partial(self.infer, content), kept_back, trajectories, torch_generator([self.seed, 5]))
-        noise, first = noise_level(trajectories, self.likelihood), simulations.observations[:, :, 0]
-        experiment = Experiment.of(self.simulator, trajectories, noise, first)
-        return replace(state, learned=Learned(content, experiment, looks, digest(trajectories), held_back))
+        experiment = Experiment.of(self.simulator, trajectories, noise, simulations.observations[:, :, 0])
+        return replace(state, learned=Learned(content, experiment, outside, digest(trajectories), held_back))
 
     def _check_units(self, simulations: Simulations) -> None:
         """A finding where a function's outputs vary by less than networks take for rounding."""

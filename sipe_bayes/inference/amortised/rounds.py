@@ -1,10 +1,15 @@
-"""Sequential rounds of simulation for the estimators whose trained network has a density: NPE and BayesSim.
+"""What the estimators whose trained network has a density share, NPE and BayesSim: sequential rounds, and ensembles.
 
-M. Deistler, P. Goncalves, J. Macke 2022, "Truncated proposals for scalable and hassle-free simulation-based inference"
-(https://arxiv.org/abs/2210.04815). Later rounds simulate the prior restricted to where the posterior so far has all but
-1e-4 of its mass. On that region the theta of every round have the prior's density up to a constant, so the proposal
-correction p(theta) / p~(theta) is one and the loss stays what it is; the network is then right there only, for the log
-in hand: with more than one round every ``fit`` simulates and trains anew.
+**Rounds.** M. Deistler, P. Goncalves, J. Macke 2022, "Truncated proposals for scalable and hassle-free simulation-based
+inference" (https://arxiv.org/abs/2210.04815). Later rounds simulate the prior restricted to where the posterior so far
+has all but 1e-4 of its mass. On that region the theta of every round have the prior's density up to a constant, so the
+proposal correction p(theta) / p~(theta) is one and the loss stays what it is; the network is then right there only, for
+the log in hand: with more than one round every ``fit`` simulates and trains anew.
+
+**Ensembles.** ``members`` > 1 networks differ in their first weights, their batches and what validates them, and answer
+with the mixture of their posteriors in equal parts (``posterior.averaged``): where they disagree it is wider. J.
+Hermans et al. 2022, "A Trust Crisis In Simulation-Based Inference? Your Posterior Approximations Can Be Unfaithful"
+(https://arxiv.org/abs/2110.06581).
 
 Deviations:
 
@@ -18,22 +23,26 @@ Deviations:
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import option
 from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import BLOCK, Simulations
+from sipe_bayes.inference.amortised.summaries import Summaries
 from sipe_bayes.inference.recorded import digest
+from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior import Averaged, Posterior
 
 _DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from: 1 / truncated, as it is by default
 _PROPOSALS = 2**17  # draws of the prior tried before resampling the posterior's, for time alone
@@ -42,7 +51,20 @@ L = TypeVar("L")
 
 
 @dataclass(frozen=True)
-class RoundsState(PriorSamplingState[L]):
+class Members(Generic[L]):
+    """What a training leaves.
+
+    Attributes:
+        networks: of the ensemble, or the one.
+        summaries: how they read a log; None where they read ``inputs``.
+    """
+
+    networks: tuple[L, ...]
+    summaries: Summaries | None = None
+
+
+@dataclass(frozen=True)
+class RoundsState(PriorSamplingState[Members[L]], Generic[L]):
     """How far a fit in rounds is.
 
     Attributes:
@@ -64,12 +86,56 @@ class RoundsOptions(PriorSamplingOptions):
     truncated: float = option(
         1e-4, "share of the posterior's mass outside the truncated prior of the next round", above=0, below=1
     )
+    members: int = option(1, "of an ensemble, each trained on all simulations, whose posteriors are averaged", least=1)
 
 
-class Rounds(PriorSampling[RoundsState[L], L], Generic[L]):
-    """Base of NPE and BayesSim."""
+class Rounds(PriorSampling[RoundsState[L], Members[L]], Generic[L]):
+    """Base of NPE and BayesSim.
+
+    A subclass writes ``regresses``, ``inputs``, ``train_network`` and ``infer_network``; none of them simulates.
+    """
 
     options: RoundsOptions
+
+    @property
+    @abstractmethod
+    def regresses(self) -> bool:
+        """Whether networks read what a regression on the simulations makes of a log, and not ``inputs``."""
+
+    @abstractmethod
+    def inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> Float32Array:
+        """What a network reads of observations (n, R, T+1, O): (n, ...), without the samples that the log lacks."""
+
+    @abstractmethod
+    def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> L:
+        """What ``infer_network`` needs of n simulations: a frozen dataclass; ``member`` goes into its seeds."""
+
+    @abstractmethod
+    def infer_network(self, trained: L, inputs: Float32Array) -> Posterior:
+        """The posterior that one network makes of a log (1, ...)."""
+
+    def train(self, simulations: Simulations, trajectories: Trajectories) -> Members[L]:
+        """All members."""
+        theta, observations, summaries = simulations.theta, simulations.observations, None
+        if self.regresses:
+            noise, statistics = noise_level(trajectories, self.likelihood), self.statistics(observations, trajectories)
+            summaries, estimates = Summaries.of(theta, observations, statistics, trajectories, noise)
+            inputs = estimates.astype(np.float32)
+        else:
+            inputs = self.inputs(observations, trajectories)
+        members = [(), *((k,) for k in range(1, self.options.members))]
+        return Members(tuple(self.train_network(inputs, theta, member) for member in members), summaries)
+
+    def infer(self, learned: Members[L], trajectories: Trajectories) -> Posterior:
+        """The members' posteriors in equal parts; that of a single network as it is."""
+        observations = trajectories.observations[None]
+        if learned.summaries is None:
+            inputs = self.inputs(observations, trajectories)
+        else:
+            statistics = self.statistics(observations, trajectories)
+            inputs = learned.summaries(trajectories.observations, statistics).astype(np.float32)
+        posteriors = [self.infer_network(network, inputs) for network in learned.networks]
+        return posteriors[0] if len(posteriors) == 1 else Averaged(posteriors)
 
     def prepare(self) -> None:
         """As the base's; in rounds, this instance conditions on one log."""

@@ -1,0 +1,165 @@
+r"""A log's summary by regression: what simulations say of E[theta | x].
+
+P. Fearnhead, D. Prangle 2012, "Constructing summary statistics for approximate Bayesian computation: semi-automatic
+approximate Bayesian computation" (https://arxiv.org/abs/1004.1112): of all summaries with as many numbers as
+parameters, the posterior's mean loses least, and a regression of theta on what was simulated estimates it. With a
+kernel k, centred, and K_ij = k(x_i, x_j) of n simulations,
+
+.. math:: s(x) = \bar\theta + k(x)^T (K + \lambda I)^{-1} (\theta - \bar\theta) ,
+
+whose ridge lambda is, for each parameter, that of least error of the simulations when each is left out. These
+left-out estimates are also what a network is trained on: it then sees summaries as far off as those of a new log.
+
+Deviations:
+
+- Kernel ridge regression in place of a linear one: k = (1 + <a, a'> + <b, b'>)^2 of the samples a and BayesSim's
+  statistics b, each standardised over the simulations, and scaled so that <a, a> and <b, b> are one on average.
+- A sample counts by the share of its variance that is not the sensor's noise, and not at all below ``least``.
+- ``most`` simulations are regressed on, and as many numbers of each, spread evenly, for time and memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.core.arrays import Float32Array, FloatArray
+from sipe_bayes.core.options import Options, option
+
+
+@dataclass(frozen=True)
+class RegressionOfTheta(Options):
+    """How theta is regressed on simulations."""
+
+    most: int = option(2000, "simulations that are regressed on", least=10)
+    numbers: int = option(4000, "samples of each that count", least=1)
+    least: float = option(0.04, "share of a sample's variance that is no noise, below which it does not count", above=0)
+    ridges: tuple[float, ...] = option(
+        tuple(float(x) for x in np.logspace(-7, 1, 25)), "that are tried", "of the largest eigenvalue of K"
+    )
+    rounding: float = option(1e-7, "of a column's largest number, below which it does not vary", above=0)
+
+
+_OPTIONS = RegressionOfTheta()
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Numbers of a log, standardised over n simulations.
+
+    Attributes:
+        kept: (F,), which.
+        mean: (F,).
+        weight: (F,), by which deviations from it are multiplied.
+    """
+
+    kept: NDArray[np.int64]
+    mean: FloatArray
+    weight: FloatArray
+
+    @classmethod
+    def of(cls, x: FloatArray, noise: FloatArray | float, options: RegressionOfTheta = _OPTIONS) -> Self:
+        """Of x (n, D) with white noise of sd ``noise`` (D,): those that vary, so that the rows' mean square is one."""
+        mean, sd = x.mean(0), x.std(0)
+        varies = sd > options.rounding * (np.abs(x).max(0) + 1e-30)
+        share = np.where(varies, 1 - (noise / np.where(varies, sd, 1.0)) ** 2, 0.0)
+        kept = np.flatnonzero(share > options.least)
+        if len(kept) > options.numbers:
+            kept = kept[np.linspace(0, len(kept) - 1, options.numbers).round().astype(int)]
+        weight = np.sqrt(share[kept]) / sd[kept]
+        return cls(kept, mean[kept], weight / max(float(np.sqrt(share[kept].sum())), 1e-30))
+
+    def __call__(self, x: FloatArray) -> Float32Array:
+        """Standardised (n, F) of x (n, D); what was not measured counts as the simulations' mean."""
+        centred = (x[:, self.kept] - self.mean) * self.weight
+        return np.nan_to_num(centred).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Regressed:
+    """A regression of theta (N,) on n simulations.
+
+    Attributes:
+        samples, statistics: columns of both.
+        points: (n, F) of the simulations.
+        middle: (n,), means of the kernel's rows.
+        ridge: (N,).
+        coefficients: (n, N).
+        theta: (N,), mean.
+    """
+
+    samples: Columns
+    statistics: Columns
+    points: Float32Array
+    middle: FloatArray
+    ridge: FloatArray
+    coefficients: FloatArray
+    theta: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        theta: FloatArray,
+        samples: FloatArray,
+        statistics: FloatArray,
+        noise: FloatArray | float,
+        options: RegressionOfTheta = _OPTIONS,
+    ) -> tuple[Self, FloatArray]:
+        """The regression, and summaries (n, N) of its simulations, each left out, those beyond ``most`` as new logs.
+
+        Args:
+            theta: (n, N).
+            samples: (n, D) with noise.
+            statistics: (n, E) of them.
+            noise: sd of the samples' noise (D,).
+            options: of the regression.
+        """
+        used = slice(0, options.most)
+        columns = Columns.of(samples[used], noise, options), Columns.of(statistics[used], 0.0, options)
+        points = np.concatenate([columns[0](samples), columns[1](statistics)], axis=1)
+        kernel = _kernel(points[used], points[used])
+        middle, mean = kernel.mean(0), theta[used].mean(0)
+        centred = kernel - middle - middle[:, None] + middle.mean()
+        eigenvalues, vectors = np.linalg.eigh(centred)
+        eigenvalues = np.maximum(eigenvalues, 0)
+        ridge, left_out = _least_error(eigenvalues, vectors, theta[used] - mean, options)
+        coefficients = vectors @ ((vectors.T @ (theta[used] - mean)) / (eigenvalues[:, None] + ridge))
+        regressed = cls(*columns, points[used], middle, ridge, coefficients, mean)
+        beyond = regressed.summaries(points[options.most :])
+        return regressed, np.concatenate([mean + left_out, beyond])
+
+    def points_of(self, samples: FloatArray, statistics: FloatArray) -> Float32Array:
+        """Of logs (m, D) with statistics (m, E): (m, F)."""
+        return np.concatenate([self.samples(samples), self.statistics(statistics)], axis=1)
+
+    def summaries(self, points: Float32Array) -> FloatArray:
+        """(m, N) of points (m, F)."""
+        return np.asarray(self.theta + self._centred(points) @ self.coefficients)
+
+    def _centred(self, points: Float32Array) -> FloatArray:
+        kernel = _kernel(points, self.points)
+        return np.asarray(kernel - kernel.mean(1)[:, None] - self.middle + self.middle.mean())
+
+
+def _kernel(one: Float32Array, other: Float32Array) -> FloatArray:
+    return np.asarray((1 + (one @ other.T).astype(np.float64)) ** 2)
+
+
+def _least_error(
+    eigenvalues: FloatArray, vectors: FloatArray, theta: FloatArray, options: RegressionOfTheta
+) -> tuple[FloatArray, FloatArray]:
+    """For each parameter the ridge (N,) of least error of those left out, and these estimates (n, N)."""
+    inside, squared, n = vectors.T @ theta, vectors**2, len(theta)
+    best, ridge, left_out = np.full(theta.shape[1], np.inf), np.empty(theta.shape[1]), np.empty(theta.shape)
+    for share in options.ridges:
+        tried = max(share * float(eigenvalues.max()), 1e-12)
+        kept = eigenvalues / (eigenvalues + tried)
+        own = squared @ kept + 1 / n
+        estimate = theta - (theta - vectors @ (kept[:, None] * inside)) / np.maximum(1 - own, 1e-9)[:, None]
+        error = ((estimate - theta) ** 2).mean(0)
+        better = error < best
+        best[better], ridge[better], left_out[:, better] = error[better], tried, estimate[:, better]
+    return ridge, left_out
