@@ -208,7 +208,7 @@ class Posterior(Drawn, TorchDistribution):
     def expand(self, batch_shape: Sequence[int], _instance: object = None) -> Self:
         """Independent copies in ``batch_shape``, as Pyro's plates ask for."""
         new = copy.copy(self)
-        new._batch_shape = torch.broadcast_shapes(self.batch_shape, torch.Size(batch_shape))
+        new._batch_shape = torch.Size(np.broadcast_shapes(self.batch_shape, tuple(batch_shape)))
         return new
 
     def sample(self, sample_shape: Sequence[int] = (), generator: Generator | None = None) -> Tensor:
@@ -252,7 +252,7 @@ class Posterior(Drawn, TorchDistribution):
         if inside.any():
             result = result.masked_scatter(inside, self._log_prob(flat[inside]))
         result = result.reshape(theta.shape[:-1])
-        return result.expand(torch.broadcast_shapes(result.shape, self.batch_shape))
+        return result.expand(np.broadcast_shapes(result.shape, self.batch_shape))
 
     @property
     def mean(self) -> Tensor:

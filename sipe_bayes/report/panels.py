@@ -241,7 +241,8 @@ def pair_grid(
             _pair_frame(ax, two, i, j, size)
     if handles:
         legend_above(figure, handles, 4)
-    figure.align_labels()
+    figure.align_xlabels(list(axes[-1]))  # of the outer panels alone: all take most of the drawing's time
+    figure.align_ylabels(list(axes[:, 0]))
     return figure
 
 

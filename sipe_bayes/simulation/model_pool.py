@@ -50,18 +50,18 @@ class ModelPool:
         Returns:
             The slot of each, (B,).
         """
-        named = np.array(logs, object)
+        named = np.array(logs if self._by_log else [None] * len(theta), object)
         differs = (theta[1:] != theta[:-1]).any(1) | (timesteps[1:] != timesteps[:-1]) | (named[1:] != named[:-1])
         first = np.flatnonzero(np.concatenate([[True], differs | own]))
         index: dict[bytes, int] = {}
         slots, rows = np.empty(len(first), int), list[int]()
         for i, at in enumerate(first.tolist()):
-            key = _key(theta[at], timesteps[at], logs[at]) + (str(i).encode() if own else b"")
+            key = _key(theta[at], timesteps[at], named[at]) + (str(i).encode() if own else b"")
             if key not in index:
                 index[key] = len(index)
                 rows.append(at)
             slots[i] = index[key]
-        self.put(np.arange(len(rows)), theta[rows], timesteps[rows], [logs[at] for at in rows])
+        self.put(np.arange(len(rows)), theta[rows], timesteps[rows], [named[at] for at in rows])
         return np.repeat(slots, np.diff(first, append=len(theta)))
 
     def put(self, slots: IntArray, theta: FloatArray, timesteps: FloatArray, logs: Sequence[str | None]) -> None:
@@ -118,6 +118,11 @@ class ModelPool:
         model = copy.copy(self.model) if model is None else model
         self._write(model, self._values(theta[None])[0], float(self.model.opt.timestep), None)
         return model
+
+    @cached_property
+    def _by_log(self) -> bool:
+        """Whether a parameter is one log's: without, the logs share their models."""
+        return any(parameter.log is not None for parameter in self.environment.space)
 
     @cached_property
     def _trial(self) -> mujoco.MjModel:

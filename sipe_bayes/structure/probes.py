@@ -113,30 +113,31 @@ def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Seq
 def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed]) -> list[Effect]:
     environment = windows.simulator.environment
     assert isinstance(environment, MjcfEnvironment)
-    batches = [group]
-    if not _possible(windows, environment, group):  # two of them write the same number
-        batches = [[one] for one in group if _possible(windows, environment, [one])]
-    return [effect for batch in batches for effect in _simulated(windows, theta, starts, batch, environment)]
+    whole = _extended(windows, environment, group)
+    if whole is not None:
+        return _simulated(windows, theta, starts, group, whole)
+    alone = ((one, _extended(windows, environment, [one])) for one in group)  # two of them write the same number
+    return [e for one, own in alone if own is not None for e in _simulated(windows, theta, starts, [one], own)]
 
 
-def _possible(windows: Windows, environment: MjcfEnvironment, group: list[Placed]) -> bool:
-    """Whether the model can have them all, beside the extensions that it has.
+def _extended(windows: Windows, environment: MjcfEnvironment, group: list[Placed]) -> Simulator | None:
+    """The model with them all, beside the extensions that it has; None where it can not have them.
 
-    None that has states of its own, where the logs' recorded states are to be held to.
+    None either of what has states of its own, where the logs' recorded states are to be held to.
     """
     try:
         larger = extended(environment, group)
     except ValueError:
-        return False
-    before, after = windows.simulator.model, larger.compile()
-    sizes = [(model.nq, model.nv, model.na, model.nhistory) for model in (before, after)]
-    return windows.settings.starts == "estimated" or sizes[0] == sizes[1]
+        return None
+    simulator = Simulator(larger, windows.simulator.num_threads)
+    sizes = [(model.nq, model.nv, model.na, model.nhistory) for model in (windows.simulator.model, simulator.model)]
+    return simulator if windows.settings.starts == "estimated" or sizes[0] == sizes[1] else None
 
 
 def _simulated(
-    windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed], environment: MjcfEnvironment
+    windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed], simulator: Simulator
 ) -> list[Effect]:
-    simulator = Simulator(extended(environment, group), windows.simulator.num_threads)
+    """Effects of extensions that the simulator's model has."""
     bound = Windows(windows.settings, simulator, windows.trajectories, windows)
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
