@@ -110,6 +110,7 @@ class Descent(Generic[P]):
         expected: nats that the step was to gain; infinite where a stale linearisation's step was refused.
         gained: nats that it gained.
         refused: most nats that a step was to gain which gained nothing.
+        exhausted: whether steps were refused until there was none, not until one was to gain too little.
     """
 
     point: P | None
@@ -119,6 +120,7 @@ class Descent(Generic[P]):
     expected: float = 0.0
     gained: float = 0.0
     refused: float = 0.0
+    exhausted: bool = False
 
 
 def descend(
@@ -144,7 +146,7 @@ def descend(
         move = model.step(linearised.theta, damping)
         expected = model.gain(move)
         if expected < tolerance:
-            return replace(standing, converged=True)
+            return replace(standing, converged=True, refused=refused)
         theta = np.clip(linearised.theta + move, 0.0, 1.0)
         point, energy = linearised.simulated(theta, model.rest(move))
         gained = linearised.energy - energy
@@ -154,4 +156,4 @@ def descend(
         if stale:
             return replace(standing, expected=np.inf)
         damping, refused = rule.after(damping, lowered=False), max(refused, expected)
-    return replace(standing, converged=True, refused=refused)
+    return replace(standing, converged=True, refused=refused, exhausted=True)

@@ -344,7 +344,7 @@ class WindowSearch:
             begin=state.points[state.point],
             steps=here.iteration,
             first_misfit=here.misfit,
-            refused=step.fit.refused,
+            refused=step.fit.refused if windows.num_start or step.fit.exhausted else 0.0,  # else points around tell
             settled=settled,
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,

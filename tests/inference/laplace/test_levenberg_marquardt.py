@@ -107,8 +107,10 @@ def test_where_no_step_is_taken(problem: Bowl, tolerance: float, stale: bool, ex
     assert (fit.point is None) == (fit.gained == 0)
 
 
-def test_a_refused_search_says_what_it_was_to_gain() -> None:
+@pytest.mark.parametrize("tolerance", [1e-9, 1e-2], ids=["until a step is none", "until it is to gain little"])
+def test_a_refused_search_says_what_it_was_to_gain(tolerance: float) -> None:
     problem = bowl(lambda t: np.inf)
-    fit = descend(problem, 1e-4, 1e-9, DampingRule())
+    fit = descend(problem, 1e-4, tolerance, DampingRule())
+    assert fit.exhausted == (tolerance < 1e-6)
     assert fit.refused == pytest.approx(problem.energy, rel=1e-3)
     assert fit.converged
