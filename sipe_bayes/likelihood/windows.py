@@ -38,6 +38,7 @@ from sipe_bayes.likelihood.starts import (
     with_history,
 )
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.contacts import contacts_change
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -145,6 +146,7 @@ class Windows:
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
         guesses = {k: estimate_states(simulator, trajectories[k]) for k in np.unique(self.log).tolist()}
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
+        self.strikes = contacts_change(simulator, list(guesses.values()))
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt, self.start)
@@ -363,16 +365,13 @@ class Windows:
         # a step across a physical limit: look the other way
         if wrong and valid[0]:
             sign[wrong] = -sign[wrong]
-            again = np.tile(theta, (len(wrong), 1))
+            again, rows = np.tile(theta, (len(wrong), 1)), np.array(wrong) + 1
             again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
-            inside = np.clip(again, 0, 1)
-            predicted[np.array(wrong) + 1], valid[np.array(wrong) + 1] = self.predict(
-                inside, all_starts[: len(wrong)], True
-            )
+            predicted[rows], valid[rows] = self.predict(np.clip(again, 0, 1), all_starts[: len(wrong)], True)
         predicted[1:] = self._continued(predicted[1:], predicted[0])
-        scale = np.concatenate([sign[:n] * size[:n], of_starts])
+        scale = np.concatenate([sign[:n] * size[:n], of_starts])[:, None, None, None]
         with np.errstate(invalid="ignore"):
-            jacobian = (predicted[1:] - predicted[0]) / scale[:, None, None, None]
+            jacobian = (predicted[1:] - predicted[0]) / scale
         jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
         residual = np.where(self.observed, self.measured - predicted[0], 0.0)
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))

@@ -22,7 +22,6 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.growing_windows import touches
 from sipe_bayes.inference.laplace.levenberg_marquardt import descend
 from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
@@ -37,6 +36,7 @@ from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.simulation.contacts import may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -74,7 +74,8 @@ class _WeighedEnergy(WindowEnergy):
 
 def begins_in_contact(windows: Windows) -> bool:
     """Whether windows begin at known states of a model in which something may touch."""
-    return not windows.num_start and isinstance(windows.simulator, Simulator) and touches(windows)
+    simulator = windows.simulator
+    return not windows.num_start and isinstance(simulator, Simulator) and may_touch(simulator.model)
 
 
 def starting_points(problem: SearchProblem, windows: Windows) -> FloatArray:

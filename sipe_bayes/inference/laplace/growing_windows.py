@@ -1,12 +1,15 @@
-"""Windows of bodies that tumble: their beginnings first, ever longer, and each window's start the best of several.
+"""Windows through impacts: their beginnings first, ever longer, and each window's start the best of several.
 
-A measured pose tells nearly where such a window starts, and its first tenth of a second, followed by the model, ten
-times nearer. But an impact magnifies what is left, the next one that, and a simulation that misses a corner's touch has
-no slope towards the one that does not. A beginning with one impact is nearly smooth; fitted, it foretells the next
-impact nearly enough (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear dynamical system identification from uncertain and
-indirect measurements", 2004, https://doi.org/10.1142/S0218127404010345). So theta and the starts descend together on
-beginnings that grow. And since windows meet in theta alone, each takes as much of a step of its start as serves it
-best: one that misses an impact on the way holds back itself, not the search.
+Of bodies that tumble, a measured pose tells nearly where a window starts, and its first tenth of a second, followed by
+the model, ten times nearer. But an impact magnifies what is left, the next one that, and a simulation that misses a
+corner's touch has no slope towards the one that does not. A beginning with one impact is nearly smooth; fitted, it
+foretells the next impact nearly enough (H. U. Voss, J. Timmer, J. Kurths, "Nonlinear dynamical system identification
+from uncertain and indirect measurements", 2004, https://doi.org/10.1142/S0218127404010345). So theta and the starts
+descend together on beginnings that grow. And since windows meet in theta alone, each takes as much of a step of its
+start as serves it best: one that misses an impact on the way holds back itself, not the search.
+
+A joint that strikes a stop, or a ball that a slide carries, is magnified alike, if its contacts come and go
+(``simulation.contacts``).
 
 Contact that chatters (a body that lies or is pushed) jumps over short differences, whose slopes then say nothing, and
 starts would follow them anywhere. So theta moves alone at first, by those starts, over wide differences. They
@@ -65,8 +68,9 @@ class ManyStarts(LinearisedWindows):
 
 
 def grows(windows: Windows) -> bool:
-    """Whether windows are searched by their beginnings: a measured free or ball joint, and starts to estimate."""
-    return bool(windows.num_start and windows.simulator.environment.poses and windows.starts_measured)
+    """Whether windows are searched by their beginnings: bodies that tumble or strike something, starts to estimate."""
+    moves = bool(windows.num_start and windows.starts_measured)
+    return moves and (windows.strikes or bool(windows.simulator.environment.poses))
 
 
 def first_horizon(windows: Windows, tuning: GrowingTuning) -> int:
@@ -204,12 +208,6 @@ def num_groups(windows: Windows, tuning: GrowingTuning) -> int:
 def group(windows: Windows, number: int, count: int) -> Windows:
     """The windows of one group, taken in turn."""
     return windows.part(np.arange(number, windows.num_windows, count))
-
-
-def touches(windows: Windows) -> bool:
-    """Whether anything in the model may touch something else."""
-    model = windows.simulator.model
-    return bool(model.npair or (model.ngeom > 1 and model.geom_contype.any() and model.geom_conaffinity.any()))
 
 
 def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuning) -> WindowOptimum:

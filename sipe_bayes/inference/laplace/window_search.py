@@ -48,7 +48,6 @@ from sipe_bayes.inference.laplace.growing_windows import (
     grows,
     num_groups,
     scattered,
-    touches,
 )
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning
@@ -79,6 +78,7 @@ from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.simulation.contacts import may_touch
 
 _ROUGH = (Phase.WHOLE, Phase.ROUGH)
 
@@ -165,7 +165,7 @@ class WindowSearch:
         if num_groups(self.windows, self._tuning.growing):
             cut_short = tuple(replace(o, finding=finding(Code.SEARCH_CUT_SHORT)) for o in state.optima)  # until then
             return replace(state, here=self._apart(0, state), optima=cut_short, aside=state.optima)
-        if not touches(self.windows):
+        if not may_touch(self.windows.simulator.model):
             return onward
         unknown = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
         return replace(onward, optima=tuple(replace(optimum, finding=unknown) for optimum in state.optima))
