@@ -2,8 +2,8 @@
 
 A plain motor, of gear and gain 1, takes N m at a hinge and N at a slide; a position actuator rad or m, a velocity
 actuator rad/s or m/s, a motor with a back-EMF V. A gear, gain or ``factor`` that is not 1, or a gear or gain that is
-unknown, converts: V and A then drive a motor too. ``"1"`` says nothing of what a column is, and always passes. Nothing
-is commanded in kg or s.
+unknown, converts: V and A then drive a motor too. A muscle and a damper take a share. ``"1"`` says nothing of what a
+column is, and always passes. Nothing is commanded in kg or s.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 
 _ELECTRIC = ("voltage", "current")
 _NEVER = ("mass", "time")
+_SHARES = (int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtGain.mjGAIN_MUSCLE))  # what motion gives, times a command
 _QUANTITIES = {  # of what turns, and of what slides
     Drive.FORCE: ("torque", "force"),
     Drive.POSITION: ("angle", "length"),
@@ -70,6 +71,8 @@ def _dimensions(config: Config, command: Command, model: mujoco.MjModel, index: 
     drive, turns, slides = drive_of(model, index), *_moves(model, index)
     meant = _described(config, command)
     if drive == Drive.OTHER:
+        if not meant and command.factor == 1 and int(model.actuator_gaintype[index]) in _SHARES:
+            return ("dimensionless",)
         return (*meant, "dimensionless", *(d for d in DIMENSIONS if d not in _NEVER))
     plain = _is_plain(config, command, model, index)
     quantities = _QUANTITIES[Drive.FORCE if drive == Drive.VOLTAGE else drive]
@@ -87,6 +90,8 @@ def _is_plain(config: Config, command: Command, model: mujoco.MjModel, index: in
     """Whether a unit of the command is a unit of what the actuator does: nothing converts it, known or not."""
     unknown = {target for parameter in config.parameters for target in parameter.targets}
     if unknown & {f"{command.target}.gear", f"{command.target}.gain"}:
+        return False
+    if int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_DCMOTOR):  # whose first number is no gain
         return False
     gears = np.abs(model.actuator_gear[index])
     scales = [*gears[gears > 0].tolist()]

@@ -27,6 +27,7 @@ from sipe_bayes.inference.registry import ESTIMATORS
 from sipe_bayes.structure.registry import EXTENSIONS
 
 _LISTED = 30  # words in a line
+_LEAST = 1e-30  # of a number beside zero, and one over it the most, in SI: squares stay numbers
 
 
 class ConfigError(LineError):
@@ -175,6 +176,15 @@ def parse_measurement_target(target: str) -> MeasurementTarget:
     )
 
 
+def _sized(value: float) -> float:
+    """A number whose square is one, too."""
+    if value and not _LEAST <= abs(value) <= 1 / _LEAST:
+        raise problem(
+            f"expected a size from {_LEAST:g} to {1 / _LEAST:g}, or zero, got {value:g}; correct it, or its unit"
+        )
+    return value
+
+
 def _target(word: str) -> str:
     parse_measurement_target(word)
     return word
@@ -185,8 +195,8 @@ ExtensionName = Annotated[Text, AfterValidator(_extension)]
 OwnExtension = Annotated[Text, AfterValidator(_own_extension)]
 Budget = Annotated[int, Strict(), Field(gt=0, le=MOST_ROLLOUTS)]
 Use = Literal["train", "holdout"]
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False), AfterValidator(_sized)]
+Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False), AfterValidator(_sized)]
 Pair = tuple[Number, Number]
 Location = Annotated[Path, BeforeValidator(_resolved)]
 UnitWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word).word)]

@@ -45,6 +45,7 @@ from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.likelihood.wild_samples import wild_positions
+from sipe_bayes.simulation.engine import HUGE
 
 _SLOW = 0.25  # s from row to row: no robot is logged so slowly without its being meant
 _SHORTEST, _LONGEST = 1e-9, 1e9  # s, of a step and of a log: beyond, a clock holds no times
@@ -155,7 +156,14 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         if isinstance(entry, Measurement) and entry.wraps:
             known = np.isfinite(values)
             values[known] = np.unwrap(entry.factor * values[known]) / entry.factor
-        return Series(time, entry.sign * entry.factor * values)
+        values *= entry.sign * entry.factor
+        huge = np.abs(values) > HUGE
+        if huge.any() and isinstance(entry, Command):
+            worst = f"{values[huge][0]:.3g} in SI in row {int(np.argmax(huge)) + 1}"
+            raise LogError(
+                f"command column {name!r} holds {worst}, the most is {HUGE:g}; correct its unit or that cell"
+            )
+        return Series(time, np.where(huge, np.nan, values))  # no measurement, as infinity is none
 
     measurements = [y for m in config.measurements for y in _aligned(m, [signal(m, column) for column in m.sources])]
     commands = [signal(c, c.column) for c in config.drives]

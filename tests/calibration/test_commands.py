@@ -63,7 +63,10 @@ CASES = [  # actuator, factor, what else there is, the dimensions that it takes 
     ('<velocity name="driven" joint="hinge" kv="9"/>', 1, {}, ["angular velocity"]),
     ('<velocity name="driven" joint="slide" kv="9"/>', 1, {}, ["velocity"]),
     ('<intvelocity name="driven" joint="hinge" kp="9" actrange="-1 1"/>', 1, {}, ["angular velocity"]),
-    ('<damper name="driven" joint="hinge" kv="9" ctrlrange="0 1"/>', 1, {}, ["dimensionless", *POWERED]),
+    ('<damper name="driven" joint="hinge" kv="9" ctrlrange="0 1"/>', 1, {}, ["dimensionless"]),
+    ('<damper name="driven" joint="hinge" kv="9" ctrlrange="0 1"/>', 0.1, {}, ["dimensionless", *POWERED]),
+    ('<muscle name="driven" joint="hinge" lengthrange="0 1"/>', 1, {}, ["dimensionless"]),
+    ('<dcmotor name="driven" joint="hinge" resistance="1" motorconst="0.3"/>', 1, {}, ["voltage"]),
 ]  # fmt: skip
 
 
