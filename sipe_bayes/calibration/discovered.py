@@ -10,7 +10,7 @@ from typing import Any
 
 from sipe_bayes.calibration.output import save_posterior
 from sipe_bayes.calibration.problem import RUN, Problem
-from sipe_bayes.core.files import to_json, write_text
+from sipe_bayes.core.files import printed, to_json, write_text
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.toml import to_toml
@@ -98,9 +98,9 @@ def write_configuration(problem: Problem, structures: Structures, folder: Path, 
     space = _environment(structures).space
     values = zip(space.names, space.values(structures.best.theta).tolist(), strict=True)
     data["search"] = {**data.get("search", {}), "start": dict(values)}
-    lines = [f"# {problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]
-    lines += [f"#   sipe calibrate {folder / DISCOVERED_TOML}", *(f"# {x.sentence}" for x in structures.columns)]
-    lines += [f"# {one.sentence}" for one in placed]
+    remarks = [f"{problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]
+    remarks += [f"  sipe calibrate {folder / DISCOVERED_TOML}", *(x.sentence for x in structures.columns)]
+    lines = [f"# {printed(remark)}" for remark in (*remarks, *(one.sentence for one in placed))]
     write_text(folder / DISCOVERED_TOML, "\n".join(lines) + "\n\n" + to_toml(data))
 
 

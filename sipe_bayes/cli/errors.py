@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import typer
 
 from sipe_bayes.cli.surroundings import broken_import, drop_output
-from sipe_bayes.core.files import FULL, reason
+from sipe_bayes.core.files import FULL, printed, reason
 from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 
 BAD_INPUT = 2
@@ -48,7 +48,7 @@ def exit_on_error(then: str = "") -> Iterator[None]:
             raise typer.Exit(INTERRUPTED) from None
         if type(error).__name__.endswith("LinAlgError"):
             raise
-        print(f"sipe: {' '.join(_text(error).split())}", file=sys.stderr)
+        print(f"sipe: {' '.join(printed(_text(error)).split())}", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
     except MemoryError:
         print("sipe: more memory is asked for than there is; ask for less, or use a larger machine", file=sys.stderr)
@@ -105,6 +105,8 @@ def _text(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and (error.filename is not None or error.errno in FULL):
         remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
         return f"{error.filename or 'a temporary file'}: {error.strerror.lower()}; {remedy}"
+    if isinstance(error, FileNotFoundError) and (error.strerror or "").startswith("No usable temporary"):
+        return f"temporary folder (TMPDIR): {os.strerror(errno.ENOSPC).lower()}; {_SPACE}"  # tempfile's, of a library
     return str(error)
 
 

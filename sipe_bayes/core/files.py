@@ -171,10 +171,14 @@ def check_text_size(path: Path) -> None:
         raise ValueError(f"has {path.stat().st_size} bytes, the most is {LONGEST_TEXT}")
 
 
+def printed(text: str) -> str:
+    """A text as one line that prints, so that no name ends a line, or a comment, that it stands in."""
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
+
+
 def shortened(text: str) -> str:
     """A line that prints, in which no word is longer than anybody reads."""
-    printed = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
-    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...{word[0][-60:]}", printed)
+    return re.sub(rf"\S{{{_WORDS},}}", lambda word: f"{word[0][:60]}...{word[0][-60:]}", printed(text))
 
 
 def reason(error: Exception) -> str:

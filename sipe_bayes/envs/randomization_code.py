@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.files import write_text
+from sipe_bayes.core.files import printed, write_text
 from sipe_bayes.envs.export import NO_NUMBERS, number_fields
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -164,9 +164,9 @@ def sources(environment: MjcfEnvironment, draws: FloatArray) -> dict[str, str]:
     table, kept = _table(environment, draws)
     if not kept:
         raise ValueError("draws: expected some that a model can have, got none; look at the posterior")
-    names = ", ".join(environment.space.names)
+    names = _within_quotes(", ".join(environment.space.names))
     sizes, kinds = _fixed(environment, draws)
-    remarks = "".join(f"\n\n{line}" for line in _remarks(environment))
+    remarks = "".join(f"\n\n{_within_quotes(line)}" for line in _remarks(environment))
     plain = pprint.pformat(table, width=120, compact=True, sort_dicts=True)
     data, texts = _DATA.format(sizes=sizes, kinds=kinds, table=plain), {}
     for file, what, body in (
@@ -237,6 +237,11 @@ def _numbers(model: mujoco.MjModel) -> dict[str, FloatArray]:
     return {**number_fields(model), **{f"opt.{name}": np.atleast_1d(getattr(model.opt, name)) for name in _OPTIONS}}
 
 
+def _within_quotes(text: str) -> str:
+    """As text of a docstring, which names neither end nor escape from."""
+    return printed(text).replace("\\", "/").replace('"', "'")
+
+
 def _remarks(environment: MjcfEnvironment) -> list[str]:
     remarks = []
     for parameter in environment.parameters:
@@ -260,7 +265,8 @@ def _terms(environment: MjcfEnvironment, draws: FloatArray) -> str:
             label = "".join(c if c.isalnum() else "_" for c in f"{parameter.name}_{number}" if c.isascii())
             if term is None:
                 why = _NO_EVENT.get(target.rpartition(".")[2], "no event of Isaac Lab sets it")
-                lines.append(f"    # {target}: {values.mean():.6g} +- {values.std():.2g} {parameter.unit}; {why}")
+                size = f"{values.mean():.6g} +- {values.std():.2g} {parameter.unit}"
+                lines.append(f"    # {printed(target)}: {size}; {why}")
             else:
                 function, entity, settings = term
                 lines += [

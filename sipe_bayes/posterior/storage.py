@@ -115,11 +115,17 @@ def ready_arviz() -> None:
             os.environ |= {} if cache is None else {"XDG_CACHE_HOME": cache}
 
 
+def _hdf5_name(word: str) -> str:
+    """A name as HDF5 takes it, to which a slash is a folder, and a dot the one that it stands in."""
+    return word.replace("/", "|").replace("\0", "") if word.strip(".") else f"parameter{word}"
+
+
 def netcdf(data: arviz.InferenceData) -> bytes:
     """The netCDF of draws, the same bytes for the same draws, made in memory: on a full disk HDF5 crashes."""
     buffer = io.BytesIO()
     for k, name in enumerate(data.groups()):
         group = data[name]
+        group = group.rename({word: _hdf5_name(str(word)) for word in {*group.variables, *group.dims}})
         group.attrs.pop("created_at", None)
         packed = {key: {"zlib": True} for key, values in group.variables.items() if values.dtype.kind in "fiub"}
         group.to_netcdf(buffer, mode="a" if k else "w", group=name, engine="h5netcdf", encoding=packed)

@@ -255,3 +255,27 @@ def test_the_playground_function_batches_the_draws(case: tuple[MjcfEnvironment, 
         plain.qpos[:], plain.qvel[:], plain.ctrl[:] = 0.3, 0.5, 0.2
         mujoco.mj_forward(own, plain)
         np.testing.assert_allclose(moved, plain.qacc, rtol=2e-3, atol=2e-3)
+
+
+HOSTILE = [
+    '"""\nraise SystemExit\n"""',
+    "a\nraise SystemExit\n#",
+    "\\",
+    'ends in "',
+    "'''+exit()+'''",
+    "{names}%s",
+    "\\N{BULLET}\\x",
+    "\u2028\x0craise",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_no_name_is_code(name: str) -> None:
+    """Names come from configurations of others; those of targets have no second line."""
+    parameters = [Parameter(name, 0.2, 1.0, targets=("body:arm.mass",)), PARAMETERS[1]]
+    own = MjcfEnvironment.build(XML, parameters, ["motor"], ["joint:hinge.position"])
+    values = own.space.values(np.full((3, 2), 0.5))
+    for text in sources(own, values).values():
+        statements = [type(node).__name__ for node in ast.parse(text).body]
+        assert ast.get_docstring(ast.parse(text))
+        assert not {"Expr", "Raise"} & set(statements[1:])

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pyro
 import pytest
 import torch
 
+from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.posterior import (
     FAMILIES,
     Dirac,
@@ -23,6 +25,7 @@ from sipe_bayes.posterior import (
     SurrogatePosterior,
     load_posterior,
 )
+from sipe_bayes.posterior.storage import netcdf
 from tests.problems.html import cells
 from tests.problems.posteriors import EXAMPLES, SIGMAS, example, seeded
 
@@ -182,3 +185,11 @@ def test_inference_data(posterior: Posterior) -> None:
 def test_outside_is_minus_infinity(posterior: Posterior) -> None:
     if posterior.has_density:
         assert float(posterior.log_prob(torch.full((len(posterior.space),), 1.001))) == -math.inf
+
+
+def test_names_that_hdf5_has_another_meaning_for(tmp_path: Path) -> None:
+    space = ParameterSpace([Parameter(name, 0.0, 1.0) for name in ("left/right", ".", "..", "plain")])
+    content = netcdf(Dirac([0.1, 0.2, 0.3, 0.4], space).to_inference_data())
+    (tmp_path / "draws.nc").write_bytes(content)
+    with h5py.File(tmp_path / "draws.nc") as file:
+        assert {"left|right", "parameter.", "parameter..", "plain"} <= set(file["posterior"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 
 from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
+from sipe_bayes.core.files import printed
 from sipe_bayes.core.toml import to_toml
 
 _WIDTH = 118
@@ -16,14 +17,14 @@ def toml_of(draft: Draft, command: str) -> str:
     """The whole file; command: what wrote it."""
     parts = [_comment(f"Written by: {command}"), *(_comment(note) for note in draft.notes), *map(_open, draft.doubts)]
     text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, **draft.likelihood}).rstrip("\n")
-    text += f" # {draft.window_note}\n"
+    text += f" # {printed(draft.window_note)}\n"
     if len(draft.logs) >= _INLINE:
         rows = [to_toml({"row": [log.row()]}) for log in draft.logs]
         lines = ["{" + ", ".join(row.splitlines()[1:]) + "}" for row in rows]
         text += "logs = [\n" + "".join(f"    {line},\n" for line in lines) + "]\n"
     clock = draft.clock
     text += "\n[columns]\n" + "".join(f"{_open(clock.doubt)}\n" for _ in range(bool(clock.doubt)))
-    text += to_toml({"row": [{"time": clock.row}]}).splitlines()[1] + f" # {clock.why}\n"
+    text += to_toml({"row": [{"time": clock.row}]}).splitlines()[1] + f" # {printed(clock.why)}\n"
     text += f"episode = {_string(draft.episode)}\n" if draft.episode else ""
     blocks = [_reading("commands", reading) for reading in draft.commands]
     blocks += [_reading("measurements", reading) for reading in draft.measurements]
@@ -38,7 +39,7 @@ def _string(word: str) -> str:
 
 
 def _comment(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="#   "))
+    return "\n".join(textwrap.wrap(printed(text), _WIDTH, initial_indent="# ", subsequent_indent="#   "))
 
 
 def _open(doubt: str) -> str:
@@ -49,7 +50,7 @@ def _reading(table: str, reading: Reading) -> str:
     """A command or measurement: evidence, what is open, its keys, and what would stand there instead."""
     lines = [_comment(note) for note in reading.notes] + [_open(doubt) for doubt in reading.doubts]
     body = to_toml({table: [reading.row()]}).rstrip("\n")
-    instead = [f"# {line}" for line in reading.instead]
+    instead = [f"# {printed(line)}" for line in reading.instead]
     return "\n".join([*lines, body, *instead]) + "\n"
 
 
