@@ -86,9 +86,11 @@ class Command(Table):
     """1 or -1"""
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
+    tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = 0.1
+    """sd of what the actuator delivers, as a share of what the column says: a motor constant is known to about a tenth,
+    and masses and friction are off by as much. The intervals with what the model lacks allow for it. 0: exact"""
     rate: Positive | None = None
-    """Hz at which firmware evaluates the controller that the actuator stands for, and holds its output between; see
-    [firmware](../firmware.md). Default: at every physics step"""
+    """Hz at which [firmware](../firmware.md) evaluates the controller, and holds its output between; default always"""
     supply: Supply | None = None
     """`{ column = "battery" }`: its voltage scales a duty, or with `rate` and `nominal` what the controller puts out"""
 
@@ -275,8 +277,7 @@ class NormalPrior(Table):
     """A normal prior truncated to the bounds, in their terms: SI, or factors of the model's value."""
 
     mean: Number
-    """normal prior truncated to the bounds: its mean, in SI, or beside `factor` in factors; default uniform on
-    the scale"""
+    """normal prior within the bounds: its mean, in SI, or beside `factor` in factors; default uniform on the scale"""
     sd: Positive
     """its standard deviation"""
 
@@ -374,8 +375,7 @@ class Search(Table):
     """how many points are simulated to choose them from, besides the model as given. They are drawn from the
     prior; from 40 on, the later ones around the best so far"""
     start: dict[str, Number] | None = None
-    """of `laplace`: values by parameter, in SI, from which the search begins instead, as `sipe discover` writes
-    them"""
+    """of `laplace`: values by parameter, in SI, where the search begins instead, as `sipe discover` writes them"""
 
 
 class Structure(Table):
@@ -388,7 +388,7 @@ class Structure(Table):
     extra: tuple[OwnExtension, ...] = ()
     """extensions of your own beside them: `"path/to/file.py:Class"` or `"package.module:Class"`"""
     sites: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
-    """joints, actuators and channels where extensions may be placed; default all"""
+    """joints, actuators, bodies and channels where extensions may be placed; default all"""
     budget: Budget | None = None
     """rollouts of all its fits; default 20,000"""
 

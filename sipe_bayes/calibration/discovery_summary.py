@@ -136,7 +136,7 @@ class _Model:
     def further(self, seed: int) -> Posterior | None:
         """Of the user's parameters that a further log would ask for; None where that cannot be said."""
         prior = self.structures.search.fitting.prior_of(self.structures.simulator(self.one))
-        missing = None if self.probed is None else missing_physics(self.probed, prior, seed)
+        missing = None if self.probed is None else missing_physics(self.probed, prior, seed, self.problem.tolerances)
         if missing is None:
             return None
         space = self.problem.prior.space

@@ -74,6 +74,11 @@ class Problem:
         return Findings(self.findings).warnings
 
     @property
+    def tolerances(self) -> dict[str, float]:
+        """The sd of what each actuator delivers, as a share of what its command says."""
+        return {command.actuator: command.tolerance for command in self.config.commands}
+
+    @property
     def segments(self) -> Segments:
         """The windows by which logs are scored, drawn and checked: the likelihood's own.
 

@@ -41,6 +41,7 @@ from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.tolerances import open_gains, tolerance_findings
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
@@ -99,7 +100,7 @@ def calibrate(
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
-    missing = _missing(probed, alone, problem.prior, method.seed) if doubted else None
+    missing = _missing(probed, alone, problem, method.seed) if doubted else None
     predictions = _Predictions.of(problem, theta)
     outside = _outside(problem, method, fit, lacks, predictions, unknown)
     bands = predictions.bands(posterior, missing, method.seed)
@@ -258,11 +259,11 @@ def _one_by_one(
     return alone, disagreement(space, alone), [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
 
 
-def _missing(probed: ProbedLogs | None, alone: list[LogEstimate], prior: Posterior, seed: int) -> MissingPhysics | None:
+def _missing(probed: ProbedLogs | None, alone: list[LogEstimate], problem: Problem, seed: int) -> MissingPhysics | None:
     """What a further log would ask for; from the logs' own estimates where nothing could be probed."""
     if probed is not None:
-        return missing_physics(probed, prior, seed)
-    return MissingPhysics(random_effects(alone, prior, seed).new_log, (), False) if alone[1:] else None
+        return missing_physics(probed, problem.prior, seed, problem.tolerances)
+    return MissingPhysics(random_effects(alone, problem.prior, seed).new_log, (), False) if alone[1:] else None
 
 
 def _mixing(method: Estimator) -> Mixing | None:
@@ -286,8 +287,8 @@ def _residuals(
 ) -> tuple[ProbedLogs | None, list[Residual]]:
     """The logs as the checks of their residuals see them, and the residuals.
 
-    Nothing with a ``StateSpace``, whose process noise takes what the model lacks. unknown: gets a finding where they
-    cannot be looked at.
+    Nothing with a ``StateSpace``, whose process noise takes what the model lacks. unknown: gets findings of what they
+    cannot tell.
     """
     if isinstance(problem.likelihood, StateSpace):
         return None, []
@@ -304,6 +305,7 @@ def _residuals(
         if probed.windows.num_windows < windows.num_windows:
             asked = probed.windows.num_windows
             unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=windows.num_windows))
+        unknown.extend(tolerance_findings(probed, open_gains(probed, problem.tolerances)))
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         probed = None

@@ -17,8 +17,8 @@ _SMOOTHER = "Use shorter windows, or drop the parameters that make the simulatio
 
 ADVICE: dict[Code, str] = {
     Code.BUDGET_SPENT: (
-        "Give a larger `budget`; the same command with the same folder does not take up a changed one, so give "
-        "another `--out`."
+        "Give a larger `budget`: the same command in the same folder goes on with laplace; give other methods another "
+        "`--out`."
     ),
     Code.AT_BOUND: _BOUNDS,
     Code.NOT_MIXED: (
@@ -136,6 +136,10 @@ ADVICE: dict[Code, str] = {
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
+    Code.COMMAND_SCALE: (
+        "Motion tells masses, inertias and friction only in the scale of the forces. Weigh one part and fix its mass "
+        "with `actuator:NAME.gain` (a servo's `kp`) free, or say by `tolerance` of the command how well it is known."
+    ),
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",
     Code.PROCESS_NOISE: "What the model lacks acts there. A few per cent are usual of a good model.",

@@ -37,7 +37,7 @@ from sipe_bayes.envs.targets import bind
 from sipe_bayes.envs.unknowns import physical_targets
 from sipe_bayes.structure.machine import Machine
 
-Kind = Literal["joint", "actuator", "channel", "world"]
+Kind = Literal["joint", "actuator", "body", "channel", "world"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PROBE = 0.03  # of a parameter's range, how far a probe goes: an effect that is still about linear
 WORLD = "world"  # the one site of an extension of the world
@@ -55,6 +55,7 @@ class Extension(ABC):
     native: ClassVar[bool] = True  # MJCF has an element for it
     nearest: ClassVar[str] = ""  # the element of MJCF that comes nearest, where it has none of its own
     last_resort: ClassVar[bool] = False  # tried only where nothing else helps
+    tolerance: ClassVar[bool] = False  # of a number that no machine has exactly, whatever its logs tell
 
     @abstractmethod
     def sentence(self, site: str) -> str:
@@ -90,7 +91,7 @@ class Placed:
 
     Args:
         extension: which.
-        site: name of the joint, actuator or channel; ``WORLD``.
+        site: name of the joint, actuator, body or channel; ``WORLD``.
         parameters: its unknowns, with the model's own values as defaults.
         edit: what it changes in the MJCF.
         probes: theta (G, K, P) at which it is tried, for each of G shapes.
@@ -135,6 +136,7 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     sites = {
         "joint": tuple(machine.joints),
         "actuator": machine.environment.actuators,
+        "body": tuple(machine.bodies),
         "channel": machine.environment.channels,
         "world": (WORLD,),
     }

@@ -16,6 +16,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 _SAMPLES = 400  # of the logs, of which forces are computed
+_PARALLEL = 1e-6  # of the cosine between two axes
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,24 @@ class JointSizes:
     velocity: float
     force: float
     inertia: float
+
+
+@dataclass(frozen=True)
+class BodySizes:
+    """Of one body that moves, as the model has it, in SI.
+
+    Args:
+        mass: kg.
+        centre: x, y and z of the centre of mass in the body's frame, in m.
+        gyration: radius of gyration about it, in m.
+        turned: the axes of the body's frame along which it matters where the centre lies: all but those that every
+            joint turns it about.
+    """
+
+    mass: float
+    centre: tuple[float, float, float]
+    gyration: float
+    turned: tuple[bool, bool, bool]
 
 
 @dataclass(frozen=True)
@@ -66,6 +85,20 @@ class Machine:
     def model(self) -> mujoco.MjModel:
         """The environment's model, as it is compiled; not to be written to."""
         return self.environment.compile()
+
+    @cached_property
+    def bodies(self) -> dict[str, BodySizes]:
+        """Bodies with a name and a mass that joints move."""
+        model, sizes = self.model, {}
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        for index in range(1, model.nbody):
+            mass, name = float(model.body_mass[index]), str(model.body(index).name)
+            if name and mass > 0 and model.body_weldid[index]:
+                x, y, z = (float(place) for place in model.body_ipos[index])
+                gyration = float(np.sqrt(model.body_inertia[index].max() / mass))
+                sizes[name] = BodySizes(mass, (x, y, z), gyration, _turned(model, data, index))
+        return sizes
 
     def is_hinge(self, joint: str) -> bool:
         """Whether it turns."""
@@ -119,6 +152,21 @@ def machine_of(windows: Windows, theta: FloatArray, starts: FloatArray) -> Machi
     channels = dict(zip(environment.channels, np.maximum(spread, 1e-9).tolist(), strict=True))
     names = tuple(str(name) for name in windows.trajectories.names)
     return Machine(environment, joints, forces, commands, channels, names, float(windows.dt.min()))
+
+
+def _turned(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[bool, bool, bool]:
+    """Along which axes of a body's frame a place in it is moved by the joints that turn it."""
+    axes, turned = data.xmat[body].reshape(3, 3), np.zeros(3, bool)
+    while body:
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            kind = int(model.jnt_type[joint])
+            if kind == mujoco.mjtJoint.mjJNT_HINGE:
+                turned |= np.abs(axes.T @ data.xaxis[joint]) < 1 - _PARALLEL
+            elif kind != mujoco.mjtJoint.mjJNT_SLIDE:
+                turned[:] = True
+        body = int(model.body_parentid[body])
+    x, y, z = turned.tolist()
+    return x, y, z
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,11 +41,21 @@ class Effect:
 
 @dataclass(frozen=True)
 class Probe:
-    """A cause that a model may lack: what it is, and what to do about it, in words; whether it is of one log alone."""
+    """A cause that a model may lack.
+
+    Args:
+        name: what it is, in words.
+        remedy: what to do about it.
+        by_log: whether it is of one log alone.
+        site: where it is.
+        whole: its size where the number that it changes is as large again; nan where that has no tolerance.
+    """
 
     name: str
     remedy: str
     by_log: bool = False
+    site: str = ""
+    whole: float = math.nan
 
 
 def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[Probe], FloatArray, BoolArray]:
@@ -65,7 +75,7 @@ def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[lis
     machine = machine_of(windows, theta, starts)
     every = [p for name in EXTENSIONS for p in placements(get_extension(name), machine)]
     seen = effects(windows, theta, starts, [p for p in every if not p.extension.last_resort])
-    named = [_named(effect.placed) for effect in seen for _ in effect.probes]
+    named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     nothing = np.zeros((*windows.observed.shape, 0))
     changes = np.concatenate([nothing, *(_unit(effect.change) for effect in seen)], axis=-1)
@@ -74,14 +84,25 @@ def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[lis
 
 def _unit(change: FloatArray) -> FloatArray:
     """Changes (W, L, C, K) in units of their root-mean-square."""
-    return change / np.sqrt((change**2).mean((0, 1, 2)))
+    return change / _size(change)
 
 
-def _named(placed: Placed) -> Probe:
+def _size(change: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt((change**2).mean((0, 1, 2))))
+
+
+def _named(effect: Effect) -> list[Probe]:
+    placed = effect.placed
     targets = [target for parameter in placed.parameters for target in parameter.targets]
     what = "a parameter" if len(targets) == 1 else "parameters"
     by_log = any(parameter.log is not None for parameter in placed.parameters)
-    return Probe(placed.sentence, f"make {' and '.join(targets)} {what}, or widen its bounds", by_log)
+    probe = Probe(placed.sentence, f"make {' and '.join(targets)} {what}, or widen its bounds", by_log, placed.site)
+    if not placed.extension.tolerance:
+        return [probe] * len(effect.probes)
+    (parameter,), steps = placed.parameters, (effect.probes - placed.plain)[:, 0]
+    own = parameter.default or math.nan
+    wholes = np.abs(_size(effect.change) * own / (steps * (parameter.high - parameter.low)))
+    return [replace(probe, whole=whole) for whole in wholes.tolist()]
 
 
 def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -106,6 +127,8 @@ def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Seq
     for one in placed:
         # a law costs steps of its own, an edit the cube's other models: these are simulated by themselves
         key = "" if one.edit is None and one.extension.native else one.label
+        if any(parameter.log is not None for parameter in one.parameters):
+            key = key or "by log"  # which writes what others write for all logs
         groups.setdefault(key, []).append(one)
     return [effect for group in groups.values() for effect in _of_group(windows, theta, starts, group)]
 

@@ -99,10 +99,12 @@ def test_a_base_that_moves_is_found() -> None:
     [
         ("supply_sag:world", ("actuator:m1.supply_sag", "actuator:m2.supply_sag"), 0.05, "force_drop"),
         ("command_limit:m2", ("actuator:m2.command_limit",), 1.8, "offset"),
+        ("mass:upper", ("body:upper.mass",), 1.3, "armature"),
+        ("gain:m1", ("actuator:m1.gain",), 1.12, "force_drop"),
     ],
 )
 def test_what_is_planted_at_two_joints_is_found(label: str, targets: tuple[str, ...], size: float, rival: str) -> None:
-    """One by the forces of both together, one by a set-point that is not reached."""
+    """By the forces of both together, by a set-point that is not reached, by numbers that the model has wrong."""
     machine = Simulator(environment(MACHINES["double"], [Parameter("planted", 0.0, 2 * size, targets=targets)]), 1)
     rng, time, logs = np.random.default_rng(4), np.arange(200) * 0.01, []
     for name in ("a", "b"):

@@ -15,6 +15,8 @@ and widens what each log asks for.
 Where the corrected residuals pass for noise, the interval is the corrected one alone. Else physics are missing that the
 library does not hold, or that are not small: both intervals, plain and corrected, are then mixed in equal parts.
 
+Both are widened by the gains that no motion tells (``misfit.tolerances``).
+
 Deviations:
 
 - A column is taken only where it raises the log evidence by ``gain``, and ``causes`` at most: there are dozens, and a
@@ -25,7 +27,7 @@ Deviations:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +37,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, chosen
+from sipe_bayes.diagnostics.misfit.tolerances import open_gains, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
@@ -71,7 +74,11 @@ class MissingPhysics:
 
 
 def missing_physics(
-    logs: ProbedLogs, prior: Posterior, seed: int = 0, options: MissingPhysicsOptions = _OPTIONS
+    logs: ProbedLogs,
+    prior: Posterior,
+    seed: int = 0,
+    tolerances: Mapping[str, float] | None = None,
+    options: MissingPhysicsOptions = _OPTIONS,
 ) -> MissingPhysics | None:
     """The interval for a model that lacks something; no simulation beside what ``logs`` took.
 
@@ -79,6 +86,7 @@ def missing_physics(
         logs: linearised at the estimate.
         prior: of theta.
         seed: of the draws.
+        tolerances: sd of what each actuator delivers, as a share of what its command says; default exact ones.
         options: of the search for causes.
 
     Returns:
@@ -87,17 +95,18 @@ def missing_physics(
     parts = parts_of(logs.windows)
     if len(parts) < 2:
         return None
+    opened = open_gains(logs, tolerances or {})
+    gains = tuple(f"a gain of {one.actuator} that is {100 * one.sd:.3g} % off" for one in opened)
     causes = _Causes.of(logs, options)
-    plain = random_effects(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed).new_log
+    further = random_effects(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed).new_log
     if not len(causes.kept):
-        return MissingPhysics(plain, (), False)
+        return MissingPhysics(widened(further, opened, seed), gains, False)
     explained = causes.explain(logs, seed)
     corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
     corrected = causes.widened(corrected, np.random.default_rng(seed))
     named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
-    if explained:
-        return MissingPhysics(corrected, named, explained)
-    return MissingPhysics(_mixed(plain, corrected), named, False)
+    further = corrected if explained else _mixed(further, corrected)
+    return MissingPhysics(widened(further, opened, seed), named + gains, explained)
 
 
 def _estimates(

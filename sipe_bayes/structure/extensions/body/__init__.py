@@ -1,0 +1,1 @@
+"""Extensions at a body: its numbers that the model has wrong."""

@@ -1,0 +1,62 @@
+"""A scale that no motion tells is allowed for, and one that the logs tell is not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.tolerances import open_gains, tolerance_findings
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import prior
+from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.pendulums import XML, log, pendulum
+
+GAIN, TOLERANCES = 1.1, {"motor": 0.1}
+
+
+def probed(simulator: Simulator, theta: FloatArray) -> ProbedLogs:
+    """Two logs of a pendulum of .6 kg whose motor is a tenth stronger than its commands say, at theta."""
+    machine = pendulum(Parameter("gain", 0.5, 1.5, targets=("actuator:motor.gain",)))
+    logs = Trajectories.stack([log(machine, [0.6, 0.08, GAIN], seed, name=str(seed)) for seed in (2, 3)])
+    windows = Windows(Segments(0.5), simulator, logs)
+    return ProbedLogs(windows, theta, Noise(np.array([0.01]), np.zeros(1)))
+
+
+def test_masses_are_allowed_the_tolerance_of_the_motor_and_said_to_be() -> None:
+    """At the best fit, mass and damping a tenth too small, motions are those of the true values: no log tells."""
+    simulator = pendulum()
+    truth = simulator.space.normalise(np.array([0.6, 0.08]))
+    seen = probed(simulator, simulator.space.normalise(np.array([0.6, 0.08]) / GAIN))
+    (opened,) = open_gains(seen, TOLERANCES)
+    np.testing.assert_allclose(opened.shift, truth - seen.theta, rtol=0.05)
+    exact, allowed = (missing_physics(seen, prior(simulator.space), 0, t) for t in ({}, TOLERANCES))
+    assert exact is not None
+    assert allowed is not None
+    squares = [one.further.variance.numpy() for one in (exact, allowed)]
+    print(squares, opened.shift)
+    np.testing.assert_allclose(squares[1], squares[0] + opened.shift**2, rtol=0.1)  # some 2,000 draws: 3 % each
+    low, high = allowed.further.quantile([0.05, 0.95]).numpy()
+    assert ((low <= truth) & (truth <= high)).all()
+    assert "a gain of motor that is 10 % off" in allowed.causes
+    assert not any("10 %" in c for c in exact.causes)
+    (noticed,) = tolerance_findings(seen, [opened])
+    assert noticed.code is Code.COMMAND_SCALE
+    assert "rod_mass by +0.05" in noticed.text
+
+
+def test_where_the_logs_tell_the_gain_or_it_is_exact_nothing_is_allowed() -> None:
+    """With the mass known only the friction is open, which does not move as another gain does."""
+    friction = Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",))
+    simulator = Simulator(MjcfEnvironment.build(XML, [friction], ["motor"], ["joint:hinge.position"]), 1)
+    seen = probed(simulator, np.array([0.4]))
+    assert open_gains(seen, TOLERANCES) == []
+    seen = probed(pendulum(), pendulum().space.normalise(np.array([0.6, 0.08]) / GAIN))
+    assert open_gains(seen, {"motor": 0.0}) == open_gains(seen, {}) == []
