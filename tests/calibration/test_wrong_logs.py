@@ -73,7 +73,7 @@ def test_wrong_input(tmp_path: Path, columns: dict[str, Any], words: dict[str, s
 # (file, bytes, words in the message)
 WRONG_FILES: list[tuple[str, bytes | None, str]] = [
     ("lag.csv", None, "no such file; did you mean 'log.csv'"),
-    ("x.tdms", b"1", "expected a .csv, .parquet, .npz, .* or .ulg file, got '.tdms'; convert it"),
+    ("x.tdms", b"1", "expected a .csv, .* or .ulg file, got '.tdms'; convert it"),
     ("x.mat", b"1", "no MATLAB file of version 5 to 7.3; save it with `save -v7`"),
     ("x.csv", b"", "holds no samples|cannot be read"),
     ("x.csv", b"0.0,1.0\n0.1,2.0\n", "first line must name the columns, got '0.0,1.0'"),
