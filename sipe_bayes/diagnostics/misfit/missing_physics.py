@@ -56,6 +56,7 @@ class MissingPhysicsOptions(Options):
 
 
 _OPTIONS = MissingPhysicsOptions()
+_NOTHING = 1e-150  # information of a column that moves nothing: its square is no number
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,7 @@ def sparse(
         (K,).
     """
     size = np.diag(precision)[plain:]
+    usable = usable & (size > _NOTHING)
     alpha = np.full(len(size), np.inf)
     for _ in range(options.most):
         kept = np.flatnonzero(np.isfinite(alpha))

@@ -58,6 +58,13 @@ def test_columns_that_may_not_be_taken_or_would_be_negative_stay_out() -> None:
     assert not np.isfinite(sparse(precision, gradient, 1, nobody, nobody)).any()
 
 
+def test_a_column_that_moves_nothing_is_left_out_without_a_warning() -> None:
+    """Its gradient is rounding: 1e-20 is far more than the square of an information of zero."""
+    with np.errstate(divide="raise", invalid="raise", over="raise"):
+        alpha = sparse(np.diag([4.0, 0.0, 9.0]), np.array([1.0, 1e-20, 30.0]), 1, np.ones(2, bool), np.zeros(2, bool))
+    assert np.isfinite(alpha).tolist() == [False, True]
+
+
 def of_logs(logs: list[Trajectory]) -> tuple[MissingPhysics, FloatArray, FloatArray]:
     """With plain 90 % intervals (2, 2) and these, of rod mass and damping alone."""
     simulator, recorded = pendulum(), Trajectories.stack(logs)
