@@ -18,7 +18,7 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
-from sipe_bayes.inference.laplace.growing_windows import grown_starts, grows, told_starts
+from sipe_bayes.inference.laplace.growing_windows import grown_starts, grows, tells_starts, told_starts
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
@@ -37,7 +37,7 @@ def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None
 
     Of bodies that tumble those of ``near`` (N,) serve all, default each theta its own.
     """
-    if grows(windows) and windows.trajectories.states is None:
+    if tells_starts(windows) and windows.trajectories.states is None:
         own = [told_starts(windows, at, GrowingTuning()) for at in (theta if near is None else near[None])]
         return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
     simulator, model = windows.simulator, windows.simulator.model

@@ -33,6 +33,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint
@@ -155,12 +156,18 @@ def start_steps(windows: Windows, size: float) -> FloatArray:
     return size * np.concatenate([np.full(half, 0.05), np.full(windows.num_start - half, 0.5)])
 
 
+def tells_starts(windows: Windows) -> bool:
+    """Whether first moments tell starts: of windows that grow, but of bodies that are only felt (an inertial unit)."""
+    simulator = windows.simulator
+    return grows(windows) and not inertial_joints(simulator.model, simulator.environment.poses)
+
+
 def told_starts(windows: Windows, theta: FloatArray, tuning: GrowingTuning) -> FloatArray:
     """Starts (W, D) that the first moments of the windows tell of at a fixed theta (N,): of what follows nothing.
 
-    The measured ones of windows that do not grow.
+    The measured ones where ``tells_starts`` says no.
     """
-    if not grows(windows):
+    if not tells_starts(windows):
         return windows.no_starts()
     steps, before = math.ceil(tuning.telling / float(windows.dt.min())), windows.rollouts
     view = windows.beginnings(max(tuning.fewest_steps, steps))
