@@ -154,7 +154,7 @@ if __name__ == "__main__":
             raise SystemExit(f"{out}: holds rows of {summary['command']}; choose another --out")
     for calibration in given.calibration:
         for method in given.methods:
-            if any((row["method"], row["calibration"]) == (method, calibration) for row in summary["rows"]):
+            if any((row["method"], row.get("calibration")) == (method, calibration) for row in summary["rows"]):
                 continue
             summary["rows"].append(run(given.task, method, calibration, given.budget, given.truths))
             print(json.dumps(summary["rows"][-1]), flush=True)
