@@ -25,6 +25,7 @@ from sipe_bayes.core.files import LONGEST_TEXT, MODEL_GIB, MODEL_SECONDS, TRUST_
 
 _STEPS = 5
 _START = 10.0  # s that a process may take until it reads the file
+_PATIENCE = 1 if sys.platform == "win32" else 5  # times the limit on a clock: elsewhere the processor's time is limited
 MOST_FILES = 1000
 """That a model may include."""
 # an element up to its end, whatever its attributes hold; possessive, so that no file makes it look twice
@@ -101,7 +102,7 @@ def _tried(path: str, content: str, seconds: float, gib: float) -> str:
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                timeout=seconds + _START,
+                timeout=_PATIENCE * seconds + _START,
             )
         except subprocess.TimeoutExpired:
             return _slow(seconds)
