@@ -67,6 +67,9 @@ class Thresholds(Options):
     misfit: float = option(
         0.05, "false alarms of residuals that are noise, and of logs that the prior gives", "p-value"
     )
+    unlike: float = option(
+        0.01, "false alarms of logs that simulations of a trained method are held against", "p-value"
+    )
     followed: float = option(
         0.5, "simulations that leave less follow a log: wrong units and signs leave about all", "of its bends"
     )

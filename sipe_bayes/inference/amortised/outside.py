@@ -1,25 +1,19 @@
 """Is a log like the simulations that a method learned from? A test before any answer, in the space of summaries.
 
-With x a log's samples and statistics, standardised over n simulations (``models.regressed.Columns``), K the matrix of
-their products 1 + <x_i, x_j>, and k those of the log with them, the simulations leave
+A log's samples and statistics, standardised over the simulations (``models.regressed.Columns``), are a point among
+theirs. Its distance to the ``_NEAREST``th nearest of them, as a multiple of these neighbours' own (a local outlier
+factor: M. Breunig, H. Kriegel, R. Ng, J. Sander 2000, "LOF: identifying density-based local outliers",
+https://doi.org/10.1145/335191.335388), is compared with the factors of the simulations among the others, so that p is
+uniform for logs of the prior, whatever the distribution (V. Vovk, A. Gammerman, G. Shafer 2005, "Algorithmic learning
+in a random world").
 
-    v = 1 + <x, x> - k^T (K + lambda I)^-1 k
-
-of it. Where there are more numbers than simulations this is its squared distance from their span: motions that no
-theta within the bounds gives, as of physics that the model lacks (process monitoring's Q statistic: J. Jackson, G.
-Mudholkar 1979, "Control procedures for residuals associated with principal component analysis",
-https://doi.org/10.1080/00401706.1979.10489779). Where there are fewer, v / lambda goes as its leverage, Hotelling's T
-squared: motions larger than any that was simulated. Both are looked at, v / <x, x> for the first and v for the second,
-and compared with what the others leave of each simulation, so that p is uniform for logs of the prior, whatever the
-distribution (V. Vovk, A. Gammerman, G. Shafer 2005, "Algorithmic learning in a random world").
-
-A log whose start had to be estimated begins a little off all simulations, which their span does not hold: it is looked
-at along their ``_LEADING`` principal directions alone, where only what is grossly different shows.
+A log whose start had to be estimated begins a little off all simulations: only a factor beyond every simulation's
+raises an alarm then.
 
 Deviations:
 
-- Twice the smaller p of the two (Bonferroni).
-- The others are one fewer than the log's simulations, and were standardised together with the one that is left out.
+- Neighbours' mean distance stands for the mean of their densities, without reachability.
+- The simulations' others are one fewer than the log's, and were standardised together with the one that is left out.
 """
 
 from __future__ import annotations
@@ -28,13 +22,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import scipy.spatial.distance
 
-from sipe_bayes.core.arrays import Float32Array, FloatArray
+from sipe_bayes.core.arrays import Float32Array, FloatArray, IntArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.models.regressed import Columns
 
-_RIDGE = 1e-6  # of K's largest eigenvalue: rounding of float32
-_LEADING = 3  # principal directions in which an error of the start is small beside what theta does
+_NEAREST = 20  # neighbours: fewer are near by chance, more reach beyond what is local
 
 
 @dataclass(frozen=True)
@@ -43,41 +37,51 @@ class Outside:
 
     Attributes:
         samples, statistics: columns that vary.
-        directions: (F, P), leading ones, of logs whose start is an estimate; else None.
-        points: (n, F or P), standardised.
-        inverse: (n, n) of K + lambda I.
-        left: (n, 2), what the others leave of each, of its own size and as it is.
+        points: (n, F), standardised.
+        spacing: (n,), distance of each from its nearest others.
+        factors: (n,), outlier factor of each among the others.
+        known_start: whether logs start where the simulations did.
     """
 
     samples: Columns
     statistics: Columns
-    directions: Float32Array | None
     points: Float32Array
-    inverse: FloatArray
-    left: FloatArray
+    spacing: FloatArray
+    factors: FloatArray
+    known_start: bool
 
     @classmethod
     def of(cls, samples: FloatArray, statistics: FloatArray, noise: FloatArray, known_start: bool) -> Self:
         """Of simulations' samples (n, D), with noise of sd ``noise`` (D,), and statistics (n, E)."""
         columns = Columns.of(samples, noise), Columns.of(statistics, np.zeros(statistics.shape[1]))
         points = np.concatenate([columns[0](samples), columns[1](statistics)], axis=1)
-        directions = None if known_start else np.linalg.svd(points, full_matrices=False)[2][:_LEADING].T.copy()
-        points = points if directions is None else points @ directions
-        products = 1 + (points @ points.T).astype(float)
-        ridge = _RIDGE * float(np.linalg.eigvalsh(products)[-1])
-        inverse = np.linalg.inv(products + ridge * np.eye(len(points)))
-        left = 1 / np.diag(inverse) - ridge
-        return cls(*columns, directions, points, inverse, np.stack([left / np.diag(products), left], axis=1))
+        distances = scipy.spatial.distance.cdist(points, points)
+        np.fill_diagonal(distances, np.inf)
+        spacing = _furthest(distances, _nearest(distances))
+        return cls(*columns, points, spacing, _factors(distances, spacing), known_start)
 
     def p_value(self, samples: FloatArray, statistics: FloatArray) -> float:
         """Of a log (1, D) with statistics (1, E) as unlike the simulations as this one."""
-        point = np.concatenate([self.samples(samples), self.statistics(statistics)], axis=1)[0]
-        point = point if self.directions is None else point @ self.directions
-        row, own = 1 + (self.points @ point).astype(float), 1 + float(point @ point)
-        left = own - row @ self.inverse @ row
-        larger = (self.left >= [left / own, left]).sum(0)
-        return min(1.0, 2 * (1 + int(larger.min())) / (1 + len(self.left)))
+        point = np.concatenate([self.samples(samples), self.statistics(statistics)], axis=1)
+        (factor,) = _factors(scipy.spatial.distance.cdist(point, self.points), self.spacing)
+        return float((1 + (self.factors >= factor).sum()) / (1 + len(self.factors)))
 
     def alarm(self, p: float) -> bool:
         """Whether p is too small for a log of the prior, or as small as so few simulations let it be."""
-        return p <= max(THRESHOLDS.misfit, 2 / (1 + len(self.left)))
+        least = 1 / (1 + len(self.factors))
+        return p <= (max(THRESHOLDS.unlike, least) if self.known_start else least)
+
+
+def _nearest(distances: FloatArray) -> IntArray:
+    """Numbers (m, K) of the nearest of n others at these distances (m, n), nearest first."""
+    return np.argsort(distances, axis=1)[:, : max(1, min(_NEAREST, distances.shape[1] // 5))]
+
+
+def _furthest(distances: FloatArray, nearest: IntArray) -> FloatArray:
+    return np.asarray(np.take_along_axis(distances, nearest[:, -1:], axis=1)[:, 0])
+
+
+def _factors(distances: FloatArray, spacing: FloatArray) -> FloatArray:
+    """How far m points are from their nearest of n others (m, n), by these neighbours' own spacing (n,): (m,)."""
+    nearest = _nearest(distances)
+    return _furthest(distances, nearest) / np.maximum(spacing[nearest].mean(1), np.finfo(float).tiny)

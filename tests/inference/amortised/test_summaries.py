@@ -77,24 +77,24 @@ def test_simulations_beyond_the_most_are_summarised_as_new_ones() -> None:
 
 
 def test_logs_of_the_prior_are_within_the_simulations_and_others_are_not() -> None:
-    """150 logs of the prior: at a rate of 5 % more alarms come once in ten thousand; every other log raises one.
+    """150 logs of the prior: at a rate of 1 % more alarms come once in ten thousand; every other log raises one.
 
     The others have a third sine, or are larger than any simulation.
     """
     rng = np.random.default_rng(3)
-    samples = motions(rng.uniform(size=(120, 2)), rng)
+    samples = motions(rng.uniform(size=(300, 2)), rng)
     outside = Outside.of(samples, squares(samples), np.full(len(STEPS), 0.1), known_start=True)
     within = motions(rng.uniform(size=(150, 2)), rng)
     alarms = [outside.alarm(outside.p_value(x[None], squares(x[None]))) for x in within]
     print(sum(alarms))
-    assert sum(alarms) <= binom.ppf(1 - 1e-4, 150, 0.05)
-    for wrong in (motions(rng.uniform(size=(20, 2)), rng, further=0.4), motions(np.full((20, 2), 2.0), rng)):
+    assert sum(alarms) <= binom.ppf(1 - 1e-4, 150, 0.01)
+    for wrong in (motions(rng.uniform(size=(20, 2)), rng, further=0.8), motions(np.full((20, 2), 2.0), rng)):
         assert all(outside.alarm(outside.p_value(x[None], squares(x[None]))) for x in wrong)
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_pendulum_with_dry_friction_is_outside_a_model_without(known: bool) -> None:
-    """More than the rate of 5 % explains where the start is known (.0003); without friction no more (.0003)."""
+    """Of 20 logs at least half raise an alarm, at a rate of 1 % once in 1e14; of right ones no more than 3 (5e-5)."""
     plain = pendulum()
     machine = pendulum(Parameter("friction", 0.0, 0.56, targets=("joint:hinge.frictionloss",)))
     actions = log(plain, [0.6, 0.05], 1, steps=200).actions
@@ -116,8 +116,8 @@ def test_a_pendulum_with_dry_friction_is_outside_a_model_without(known: bool) ->
             method.fit(one)
             alarms[what] += any(f.code is Code.UNLIKE_SIMULATIONS for f in method.findings)
     print(alarms)
-    assert alarms["right"] <= 5
-    assert alarms["wrong"] >= 6 or not known
+    assert alarms["right"] <= 3
+    assert alarms["wrong"] >= 10
 
 
 @pytest.mark.parametrize("method", ["bayessim", "npe"])
