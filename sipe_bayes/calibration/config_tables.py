@@ -87,8 +87,8 @@ class Command(Table):
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
     tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = 0.1
-    """sd of what the actuator delivers, as a share of what the column says: a motor constant is known to about a tenth,
-    and masses and friction are off by as much. The intervals with what the model lacks allow for it. 0: exact"""
+    """sd of what a motor or position servo delivers, as a share of what the column says: a motor constant is known to
+    about a tenth, and masses are off by as much. The intervals with what the model lacks allow for it. 0: exact"""
     rate: Positive | None = None
     """Hz at which [firmware](../firmware.md) evaluates the controller, and holds its output between; default always"""
     supply: Supply | None = None

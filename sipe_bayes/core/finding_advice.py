@@ -100,8 +100,8 @@ ADVICE: dict[Code, str] = {
         "Take `npe` or `bayessim` as well. Let windows begin shortly before the contacts that matter."
     ),
     Code.BEYOND_START_NOISE: (
-        "Raise `budget`: the search then begins anew from other places. Shorter windows have fewer valleys. If nothing "
-        "helps, the model lacks something: `sipe discover`."
+        "Raise `budget`, with another `--out`: the search then begins from more places. Shorter windows have fewer "
+        "valleys. If nothing helps, the model lacks something: `sipe discover`."
     ),
     Code.NOT_LOOKED_AROUND: "Raise `budget`: the look around the optimum comes last.",
     Code.TOO_FEW_DRAWS: f"The posterior bends more than a normal follows. {_COMPARE}",

@@ -101,7 +101,7 @@ def _named(effect: Effect) -> list[Probe]:
         return [probe] * len(effect.probes)
     (parameter,), steps = placed.parameters, (effect.probes - placed.plain)[:, 0]
     own = parameter.default or math.nan
-    wholes = np.abs(_size(effect.change) * own / (steps * (parameter.high - parameter.low)))
+    wholes = _size(effect.change) * own / (steps * (parameter.high - parameter.low))
     return [replace(probe, whole=whole) for whole in wholes.tolist()]
 
 

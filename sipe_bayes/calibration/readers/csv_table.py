@@ -46,20 +46,31 @@ def read_csv(path: Path, wanted: Collection[str]) -> Columns:
 def _opening(file: TextIO) -> tuple[int, str, str]:
     """How many lines of remarks stand above the header, the header, and the line after it.
 
-    A remark is an empty line or one that begins with ``#`` or ``%``; the last one is the header where rows follow.
+    A remark is an empty line or one that begins with ``#`` or ``%``; where rows follow, the header is the last that has
+    as many names as the first row has cells.
     """
-    header, first = file.readline(_LONGEST).rstrip("\r\n"), file.readline(_LONGEST)
+    header, first, remarks = file.readline(_LONGEST).rstrip("\r\n"), file.readline(_LONGEST), list[str]()
     for above in range(_REMARKS):
-        remark = not header.strip() or (header.lstrip()[0] in "#%" and not _is_row(first))
-        if not remark or not first:
+        marked = bool(header.strip()) and header.lstrip()[0] in "#%"
+        if marked and _is_row(first):
+            return above, next((line for line in [header, *remarks] if _width(line) == _width(first)), header), first
+        if not first or not (marked or not header.strip()):
             return above, header, first
+        remarks.insert(0, header)
         header, first = first.rstrip("\r\n"), file.readline(_LONGEST)
     return _REMARKS, header, first
 
 
 def _is_row(line: str) -> bool:
-    """Whether a line begins with a number."""
-    return bool(line.strip()) and _is_number(_split(line.strip(), _separator(line))[0])
+    """Whether a line holds a number and is no remark."""
+    plain = line.strip()
+    return bool(plain) and plain[0] not in "#%" and any(map(_is_number, _split(plain, _separator(plain))))
+
+
+def _width(line: str) -> int:
+    """How many cells a line has, without the mark of a remark."""
+    plain = line.strip().lstrip("#% ")
+    return len(_split(plain, _separator(plain)))
 
 
 def _float_precision(version: str) -> Literal["round_trip"] | None:

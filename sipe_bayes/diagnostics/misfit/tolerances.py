@@ -49,7 +49,7 @@ def open_gains(logs: ProbedLogs, tolerances: Mapping[str, float]) -> list[Tolera
     for k, probe in enumerate(logs.probes):
         size = probe.whole * tolerances.get(probe.site, 0.0)
         told = seen.information[k] < np.inf and seen.information[k] > _IMITATED * whole[k]
-        if size > 0 and not told:
+        if size and np.isfinite(size) and not told:
             opened.append(Tolerance(probe.site, tolerances[probe.site], -seen.answer[:, k] * size))
     return opened
 
@@ -61,10 +61,8 @@ def tolerance_findings(logs: ProbedLogs, opened: list[Tolerance]) -> list[Findin
     for one in opened:
         moved = [j for j in range(len(space)) if abs(one.shift[j]) > sd[j]]
         if moved:
-            by = [
-                f"{space[j].name} by {one.shift[j] * (space[j].high - space[j].low):+.2g} {space[j].unit}"
-                for j in moved
-            ]
+            change = np.diff(space.values(np.clip([logs.theta, logs.theta + one.shift], 0, 1)), axis=0)[0]
+            by = [f"{space[j].name} by {change[j]:+.2g} {space[j].unit}" for j in moved]
             names, percent, words = [space[j].name for j in moved], 100 * one.sd, ", ".join(by)
             code = Code.COMMAND_SCALE
             findings.append(finding(code, parameters=names, actuator=one.actuator, percent=percent, moved=words))
@@ -74,6 +72,6 @@ def tolerance_findings(logs: ProbedLogs, opened: list[Tolerance]) -> list[Findin
 def widened(further: Particles, opened: list[Tolerance], seed: int) -> Particles:
     """Draws of theta with gains drawn within their tolerances."""
     theta = further.theta.numpy()
-    sizes = np.random.default_rng(seed).standard_normal((len(theta), len(opened)))
+    sizes = np.random.default_rng([seed, 1]).standard_normal((len(theta), len(opened)))
     shifts = np.array([one.shift for one in opened]).reshape(len(opened), theta.shape[1])
     return Particles(np.clip(theta + sizes @ shifts, 0, 1), further.space, weights=further.weights.numpy())

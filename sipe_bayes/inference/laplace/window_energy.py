@@ -181,10 +181,12 @@ def start_noise(windows: Windows) -> FloatArray:
 def beyond_start_noise(windows: Windows, sd: FloatArray) -> float | None:
     """How many times noise sds (C,) are the noise of the measurements of known starts; None where no more than it.
 
-    A thousandth of a channel's spread is no matter, whatever the noise of the starts.
+    A thousandth of a channel's spread is no matter, whatever the noise of the starts; of channels whose noise there is
+    less, as in simulations without noise, nothing is asked.
     """
     noise, spread = start_noise(windows), np.maximum(windows.spread, 1e-300)
     known = np.isfinite(noise) & np.isnan(windows.fixed_sd)
+    known &= np.sqrt(np.where(known, noise**2, 0.0).sum(0) / np.maximum(known.sum(0), 1)) > 1e-3 * spread
     if not known.any():
         return None
     share = np.where(known, noise**2 + (1e-3 * spread) ** 2, 0.0) / np.maximum(sd, 1e-300) ** 2

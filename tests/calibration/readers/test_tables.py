@@ -78,3 +78,18 @@ def test_a_missing_package_is_named_with_its_command(
 def test_a_folder_that_is_no_log(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"a folder without meta/info.json or metadata.yaml; name the log's file"):
         read_table(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("# label,time,q\nrun1,0,1\nrun1,1,2\n", ["label", "time", "q"]),
+        ("# q,time\n,0\n1,1\n", ["q", "time"]),
+        ("# made by a logger\n# time,q\n# rad\n0,1\n1,2\n", ["time", "q"]),
+        ("% remark\n\ntime q\n0 1\n1 2\n", ["time", "q"]),
+        ("time,q\n0,1\n1,2\n", ["time", "q"]),
+    ],
+)
+def test_remarks_above_a_table_are_no_header(text: str, columns: list[str], tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    assert [name for name in read_table(tmp_path / "log.csv") if len(name) < 20] == columns

@@ -52,6 +52,24 @@ def test_masses_are_allowed_the_tolerance_of_the_motor_and_said_to_be() -> None:
     assert "rod_mass by +0.05" in noticed.text
 
 
+def test_the_shift_of_a_gain_has_its_sign_whichever_the_gain_has_and_its_size_on_a_log_scale() -> None:
+    """A motor mounted the other way round, its commands too, with damping on a log scale."""
+    xml = XML.replace('joint="hinge"/>', 'joint="hinge" gear="-1"/>').replace("<motor", '<general gainprm="-1"')
+    unknowns = [
+        Parameter("rod_mass", 0.3, 1.0, targets=("body:rod.mass",)),
+        Parameter("damping", 0.001, 1.0, scale="log", targets=("joint:hinge.damping",)),
+    ]
+    simulator = Simulator(MjcfEnvironment.build(xml, unknowns, ["motor"], ["joint:hinge.position"]), 1)
+    values = np.array([0.6, 0.08]) / GAIN
+    seen = probed(simulator, simulator.space.normalise(values))
+    (opened,) = open_gains(seen, TOLERANCES)
+    moved = simulator.space.values(seen.theta + opened.shift)
+    np.testing.assert_allclose(moved - values, 0.1 * values, rtol=0.15)
+    (noticed,) = tolerance_findings(seen, [opened])
+    assert "rod_mass by +0.05" in noticed.text
+    assert "damping by +0.1" not in noticed.text
+
+
 def test_where_the_logs_tell_the_gain_or_it_is_exact_nothing_is_allowed() -> None:
     """With the mass known only the friction is open, which does not move as another gain does."""
     friction = Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.simulation.contacts import contacts_change
+from sipe_bayes.simulation.contacts import contacts_change, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 BOUNCE = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
@@ -45,6 +46,11 @@ def test_a_contact_that_comes_and_goes_is_seen(simulator: Simulator) -> None:
     assert contacts_change(simulator, [high, low])
     assert not contacts_change(simulator, [high])
     assert not contacts_change(simulator, [low])
+    resting = low.copy()
+    resting[:, 1] = 0.03 + 0.0005 * np.random.default_rng(2).standard_normal(50)  # noise of what lies on the floor
+    assert not contacts_change(simulator, [resting])
+    off = BOUNCE.replace('cone="elliptic"/>', 'cone="elliptic"><flag contact="disable"/></option>')
+    assert not may_touch(mujoco.MjModel.from_xml_string(off))
     free = BOUNCE.replace('type="sphere"', 'type="sphere" contype="0" conaffinity="0"')
     apart = Simulator(MjcfEnvironment.build(free, [DAMPRATIO], [], ["joint:z.position"]), num_threads=1)
     assert not contacts_change(apart, [high, low])

@@ -21,10 +21,16 @@ class Gain(Extension):
         return f"a gain of {site} that is not the model's"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """The gain, with a normal prior of a tenth around the model's; none where gear or motor constant is unknown."""
-        gain = float(machine.model.actuator_gainprm[machine.model.actuator(site).id, 0])
-        scaled = {f"actuator:{site}.{number}" for number in ("gear", "gain", "kp", "motor_constant")}
-        if not gain or scaled & machine.written():
+        """The gain, with a normal prior of a tenth around the model's.
+
+        None where gear or gain are unknown, nor of drives whose force is no one number's multiple: velocity servos,
+        motors with a bias, muscles and dcmotors.
+        """
+        index = machine.model.actuator(site).id
+        gain, bias = float(machine.model.actuator_gainprm[index, 0]), machine.model.actuator_biasprm[index]
+        scaled = {f"actuator:{site}.{number}" for number in ("gear", "gain", "kp")}
+        servo = bias[1] == -gain and not bias[0]
+        if not gain or scaled & machine.written() or not (servo or not bias[:3].any()):
             return ()
         low, high = sorted((gain * (1 - _FURTHEST), gain * (1 + _FURTHEST)))
         return (
@@ -34,7 +40,7 @@ class Gain(Extension):
                 high,
                 prior_mean=gain,
                 prior_sd=_SD * abs(gain),
-                targets=(f"actuator:{site}.{'kp' if machine.is_position(site) else 'gain'}",),
+                targets=(f"actuator:{site}.{'kp' if servo else 'gain'}",),
                 description="force for each unit of command",
             ),
         )
