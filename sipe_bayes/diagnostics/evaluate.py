@@ -223,9 +223,11 @@ def channel_scores(windows: Windows, theta: FloatArray, predicted: FloatArray | 
 
 
 def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
-    """Predictions (B, T+1, C) of one log, window after window, of predicted (B, W, L, C)."""
-    mine = np.flatnonzero(windows.log == log)
-    return np.concatenate([predicted[:, w][:, windows.owned[w]] for w in mine], axis=1)
+    """Predictions (B, T+1, C) of one log, of predicted (B, W, L, C); NaN where no window stands."""
+    out = np.full((len(predicted), len(windows.trajectories[log].time), predicted.shape[-1]), np.nan)
+    for w in np.flatnonzero(windows.log == log):
+        out[:, windows.start[w] + np.flatnonzero(windows.owned[w])] = predicted[:, w][:, windows.owned[w]]
+    return out
 
 
 def signals(windows: Windows, use: str, predicted: FloatArray, band: tuple[FloatArray, FloatArray]) -> list[Signal]:

@@ -8,8 +8,9 @@ import pytest
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.evaluate import _jackknifed, channel_scores, compare_errors, errors
+from sipe_bayes.diagnostics.evaluate import _jackknifed, channel_scores, compare_errors, errors, fitted_residuals
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
@@ -46,6 +47,21 @@ def test_a_diverging_log_does_not_hide_the_others() -> None:
     rows = {row.log: row for row in channel_scores(windows, simulator.space.normalise(np.array([0.6, 0.05])))}
     assert rows["good"].rmse < 0.05
     assert not rows["wild"].rmse < 1e3
+
+
+def test_residuals_of_some_windows_stand_at_their_times() -> None:
+    """As where a long log is searched on blocks spread over it."""
+    simulator = pendulum()
+    recorded = log(simulator, [0.6, 0.05], 1, steps=200)
+    every = Windows(Segments(0.5), simulator, Trajectories.stack(recorded))
+    theta, noise = simulator.space.normalise(np.array([0.6, 0.05])), Noise(np.array([0.01]), np.zeros(1))
+    (whole,), (some,) = (
+        fitted_residuals(w, theta, noise, w.no_starts()) for w in (every, every.part(np.array([0, 2])))
+    )
+    shown = np.isfinite(some.residual)
+    assert len(some.residual) == len(some.time) == len(whole.residual)
+    assert 0.4 < shown.mean() < 0.6
+    np.testing.assert_array_equal(some.residual[shown], whole.residual[shown])
 
 
 CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0"/>
