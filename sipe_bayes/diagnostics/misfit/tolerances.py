@@ -48,8 +48,8 @@ def open_gains(logs: ProbedLogs, tolerances: Mapping[str, float]) -> list[Tolera
     opened = []
     for k, probe in enumerate(logs.probes):
         size = probe.whole * tolerances.get(probe.site, 0.0)
-        told = seen.information[k] < np.inf and seen.information[k] > _IMITATED * whole[k]
-        if size and np.isfinite(size) and not told:
+        determined = seen.information[k] < np.inf and seen.information[k] > _IMITATED * whole[k]
+        if size and np.isfinite(size) and not determined:
             opened.append(Tolerance(probe.site, tolerances[probe.site], -seen.answer[:, k] * size))
     return opened
 
