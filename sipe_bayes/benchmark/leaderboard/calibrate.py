@@ -3,6 +3,9 @@
 That is the interval with what the model lacks (``diagnostics.misfit.missing_physics``), which asks for windows: a log
 that was fitted whole from its known start is fitted again in windows of half a second, within the same budget. Only of
 a user's MJCF, which extensions are made for; elsewhere it is ``laplace``.
+
+Held-out logs are predicted with the most probable values of the first fit, as ``sipe calibrate`` does: where physics
+are missing, the model does not predict best with the machine's own values, which that interval is about.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import numpy as np
 
 from sipe_bayes.benchmark.leaderboard.run import DRAWS, Estimate, draws_of
 from sipe_bayes.benchmark.leaderboard.task import Case, Problem, Task
+from sipe_bayes.calibration.gathered import most_probable
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
@@ -62,14 +66,15 @@ class Calibrate:
         """See ``Method``."""
         logs, given = case.trajectories, problem.likelihood
         fit = self._fit(problem, given, logs, task.budget)
-        posterior, rollouts = fit.posterior, fit.method.rollouts
+        posterior, rollouts, best = fit.posterior, fit.method.rollouts, most_probable(fit.posterior)
         if isinstance(problem.simulator.environment, MjcfEnvironment) and self._alarm(fit):
             if given.starts == "recorded":
                 fit = self._fit(problem, Segments(), replace(logs, states=None), task.budget - rollouts)
                 rollouts += fit.method.rollouts
             missing = missing_physics(fit.probed(), problem.prior, self.seed)
             posterior = posterior if missing is None else missing.further
-        return Estimate(posterior.values(DRAWS, draws_of(self.seed, problem, case)), rollouts)
+        drawn = posterior.values(DRAWS, draws_of(self.seed, problem, case))
+        return Estimate(drawn, rollouts, problem.space.values(best))
 
     def _fit(self, problem: Problem, likelihood: Segments, logs: Trajectories, budget: int) -> _Fit:
         method = Laplace(

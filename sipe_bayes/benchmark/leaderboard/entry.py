@@ -82,12 +82,15 @@ class Answer:
         rollouts: that it simulated for this log.
         cpu_seconds: that it took for this log; what is learned once for several counts where it was learned.
         failure: why there are no values.
+        predicts: physical, (N,): what held-out logs are predicted with; default the mean of ``values``. Of a wrong
+            model the values that predict best are not the machine's own.
     """
 
     values: list[list[float]] = field(default_factory=list)
     rollouts: int = 0
     cpu_seconds: float = 0.0
     failure: str = ""
+    predicts: list[float] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ class Answers:
 
     def write(self, folder: Path) -> None:
         """Write ``tasks/TASK.json`` of an entry's folder, whole or not at all."""
-        plain = {**vars(self), "logs": {name: vars(answer) for name, answer in self.logs.items()}}
+        plain = {**vars(self), "logs": {name: _plain(answer) for name, answer in self.logs.items()}}
         write_text(answers_path(folder, self.task), to_json(plain) + "\n")
 
     def complete(self, problem: Problem) -> bool:
@@ -161,6 +164,17 @@ def theta_of(answer: Answer, problem: Problem) -> FloatArray:
     return np.clip(problem.space.normalise(np.array(answer.values)), 0.0, 1.0)
 
 
+def predicting(answer: Answer, problem: Problem) -> FloatArray:
+    """The theta (N,) that held-out logs are predicted with."""
+    if not answer.predicts:
+        return np.asarray(theta_of(answer, problem).mean(0))
+    return np.clip(problem.space.normalise(np.array(answer.predicts)), 0.0, 1.0)
+
+
+def _plain(answer: Answer) -> dict[str, object]:
+    return {name: value for name, value in vars(answer).items() if name != "predicts" or value}
+
+
 def rounded(values: FloatArray) -> list[list[float]]:
     """Values (M, N) to six digits, as they are written."""
     return [[float(f"{x:.6g}") for x in row] for row in values]
@@ -176,11 +190,18 @@ def check_answer(where: str, answer: Answer, problem: Problem) -> None:
         raise EntryError(f"{where}: expected values or a failure, got {'both' if answer.values else 'neither'}")
     if answer.failure:
         return
-    size, widths = len(problem.space), {len(row) for row in answer.values}
-    if widths != {size} or len(answer.values) > MOST_DRAWS:
-        shape = f"{len(answer.values)} rows of {', '.join(map(str, sorted(widths)))} numbers"
-        raise EntryError(f"{where}: values of {shape}; expected at most {MOST_DRAWS} rows of {size}, a parameter each")
-    theta = problem.space.normalise(np.array(answer.values))
+    _check_rows(f"{where}: values", answer.values, problem)
+    if answer.predicts:
+        _check_rows(f"{where}: predicts", [answer.predicts], problem)
+
+
+def _check_rows(where: str, rows: list[list[float]], problem: Problem) -> None:
+    """Raises EntryError for rows that are no physical values of the problem's parameters."""
+    size, widths = len(problem.space), {len(row) for row in rows}
+    if widths != {size} or len(rows) > MOST_DRAWS:
+        shape = f"{len(rows)} rows of {', '.join(map(str, sorted(widths)))} numbers"
+        raise EntryError(f"{where} of {shape}; expected at most {MOST_DRAWS} rows of {size}, a parameter each")
+    theta = problem.space.normalise(np.array(rows))
     if not np.isfinite(theta).all():
         count = int((~np.isfinite(theta)).any(1).sum())
         raise EntryError(f"{where}: NaN, infinity or what has no logarithm in {count} rows; a failed log has `failure`")
@@ -188,7 +209,7 @@ def check_answer(where: str, answer: Answer, problem: Problem) -> None:
     if outside.any():
         parameter = problem.space[int(outside.argmax())]
         raise EntryError(
-            f"{where}: values of {parameter.name} outside the prior's bounds {parameter.low:g} to {parameter.high:g}; "
+            f"{where} of {parameter.name} outside the prior's bounds {parameter.low:g} to {parameter.high:g}; "
             "leave such draws out, or clip them"
         )
 

@@ -46,7 +46,12 @@ MEASURES = (
     Measure("skill", "CRPS skill", "0 is the prior, 1 the truth", lambda s: s.skill),
     Measure("coverage", "coverage of 90 %", "of the intervals, ± its standard error", lambda s: s.coverage),
     Measure("interval", "interval score", "in ranges; smaller is better", lambda s: s.interval),
-    Measure("heldout", "held-out error", "over that of the model as given; smaller is better", lambda s: s.heldout),
+    Measure(
+        "heldout",
+        "held-out error",
+        "of what is predicted with, over that of the model as given; smaller is better",
+        lambda s: s.heldout,
+    ),
     Measure("rollouts", "rollouts", "for each log", lambda s: s.rollouts),
     Measure("cpu", "CPU seconds", "for each log", lambda s: s.cpu_seconds),
     Measure("failed", "failed logs", "which count as the prior", lambda s: float(s.failed)),

@@ -50,10 +50,17 @@ PRIOR = "prior"
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a method gives for one log: physical values (M, N), and how many rollouts it took."""
+    """What a method gives for one log.
+
+    Args:
+        values: physical (M, N), draws or a point.
+        rollouts: that it took.
+        predicts: physical (N,), what held-out logs are predicted with; default the mean of ``values``.
+    """
 
     values: FloatArray
     rollouts: int
+    predicts: FloatArray | None = None
 
 
 class Method(Protocol):
@@ -140,7 +147,9 @@ def _answer(method: Method, task: Task, problem: Problem, case: Case) -> Answer:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             estimate = clock.time(lambda: method(task, problem, case))
-        answer = Answer(rounded(estimate.values), estimate.rollouts, round(clock.cpu_seconds, 3))
+        predicts = [] if estimate.predicts is None else rounded(estimate.predicts[None])[0]
+        seconds = round(clock.cpu_seconds, 3)
+        answer = Answer(rounded(estimate.values), estimate.rollouts, seconds, predicts=predicts)
         check_answer("estimate", answer, problem)
     except Exception:  # a failure is an answer, and counts as one
         why = " ".join(traceback.format_exc().strip().splitlines()[-1].split())[:300]

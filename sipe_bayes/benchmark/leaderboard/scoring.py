@@ -3,9 +3,9 @@
 Per log and known parameter, in theta: CRPS and its skill 1 - CRPS / CRPS of the prior, summed over logs before the
 ratio is taken; whether the central 90 % interval holds the truth; the interval score of T. Gneiting, A. Raftery 2007,
 "Strictly Proper Scoring Rules", https://doi.org/10.1198/016214506000001437, Section 6.2, smaller for intervals that are
-narrow and right. Where logs are held out: the error of the mean on them over that of the model as given, geometric mean
-over logs and channels. A log that failed has the prior's CRPS and interval score, no coverage, and the model's own
-held-out error: as much as one knows without the method.
+narrow and right. Where logs are held out: the error on them of what the entry predicts with, its mean unless it says
+otherwise, over that of the model as given, geometric mean over logs and channels. A log that failed has the prior's
+CRPS and interval score, no coverage, and the model's own held-out error: as much as one knows without the method.
 
 An estimate that is made of a log alone can not be nearer to the truth than the exact posterior allows: where that is
 known, the mass of it within the estimate's distance of the truth is uniform on [0, 1]. An entry for which all these
@@ -29,6 +29,7 @@ from sipe_bayes.benchmark.leaderboard.entry import (
     EntryError,
     answered,
     answers_path,
+    predicting,
     read_answers,
     theta_of,
 )
@@ -212,7 +213,7 @@ def score_log(problem: Problem, case: Case, answer: Answer) -> LogScore:
     if not answer.failure:
         theta = theta_of(answer, problem)
         after = _belief(theta[:, known], before) if before is not None else None
-        ratio = heldout_ratio(problem, case.heldout, theta.mean(0))
+        ratio = heldout_ratio(problem, case.heldout, predicting(answer, problem))
     covered, interval, own, prior_crps = 0, None, 0.0, 0.0
     if before is not None and after is not None:
         own, prior_crps = float(crps(after, truth).sum()), float(crps(before, truth).sum())

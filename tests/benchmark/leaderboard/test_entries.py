@@ -85,6 +85,21 @@ def test_a_point_is_scored_as_one(tmp_path: Path) -> None:
     assert got == pytest.approx([np.abs(case.truth - 0.5).sum() for case in problem.cases], abs=1e-5)
 
 
+def test_held_out_logs_are_predicted_with_what_the_entry_says(tmp_path: Path) -> None:
+    """By default with the mean: of draws about it that is as good as itself; the model as given has a ratio of one."""
+    problem = made("simple_pendulum")
+    given = problem.space.values(np.clip(problem.space.default_theta, 0, 1))
+    other = problem.space.values(np.repeat([[0.35], [0.25]], len(problem.space), axis=1))
+    ratios = []
+    for name, predicts in (("mean", None), ("same", other.mean(0)), ("given", given)):
+        estimate = Estimate(other, 0, predicts)
+        run_entry(entry(name), tmp_path / name, chosen(["simple_pendulum"]), lambda *_, e=estimate: e, quiet)
+        ratios.append(scored(tmp_path / name).tasks["simple_pendulum"].heldout)
+    assert ratios[0] == pytest.approx(ratios[1], rel=1e-4)
+    assert ratios[0] != pytest.approx(1.0, rel=0.1)
+    assert ratios[2] == pytest.approx(1.0, rel=1e-4)
+
+
 def test_a_failure_counts_as_the_prior(tmp_path: Path, honest: Path) -> None:
     def half(task: Task, problem: Problem, case: Case) -> Estimate:
         if problem.cases.index(case) % 2:
@@ -150,6 +165,12 @@ WRONG: dict[str, tuple[str, Callable[[dict[str, Any]], object], str]] = {
     "infinity": (LINEAR, rows(lambda v: v[3].__setitem__(2, np.inf)), "infinity"),
     "a word": (LINEAR, rows(lambda v: v[3].__setitem__(2, "high")), "number"),
     "outside the prior": (LINEAR, rows(lambda v: v[3].__setitem__(2, 5.0)), "theta_3 outside the prior's bounds"),
+    "NaN to predict with": (LINEAR, lambda plain: plain["logs"]["x 0"].update(predicts=[np.nan] * 10), "predicts: NaN"),
+    "too few to predict with": (
+        LINEAR,
+        lambda plain: plain["logs"]["x 0"].update(predicts=[0.0]),
+        "predicts of 1 rows",
+    ),
     "nothing": (LINEAR, rows(lambda v: v.clear()), "neither"),
     "both": (LINEAR, lambda plain: plain["logs"]["x 0"].update(failure="no"), "both"),
     "less than no time": (LINEAR, lambda plain: plain["logs"]["x 0"].update(cpu_seconds=-1.0), "below zero"),
