@@ -6,13 +6,14 @@ Logs have 1 % observation noise; each method is trained once for each task.
                                                   [--methods npe bayessim "npe regressed"] [--calibration 0 0.2]
 
 One log of 100 control steps (FetchPush: 50) gives actions and starting state: of smooth random actions on the
-pendulum and the half-cheetah, of the expert on the hand and FetchPush. Each method is trained once, on ``budget`` simulations of the
-prior with noise of 1 % of each channel's spread, on the hand and FetchPush of a tenth of the largest channel's at
-least, and then conditions on ``truths`` new simulations of truths drawn from the prior, noise included. Coverage is
-pooled over the parameters and the truths, its standard error clustered by truth. contraction = 1 - sd / prior sd, mean.
-A parameter counts as determined by a log that leaves less than half of the prior's sd. Skill is 1 - CRPS / CRPS of the
-prior, the interval score that of 90 % intervals in theta, both means over parameters and truths. Ranks are uniform
-where the smallest of N p-values is at least .05 / N. Rows that the file holds already are kept.
+pendulum and the half-cheetah, of the expert on the hand and FetchPush. Each method is trained once, on ``budget``
+simulations of the prior with noise of 1 % of each channel's spread, on the hand and FetchPush of a tenth of the
+largest channel's at least, and then conditions on ``truths`` new simulations of truths drawn from the prior, noise
+included. Coverage is pooled over the parameters and the truths, its standard error clustered by truth. contraction =
+1 - sd / prior sd, mean. A parameter counts as determined by a log that leaves less than half of the prior's sd. Skill
+is 1 - CRPS / CRPS of the prior, the interval score that of 90 % intervals in theta, both means over parameters and
+truths. Ranks are uniform where the smallest of N p-values is at least .05 / N. Rows that the file holds already are
+kept.
 """
 
 from __future__ import annotations

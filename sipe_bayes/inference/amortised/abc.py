@@ -4,7 +4,8 @@ J. Pritchard et al. 1999, "Population growth of human Y chromosomes"
 (https://doi.org/10.1093/oxfordjournals.molbev.a026091), as sbi's MCABC does it. With summary statistics S
 (``models.statistics``), scaled to unit variance over the simulations, the fraction ``accepted`` of smallest
 |S(x_i) - S(x)| is kept: equally weighted draws of p(theta | |S(x') - S(x)| < epsilon), which is wider than the
-posterior and reaches it as epsilon goes to zero.
+posterior and reaches it as epsilon goes to zero. ``summary``: or S is what a regression on the simulations makes of the
+log (``inference.amortised.summaries``), in ranges of the parameters and not scaled.
 
 ``regression=True``: M. Beaumont, W. Zhang, D. Balding 2002, "Approximate Bayesian Computation in Population Genetics"
 (https://doi.org/10.1093/genetics/162.4.2025): accepted theta are moved by what a linear regression on S says that their
@@ -32,6 +33,8 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import Simulations
+from sipe_bayes.inference.amortised.summaries import REGRESSED, Summaries
+from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.models.sbi_tools import import_sbi, seeded
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.flow import to_cube, to_line
@@ -43,6 +46,12 @@ class ABCOptions(PriorSamplingOptions):
 
     accepted: float = option(0.05, "fraction of the valid simulations that is kept, at least one", above=0, most=1)
     regression: bool = option(False, "linear adjustment of the accepted")
+    summary: str = option(
+        "statistics",
+        'what is compared; "regressed": theta as regressed on the simulations; '
+        '"robust": the same, of which the log\'s is by minimum distance',
+        among=("statistics", *REGRESSED),
+    )
 
 
 @dataclass(frozen=True)
@@ -52,12 +61,14 @@ class Bank:
     Attributes:
         theta: (n, N) of the valid simulations.
         statistics: (n, F) of them.
-        scale: (F,), their sd, infinite where they hardly vary.
+        scale: (F,), by which they are divided, infinite where they hardly vary.
+        summaries: how they are made; None of plain statistics.
     """
 
     theta: FloatArray
     statistics: FloatArray
     scale: FloatArray
+    summaries: Summaries | None = None
 
 
 class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
@@ -70,16 +81,24 @@ class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
 
     def train(self, simulations: Simulations, trajectories: Trajectories) -> Bank:
         """Nothing but the scale of the statistics is learned."""
-        statistics = self.statistics(simulations.observations, trajectories)
+        theta, observations = simulations.theta, simulations.observations
+        statistics, summaries = self.statistics(observations, trajectories), None
+        if self.options.summary in REGRESSED:
+            noise = noise_level(trajectories, self.likelihood)
+            summaries, statistics = Summaries.of(
+                theta, observations, statistics, trajectories, noise, self.options.summary
+            )
         sd = statistics.std(0)
         varies = sd > 1e-7 * (np.abs(statistics).max(0) + 1e-30)
-        return Bank(simulations.theta, statistics, np.where(varies, sd, np.inf))
+        return Bank(theta, statistics, np.where(varies, sd if summaries is None else 1.0, np.inf), summaries)
 
     def infer(self, learned: Bank, trajectories: Trajectories) -> Posterior:
         """The nearest of the simulations; raises ValueError where the log has no statistics, or they are too few."""
         observed = self.statistics(trajectories.observations[None], trajectories)
         if not np.isfinite(observed).all():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
+        if learned.summaries is not None:
+            observed = learned.summaries(trajectories.observations, observed)
         varies = np.isfinite(learned.scale)
         simulated = learned.statistics[:, varies] / learned.scale[varies]
         target = observed[0, varies] / learned.scale[varies]
@@ -92,7 +111,7 @@ class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
                 "raise accepted or the budget, or leave the regression out"
             )
         line, distances = self._accept(to_line(theta), torch.from_numpy(simulated), torch.from_numpy(target), kept)
-        self._report(distances, simulated.shape[1])
+        self._report(distances, simulated)
         return Particles(to_cube(line).clamp(0.0, 1.0), self.space)
 
     def _accept(
@@ -114,8 +133,8 @@ class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
             )
         return accepted.double(), summary["distances"].numpy()
 
-    def _report(self, distances: FloatArray, statistics: int) -> None:
-        spread = float(np.sqrt(2 * statistics))  # distance of two independent simulations, root mean square
+    def _report(self, distances: FloatArray, simulated: FloatArray) -> None:
+        spread = float(np.sqrt(2 * simulated.var(0).sum()))  # distance of two independent ones, root mean square
         self.diagnostics.update(accepted=len(distances), epsilon=float(distances.max()), nearest=float(distances.min()))
         self.diagnostics["epsilon_relative"] = float(distances.max()) / spread
         if len(distances) < THRESHOLDS.few_accepted:

@@ -8,7 +8,8 @@ draws from a proposal p~ instead of the prior p, the answer is q p / p~.
 - ``features``: "mlp" (two layers of 24 tanh units) or "random_fourier" (quasi-Monte Carlo, Matern-5/2), then a linear
   layer.
 - ``summary``: "statistics"; "learned": a network on each control step, averaged, trained with the mixture; or
-  "regressed": what a regression on the simulations makes of the log (``models.regressed``).
+  "regressed": what a regression on the simulations makes of the log (``models.regressed``); or "robust", the same, of
+  which the log's is that of the nearest simulations (``models.minimum_distance``).
 - ``rounds`` > 1 draws later rounds where the answer so far has its mass: truncated proposals, for which the correction
   p / p~ is one (``inference.amortised.rounds``), instead of dividing mixtures, which need not leave a density.
 
@@ -34,6 +35,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import seed_integer
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.rounds import Rounds, RoundsOptions, RoundsState
+from sipe_bayes.inference.amortised.summaries import REGRESSED
 from sipe_bayes.models.mixture_density import Features, MixtureDensity
 from sipe_bayes.models.training import TrainedNetwork, Training, check_device, restore, train
 from sipe_bayes.models.transitions import StepEmbedding, control_steps
@@ -48,8 +50,9 @@ class BayesSimOptions(RoundsOptions):
     features: Features = option("mlp", "what a linear layer makes the mixture of", among=get_args(Features))
     summary: str = option(
         "statistics",
-        'what the features are of; "regressed": theta as regressed on the simulations',
-        among=("statistics", "learned", "regressed"),
+        'what the features are of; "regressed": theta as regressed on the simulations; '
+        '"robust": the same, of which the log\'s is by minimum distance',
+        among=("statistics", "learned", *REGRESSED),
     )
     hidden: int | None = option(
         None, "units of each of the network's two layers, default 24, or random features, default 500", least=2
@@ -81,9 +84,9 @@ class BayesSim(Rounds[TrainedNetwork]):
     options: BayesSimOptions
 
     @property
-    def regresses(self) -> bool:
+    def summary(self) -> str:
         """See the base's."""
-        return self.options.summary == "regressed"
+        return self.options.summary
 
     def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> TrainedNetwork:
         """The network, of greatest likelihood of held-out simulations."""
@@ -122,7 +125,7 @@ class BayesSim(Rounds[TrainedNetwork]):
     def _network(self) -> _Summarised:
         environment, options = self.simulator.environment, self.options
         o, a = len(environment.channels), environment.num_actions
-        embedding, size = None, len(self.space) if self.regresses else o * a + 2 * o
+        embedding, size = None, len(self.space) if self.summary in REGRESSED else o * a + 2 * o
         if options.summary == "learned":
             embedding = StepEmbedding(2 * o + a, options.summary_features, options.summary_hidden)
             size = options.summary_features

@@ -12,7 +12,8 @@ correction, and the trained flow conditions on other logs without training again
 ``rounds`` > 1: truncated proposals, see ``inference.amortised.rounds``.
 
 Trajectories enter as sets of control steps (s, a, s' - s) through ``models.transitions.StepEmbedding``, as theta that a
-regression on the simulations makes of them (``embedding="regressed"``, ``models.regressed``), or as they are ("none").
+regression on the simulations makes of them (``embedding="regressed"`` and "robust", ``inference.amortised.summaries``),
+or as they are ("none").
 
 Deviations:
 
@@ -39,6 +40,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import seed_integer
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.rounds import Rounds, RoundsOptions, RoundsState
+from sipe_bayes.inference.amortised.summaries import REGRESSED
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
 from sipe_bayes.models.training import Weights, check_device, weights
 from sipe_bayes.models.transitions import MOST_STEPS, Standardise, StepEmbedding, control_steps
@@ -55,8 +57,9 @@ class NPEOptions(RoundsOptions):
     embedding: str = option(
         "transitions",
         'of control steps, of any number; "regressed": theta as regressed on the simulations, for motions; '
+        '"robust": the same, of which the log\'s is by minimum distance; '
         '"none": every finite sample as it is, for functions with few outputs',
-        among=("transitions", "regressed", "none"),
+        among=("transitions", *REGRESSED, "none"),
     )
     embedding_features: int = option(32, "numbers that the embedding summarises a log in", least=1)
     transforms: int = option(5, "layers of the spline flow", least=1)
@@ -122,9 +125,9 @@ class NPE(Rounds[TrainedFlow]):
         return super().start(trajectories)
 
     @property
-    def regresses(self) -> bool:
+    def summary(self) -> str:
         """See the base's."""
-        return self.options.embedding == "regressed"
+        return self.options.embedding
 
     def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> TrainedFlow:
         """The flow with its embedding, of greatest likelihood of held-out simulations."""

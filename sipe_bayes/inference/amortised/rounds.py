@@ -38,7 +38,7 @@ from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import BLOCK, Simulations
-from sipe_bayes.inference.amortised.summaries import Summaries
+from sipe_bayes.inference.amortised.summaries import REGRESSED, Summaries
 from sipe_bayes.inference.recorded import digest
 from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.settings import BudgetExhausted
@@ -92,15 +92,15 @@ class RoundsOptions(PriorSamplingOptions):
 class Rounds(PriorSampling[RoundsState[L], Members[L]], Generic[L]):
     """Base of NPE and BayesSim.
 
-    A subclass writes ``regresses``, ``inputs``, ``train_network`` and ``infer_network``; none of them simulates.
+    A subclass writes ``summary``, ``inputs``, ``train_network`` and ``infer_network``; none of them simulates.
     """
 
     options: RoundsOptions
 
     @property
     @abstractmethod
-    def regresses(self) -> bool:
-        """Whether networks read what a regression on the simulations makes of a log, and not ``inputs``."""
+    def summary(self) -> str:
+        """What networks read: what a regression on the simulations makes (``summaries.REGRESSED``), else ``inputs``."""
 
     @abstractmethod
     def inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> Float32Array:
@@ -117,9 +117,9 @@ class Rounds(PriorSampling[RoundsState[L], Members[L]], Generic[L]):
     def train(self, simulations: Simulations, trajectories: Trajectories) -> Members[L]:
         """All members."""
         theta, observations, summaries = simulations.theta, simulations.observations, None
-        if self.regresses:
+        if self.summary in REGRESSED:
             noise, statistics = noise_level(trajectories, self.likelihood), self.statistics(observations, trajectories)
-            summaries, estimates = Summaries.of(theta, observations, statistics, trajectories, noise)
+            summaries, estimates = Summaries.of(theta, observations, statistics, trajectories, noise, self.summary)
             inputs = estimates.astype(np.float32)
         else:
             inputs = self.inputs(observations, trajectories)

@@ -219,7 +219,7 @@ def test_wrong_input() -> None:
     trained.fit(seen(0.4, 0.5))
     assert trained.state is not None
     table: list[tuple[Any, str]] = [
-        (lambda: NPE(simulator, embedding="lstm"), "embedding: expected one of transitions, regressed, none"),
+        (lambda: NPE(simulator, embedding="lstm"), "embedding: expected one of transitions, regressed, robust, none"),
         (lambda: NPE(simulator, rounds=0), "rounds: expected at least 1"),
         (lambda: NPE(simulator, bins=1), "bins: expected at least 2"),
         (lambda: NPE(simulator, learning_rate=0.0), "learning_rate"),
