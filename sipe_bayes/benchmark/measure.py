@@ -20,7 +20,7 @@ from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import digest
 from sipe_bayes.inference.registry import estimator_class, get_estimator
-from sipe_bayes.posterior import Dirac, Posterior, prior, storage
+from sipe_bayes.posterior import Dirac, Posterior, prior
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -175,4 +175,4 @@ def _with_policy(cell: Cell, record: Record, simulator: Simulator, folder: Path)
 
 def netcdf(posterior: Posterior, seed: int) -> bytes:
     """A posterior's netCDF, the same bytes for the same posterior."""
-    return storage.netcdf(posterior.to_inference_data(generator=torch.Generator().manual_seed(seed)))
+    return posterior.netcdf(generator=torch.Generator().manual_seed(seed))

@@ -27,7 +27,6 @@ from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.randomization_code import write_randomization
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.posterior.storage import netcdf
 from sipe_bayes.report.interactive.clips import Clip, make_clip
 from sipe_bayes.report.interactive.motion import motion
 from sipe_bayes.report.page import write_report
@@ -146,7 +145,7 @@ def _clip(calibration: Calibration, problem: Problem) -> Clip:
 def save_posterior(posterior: Posterior, folder: Path) -> None:
     """Write ``posterior.*``: what ``load_posterior`` reads, and its draws for ArviZ."""
     posterior.save(folder / "posterior")
-    write_bytes(folder / "posterior.nc", netcdf(posterior.to_inference_data()))
+    write_bytes(folder / "posterior.nc", posterior.netcdf())
 
 
 def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, object]:

@@ -196,11 +196,11 @@ def _table(
     """Field -> (places, rows) of the physical draws, and how many these are."""
     model, changed, rows = environment.compile(), environment.compile(), []
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    given = _numbers(model)
+    given, fields, data = _numbers(model), number_fields(changed), mujoco.MjData(changed)
     for values in draws:
         if environment.write(changed, values):
-            mujoco.mj_setConst(changed, mujoco.MjData(changed))
-            rows.append({name: field.copy() for name, field in _numbers(changed).items()})
+            mujoco.mj_setConst(changed, data)
+            rows.append({name: field.copy() for name, field in {**fields, **_options(changed)}.items()})
     table: dict[str, tuple[list[int], list[list[float]]]] = {}
     for name, field in given.items() if rows else ():
         every = np.stack([row[name].ravel() for row in rows])
@@ -234,7 +234,11 @@ def _fixed(
 
 def _numbers(model: mujoco.MjModel) -> dict[str, FloatArray]:
     """The model's fields of floating-point numbers, and its options'."""
-    return {**number_fields(model), **{f"opt.{name}": np.atleast_1d(getattr(model.opt, name)) for name in _OPTIONS}}
+    return {**number_fields(model), **_options(model)}
+
+
+def _options(model: mujoco.MjModel) -> dict[str, FloatArray]:
+    return {f"opt.{name}": np.atleast_1d(getattr(model.opt, name)) for name in _OPTIONS}
 
 
 def _within_quotes(text: str) -> str:

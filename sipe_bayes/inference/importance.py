@@ -149,9 +149,7 @@ def judged(target: Target, normal: GaussianMixture, seed: int, tuning: Importanc
 
 def pareto_shape(log_ratios: FloatArray) -> float:
     """Shape k of the generalised Pareto distribution of the largest of exp(log_ratios (M,))."""
-    ready_arviz()
-    from arviz import psislw
-
+    psislw = ready_arviz().psislw
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns of what is returned
         return float(psislw(log_ratios - log_ratios.max())[1])

@@ -19,7 +19,7 @@ from sipe_bayes.core.html import html_table
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.validation import at_least, whole
 from sipe_bayes.posterior.drawn import Drawn
-from sipe_bayes.posterior.storage import Header, draws_by_name, ready_arviz, write_pair
+from sipe_bayes.posterior.storage import Header, draws_by_name, netcdf, ready_arviz, write_pair
 
 if TYPE_CHECKING:
     import arviz
@@ -366,14 +366,11 @@ class Posterior(Drawn, TorchDistribution):
         Raises:
             ValueError: for other shapes, or a prior over other parameters.
         """
-        ready_arviz()
-        import arviz
-
+        arviz = ready_arviz()
         if prior is not None and prior.space.names != self.space.names:
             raise ValueError(f"prior: expected one over {list(self.space.names)}, got {list(prior.space.names)}")
-        with torch.no_grad():
-            theta = self._chains(num_draws, generator)
-            before = None if prior is None else prior._sample(num_draws, generator)[None]
+        theta = self._chains(num_draws, generator)
+        before = None if prior is None else prior._sample(num_draws, generator)[None]
         data = arviz.from_dict(
             posterior=self._by_name(theta),
             prior=None if before is None else self._by_name(before),
@@ -386,6 +383,11 @@ class Posterior(Drawn, TorchDistribution):
             for parameter in self.space:
                 group[parameter.name].attrs.update(units=parameter.unit, description=parameter.description)
         return data
+
+    def netcdf(self, generator: Generator | None = None) -> bytes:
+        """The file of ``to_inference_data``, which ``arviz.from_netcdf`` reads."""
+        draws = self._by_name(self._chains(2000, generator))
+        return netcdf({"posterior": draws, "sample_stats": self._sample_stats()}, self.space)
 
     def _by_name(self, theta: Tensor) -> dict[str, NDArray[Any]]:
         """Values (chain, draw) of theta (chain, draw, N) by parameter."""

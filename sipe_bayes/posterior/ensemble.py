@@ -123,9 +123,7 @@ def mixing_of(chain: FloatArray) -> dict[str, float]:
         Over the parameters the largest R-hat ``rhat``, and the fewest effective draws ``ess`` of bulk and tails; the
         autocorrelation time ``autocorrelation_steps`` is that of the bulk.
     """
-    ready_arviz()
-    import arviz
-
+    arviz = ready_arviz()
     draws = [column.T for column in np.moveaxis(chain, 2, 0)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

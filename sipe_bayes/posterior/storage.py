@@ -13,18 +13,17 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from types import ModuleType
+from typing import Any, TypedDict, cast
 
+import h5netcdf
 import numpy as np
 import safetensors.torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from sipe_bayes.core.files import FileError, is_file, read_json, reading, scratch, shortened, write_bytes
-from sipe_bayes.core.parameters import Plain
-
-if TYPE_CHECKING:
-    import arviz
+from sipe_bayes.core.parameters import ParameterSpace, Plain
 
 FORMAT = "sipe_bayes.posterior/1"
 SAVE_AGAIN = "save it again with posterior.save(path)"
@@ -100,8 +99,8 @@ def draws_by_name(name: str, given: Mapping[str, ArrayLike] | None, theta: Tenso
     return arrays
 
 
-def ready_arviz() -> None:
-    """Import ArviZ; it notes in the user's cache folder that it was, and where it cannot, in one that goes."""
+def ready_arviz() -> ModuleType:
+    """ArviZ, imported; it notes in the user's cache folder that it was, and where it cannot, in one that goes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # arviz < 1 announces its successor on import
         try:
@@ -110,9 +109,10 @@ def ready_arviz() -> None:
             cache = os.environ.get("XDG_CACHE_HOME")
             with scratch() as folder:
                 os.environ["XDG_CACHE_HOME"] = str(folder)
-                import arviz  # noqa: F401
+                import arviz
             del os.environ["XDG_CACHE_HOME"]
             os.environ |= {} if cache is None else {"XDG_CACHE_HOME": cache}
+    return arviz
 
 
 def _hdf5_name(word: str) -> str:
@@ -120,13 +120,27 @@ def _hdf5_name(word: str) -> str:
     return word.replace("/", "|").replace("\0", "") if word.strip(".") else f"parameter{word}"
 
 
-def netcdf(data: arviz.InferenceData) -> bytes:
-    """The netCDF of draws, the same bytes for the same draws, made in memory: on a full disk HDF5 crashes."""
+def netcdf(groups: Mapping[str, Mapping[str, ArrayLike]], space: ParameterSpace) -> bytes:
+    """A netCDF of draws as ArviZ reads it, the same bytes for the same draws.
+
+    It is made in memory, for on a full disk HDF5 crashes, and without ArviZ, whose import takes as long as many a fit.
+
+    Args:
+        groups: arrays (chain, draw) by name, by group; empty ones are left out.
+        space: of the parameters, which get their units and descriptions.
+    """
+    about = {p.name: {"units": p.unit, "description": p.description} for p in space}
     buffer = io.BytesIO()
-    for k, name in enumerate(data.groups()):
-        group = data[name]
-        group = group.rename({word: _hdf5_name(str(word)) for word in {*group.variables, *group.dims}})
-        group.attrs.pop("created_at", None)
-        packed = {key: {"zlib": True} for key, values in group.variables.items() if values.dtype.kind in "fiub"}
-        group.to_netcdf(buffer, mode="a" if k else "w", group=name, engine="h5netcdf", encoding=packed)
+    with h5netcdf.File(buffer, "w") as file:
+        for key, given in groups.items():
+            arrays = {name: np.asarray(values) for name, values in given.items()}
+            if not arrays:
+                continue
+            group = file.create_group(key)
+            for name, size in zip(("chain", "draw"), next(iter(arrays.values())).shape, strict=True):
+                group.dimensions[name] = size
+                group.create_variable(name, (name,), data=np.arange(size))
+            for name, values in arrays.items():
+                kept = group.create_variable(_hdf5_name(name), ("chain", "draw"), data=values, compression="gzip")
+                kept.attrs.update(about.get(name, {}))
     return buffer.getvalue()

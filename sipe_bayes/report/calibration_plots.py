@@ -186,6 +186,7 @@ def log_figure(
     ratios = [2.2, 1] if long else None
     grid = figure.add_gridspec(2 * len(rows), 1 + long, height_ratios=[*heights] * len(rows), width_ratios=ratios)
     spans = [(float(first.time[0]), float(first.time[-1])), *([worst_stretch(rows)] if long else [])]
+    labelled: list[Axes] = []
     for column, span in enumerate(spans):
         for i, signal in enumerate([within(row, span) for row in rows] if column else rows):
             above = figure.add_subplot(grid[2 * i, column])
@@ -200,6 +201,7 @@ def log_figure(
                 continue
             above.set_ylabel(with_unit(shortened(signal.channel, 22), signal.unit))
             below.set_ylabel("error")
+            labelled += [above, below]
             above.set_title(titles.get(signal.channel, ""), loc="right", color="#444444", fontsize=8.5)
         below.set_xlabel("time [s]")
     held_out = first.use == "holdout"
@@ -207,7 +209,7 @@ def log_figure(
     colour = HOLDOUT if held_out else "#222222"
     figure.suptitle(f"{shortened(first.log, 60)}: {kind}", color=colour, fontweight="bold")
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-    figure.align_ylabels()
+    figure.align_ylabels(labelled)
     return figure
 
 
@@ -246,7 +248,7 @@ def _residual_figure(rows: Sequence[Residual]) -> Figure:
         _autocorrelation(right, row)
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("lag [samples]")
-    figure.align_ylabels()
+    figure.align_ylabels(list(axes[:, 0]))
     return figure
 
 

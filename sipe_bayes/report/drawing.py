@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import base64
 import functools
+import gc
 import io
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import ParamSpec, TypeVar
 
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import Formatter, LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
@@ -57,22 +60,35 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 @styled
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file.
+    """The figure as a PNG file in 256 colours, a third of the size of all.
+
+    It is drawn once: ``Figure.savefig`` draws every artist twice where a layout is by constraints.
 
     Returns:
         The file's bytes, the same for the same figure.
     """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=STYLE.dpi, metadata={"Software": None})
+    canvas, buffer = FigureCanvasAgg(figure), io.BytesIO()
+    canvas.draw()
+    colours = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    colours.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(buffer, "PNG")
     return buffer.getvalue()
 
 
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Without Python's search for cycles of garbage, which takes a third of the time in which figures are made."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
+
+
 def inside_page(image: bytes) -> str:
-    """A PNG file as the source of an image that the page itself holds, in 256 colours: a third of the size."""
-    buffer = io.BytesIO()
-    colours = Image.open(io.BytesIO(image)).convert("RGB")
-    colours.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(buffer, "PNG")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    """A PNG file as the source of an image that the page itself holds."""
+    return "data:image/png;base64," + base64.b64encode(image).decode("ascii")
 
 
 class _Plain(Formatter):
@@ -144,7 +160,18 @@ def new_figure(height: float, width: float = STYLE.width) -> Drawing:
         height: inches.
         width: inches.
     """
-    return Drawing(figsize=(width, height), layout="constrained", facecolor="white")
+    return Drawing(figsize=(width, height), dpi=STYLE.dpi, layout="constrained", facecolor="white")
+
+
+def laid_out(figure: Figure, plain: Sequence[Axes]) -> None:
+    """Lay the figure out for good, axes without labels as if they had no ticks either, which take most of the time."""
+    for ax in plain:
+        ax.set_axis_off()
+    if engine := figure.get_layout_engine():
+        engine.execute(figure)
+    figure.set_layout_engine("none")
+    for ax in plain:
+        ax.set_axis_on()
 
 
 def panel_grid(count: int, row: float, margin: float) -> tuple[Figure, list[Axes], int]:

@@ -26,7 +26,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing, improvement
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
-from sipe_bayes.report.drawing import inside_page, png
+from sipe_bayes.report.drawing import inside_page, png, uncollected
 from sipe_bayes.report.interactive.charts import charts
 from sipe_bayes.report.interactive.clips import Clip
 from sipe_bayes.report.templates import html_templates
@@ -171,6 +171,7 @@ def _logs(calibration: Calibration) -> list[tuple[str, str]]:
     return [item for items in by_use for item in items[:each]]
 
 
+@uncollected()
 def pictures(calibration: Calibration) -> list[Picture]:
     """Every figure of the report, rendered."""
     drawn = [("marginals", "marginals", "Marginal of each parameter", plots.marginals(calibration))]

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR, PRIOR, STYLE
-from sipe_bayes.report.drawing import new_figure, panel_grid, ticks
+from sipe_bayes.report.drawing import laid_out, new_figure, panel_grid, ticks
 from sipe_bayes.report.legends import PRIOR_HANDLE, legend_above, line_handle, shade_handle
 from sipe_bayes.report.words import shortened, unit_text
 
@@ -243,6 +243,7 @@ def pair_grid(
         legend_above(figure, handles, 4)
     figure.align_xlabels(list(axes[-1]))  # of the outer panels alone: all take most of the drawing's time
     figure.align_ylabels(list(axes[:, 0]))
+    laid_out(figure, list(axes[:-1, 1:].flat))
     return figure
 
 

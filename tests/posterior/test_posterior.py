@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import arviz
 import h5py
 import numpy as np
 import pyro
@@ -25,7 +26,6 @@ from sipe_bayes.posterior import (
     SurrogatePosterior,
     load_posterior,
 )
-from sipe_bayes.posterior.storage import netcdf
 from tests.problems.html import cells
 from tests.problems.posteriors import EXAMPLES, SIGMAS, example, seeded
 
@@ -187,9 +187,21 @@ def test_outside_is_minus_infinity(posterior: Posterior) -> None:
         assert float(posterior.log_prob(torch.full((len(posterior.space),), 1.001))) == -math.inf
 
 
+def test_the_file_holds_what_arviz_gets(posterior: Posterior, tmp_path: Path) -> None:
+    path = tmp_path / "draws.nc"
+    path.write_bytes(posterior.netcdf(seeded()))
+    stored, direct = arviz.from_netcdf(path), posterior.to_inference_data(generator=seeded())
+    assert stored.groups() == direct.groups()
+    for group in direct.groups():
+        assert set(stored[group]) == set(direct[group])
+        for name, values in direct[group].items():
+            np.testing.assert_array_equal(stored[group][name], values)
+            assert stored[group][name].attrs == values.attrs
+
+
 def test_names_that_hdf5_has_another_meaning_for(tmp_path: Path) -> None:
     space = ParameterSpace([Parameter(name, 0.0, 1.0) for name in ("left/right", ".", "..", "plain")])
-    content = netcdf(Dirac([0.1, 0.2, 0.3, 0.4], space).to_inference_data())
+    content = Dirac([0.1, 0.2, 0.3, 0.4], space).netcdf()
     (tmp_path / "draws.nc").write_bytes(content)
     with h5py.File(tmp_path / "draws.nc") as file:
         assert {"left|right", "parameter.", "parameter..", "plain"} <= set(file["posterior"])

@@ -22,13 +22,14 @@ from sipe_bayes.report.discovery.words import (
     value_rows,
     warnings,
 )
-from sipe_bayes.report.drawing import png
+from sipe_bayes.report.drawing import png, uncollected
 from sipe_bayes.report.interactive.charts import charts
 from sipe_bayes.report.page import Picture, run_details, write_page
 from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.words import error_text, number, times, unit_text
 
 
+@uncollected()
 def discovery_pictures(discovery: Discovery) -> list[Picture]:
     """Every figure of the report, rendered."""
     drawn = []
