@@ -19,6 +19,7 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.scores import c2st
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
+from sipe_bayes.inference.laplace.strategy import mixture
 from sipe_bayes.likelihood.starts import moved
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.posterior import Particles, Posterior
@@ -124,10 +126,11 @@ def one_row(name: str, seed: int) -> dict[str, Any]:
 
     simulator, truth, log = logged(name, seed)
     estimator = sipe.get_estimator(simulator, "laplace", likelihood=sipe.StateSpace(), seed=seed)
-    posterior = estimator.fit(log)
+    estimator.fit(log)
     assert estimator.state is not None
     optimum = max(estimator.state.search.optima, key=lambda one: one.evidence)
     assert isinstance(optimum, ChainOptimum)
+    posterior = mixture([replace(optimum, averaged=None)], simulator.space)
     chain = estimator.bound(Trajectories.stack([log]))
     chain.budget = np.inf
     begin = time.process_time()

@@ -19,6 +19,7 @@ from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
+from sipe_bayes.inference.laplace.state_space.noise_average import averaged
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
@@ -143,9 +144,9 @@ class Laplace(Estimator[LaplaceState]):
             optima, shots_left = distinct(state.search.optima), self._shots_left(state.search)
             if shots_left and self._absorbs(windows, optima[0]):
                 return state
-            judgements = self._judged(windows, optima)
-            stands = not judgements or judgements[0].normal
-            return replace(state, judgements=judgements, done=stands or not shots_left)
+            state = self._judged(windows, state, optima)
+            stands = not state.judgements or state.judgements[0].normal
+            return replace(state, done=stands or not shots_left)
         if windows.num_start or windows.settings.noise == "sandwich":
             return ended
         kept = distinct(state.search.optima)
@@ -173,18 +174,23 @@ class Laplace(Estimator[LaplaceState]):
         share = self.options.tuning.state_space.shooting.absorbed
         return optimum.rough and optimum.absorbed > share * chain.observed.sum()
 
-    def _judged(self, chain: Chain, kept: list[Optimum]) -> tuple[Judgement, ...]:
-        """Of the normals of a chain's optima; fewer where the budget ends."""
-        out: list[Judgement] = []
+    def _judged(self, chain: Chain, state: LaplaceState, kept: list[Optimum]) -> LaplaceState:
+        """With the normals of a chain's optima averaged over the noise and judged; fewer where the budget ends."""
+        assert not isinstance(state.search, WindowState)
+        judgements, search = [], state.search
+        tuning, steps = self.options.tuning.importance, len(chain.log)
         for optimum in kept:
             assert isinstance(optimum, ChainOptimum)
             try:
-                target = ChainTarget(self.prior, chain, ChainFit.at(chain, optimum))
-                normal = mixture([optimum], self.space)
-                out.append(importance.judged(target, normal, self.seed, self.options.tuning.importance, len(chain.log)))
+                fit = ChainFit.at(chain, optimum)
+                search = search.with_optimum(replace(optimum, averaged=averaged(self.problem, chain, fit)))
+                held = mixture([replace(optimum, averaged=None)], self.space)
+                judgements.append(
+                    importance.judged(ChainTarget(self.prior, chain, fit), held, self.seed, tuning, steps)
+                )
             except BudgetExhausted:
                 break
-        return tuple(out)
+        return replace(state, search=search, judgements=tuple(judgements))
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts."""
@@ -287,7 +293,7 @@ class Laplace(Estimator[LaplaceState]):
         kept = [] if self.state is None else distinct(self.state.search.optima)
         if not kept:
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        prior, mean, total = QuadraticPrior.of(self.prior), kept[0].mean, np.linalg.inv(kept[0].covariance)
+        prior, mean, total = QuadraticPrior.of(self.prior), kept[0].mean, np.linalg.inv(kept[0].spread)
         flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T

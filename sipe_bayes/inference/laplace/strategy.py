@@ -45,6 +45,11 @@ class Optimum:
     sd: FloatArray
     tau: FloatArray
 
+    @property
+    def spread(self) -> FloatArray:
+        """Covariance (N, N) of the posterior, before truncation."""
+        return self.covariance
+
     def holds(self, other: Optimum) -> bool:
         """Whether this optimum's normal holds another one well inside it."""
         return self.distance(other) ** 2 < len(self.mean)
@@ -181,5 +186,5 @@ def mixture(optima: Sequence[Optimum], space: ParameterSpace) -> GaussianMixture
     """The optima's normals truncated to the cube, weighted by their evidence."""
     evidence = np.array([one.evidence for one in optima])
     weights = torch.from_numpy(evidence - evidence.max())
-    means, covariances = np.stack([o.mean for o in optima]), np.stack([o.covariance for o in optima])
+    means, covariances = np.stack([o.mean for o in optima]), np.stack([o.spread for o in optima])
     return GaussianMixture(weights, means, covariances, space)

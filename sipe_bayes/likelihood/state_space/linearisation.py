@@ -160,10 +160,25 @@ def log_likelihood(linear: ChainLinearisation, noise: ChainNoise, solved: Elimin
     return float(constants - scales - best - 0.5 * solved.log_determinant)
 
 
-def restricted(
-    linear: ChainLinearisation, noise: ChainNoise, border: Border, held: bool = False
-) -> tuple[float, FloatArray, FloatArray]:
-    """Restricted log-likelihood of the noise: states and theta integrated out.
+@dataclass(frozen=True)
+class Integrated:
+    """States and theta integrated out of the likelihood of one linearisation.
+
+    Args:
+        value: restricted log-likelihood of the noise, up to a constant.
+        solved: the states eliminated; where they are, if they are held.
+        step: (N,) of theta, zero if held.
+        covariance: (N, N) of theta.
+    """
+
+    value: float
+    solved: Eliminated
+    step: FloatArray
+    covariance: FloatArray
+
+
+def integrate(linear: ChainLinearisation, noise: ChainNoise, border: Border, held: bool = False) -> Integrated:
+    """Integrate states and theta out.
 
     Args:
         linear: the linearisation.
@@ -171,8 +186,8 @@ def restricted(
         border: what holds theta besides the data.
         held: with states and theta where they are, not after the step that would be best were all linear.
 
-    Returns:
-        The value up to a constant, and its derivatives by log sd (C,) and by log process (D,).
+    Raises:
+        numpy.linalg.LinAlgError: where rounding leaves the states' block no longer positive definite.
     """
     solved = eliminate_states(linear, noise)
     step, covariance, determinant = border.solve(solved)
@@ -180,11 +195,23 @@ def restricted(
         solved, step = replace(solved, shift=np.zeros_like(solved.shift), explained=0.0), np.zeros_like(step)
     pulled = solved.gradient + border.pull
     value = log_likelihood(linear, noise, solved) + 0.5 * float(step @ pulled) - 0.5 * determinant
-    squares, jumps = expected_squares(linear, solved, step, covariance)
+    return Integrated(value, solved, step, covariance)
+
+
+def restricted(
+    linear: ChainLinearisation, noise: ChainNoise, border: Border, held: bool = False
+) -> tuple[float, FloatArray, FloatArray]:
+    """Restricted log-likelihood of the noise, of arguments as in ``integrate``.
+
+    Returns:
+        The value up to a constant, and its derivatives by log sd (C,) and by log process (D,).
+    """
+    done = integrate(linear, noise, border, held)
+    squares, jumps = expected_squares(linear, done.solved, done.step, done.covariance)
     variance = linear.jump_variance(noise)
     share = (linear.linked[:, None] & noise.regular) * noise.process**2 / variance
     by_sd = squares.sum(0) / noise.sd**2 - linear.observed.sum(0)
-    return value, by_sd, (share * (jumps / variance - 1)).sum(0)
+    return done.value, by_sd, (share * (jumps / variance - 1)).sum(0)
 
 
 def expected_squares(

@@ -6,7 +6,8 @@ likelihood no longer cares.
 
 Deviations:
 
-- The noise is held at its optimum: the posterior of theta does not widen for it.
+- The noise is held at its optimum while theta and states are searched; that it is uncertain enters the normal of theta
+  afterwards (``noise_average``).
 - A coordinate's process noise q has a prior q^0.5 exp(-q / movement), movement being how far the coordinate moves in a
   control step: the likelihood leaves the process noise of an unmeasured coordinate open above, and any that is small
   enough open below, where an estimate of zero would be overconfident (Y. Chung, S. Rabe-Hesketh, V. Dorie, A. Gelman,
@@ -16,68 +17,120 @@ Deviations:
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.optimize
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.state_space.options import NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import border
+from sipe_bayes.likelihood.block_tridiagonal import Border
 from sipe_bayes.likelihood.minimise import damped_box_step
 from sipe_bayes.likelihood.noise import NORMAL_MAD
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.chain import Chain
-from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
+from sipe_bayes.likelihood.state_space.linearisation import (
+    ChainLinearisation,
+    ChainNoise,
+    eliminate_states,
+    restricted,
+)
 
 
-def infer_noise(
-    chain: Chain,
-    linear: ChainLinearisation,
-    noise: ChainNoise,
-    prior: QuadraticPrior,
-    theta: FloatArray,
-    movement: FloatArray,
-    tuning: NoiseTuning,
-    held: bool = False,
-) -> tuple[ChainNoise, float]:
-    """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten.
+@dataclass(frozen=True)
+class NoisePosterior:
+    """What one linearisation says of its noise, by logarithms of the sds that are unknown and tell scales apart (F,).
 
-    Begins at ``noise``; ``movement`` (D,) are the scales of the process noises' priors, ``held`` as in ``restricted``.
-    Returns the noise, and the nats that it gains.
+    Args:
+        chain: the logs.
+        linear: the linearisation.
+        noise: where its logarithms begin; sds that are given are kept.
+        prior: on theta.
+        theta: (N,), of the linearisation.
+        movement: (D,), the scales of the process noises' priors.
+        tuning: its numbers.
+        held: as in ``restricted``.
     """
-    channels, fixed = len(noise.sd), chain.fixed_sd
-    hold = border(prior, theta, eliminate_states(linear, noise).gradient)
-    least_sd, least_process = chain.least
-    least = np.log(np.concatenate([least_sd, np.maximum(least_process, tuning.least_share * movement)]))
-    start = np.maximum(np.log(np.concatenate([noise.sd, noise.process])), least)
-    # of channels of one scale the first stands for all
-    owner = np.concatenate([_first(chain.scales), channels + np.arange(len(noise.process))])
-    free = np.concatenate([np.isnan(fixed), np.full(len(noise.process), True)]) & (owner == np.arange(len(owner)))
 
-    def split(logs: FloatArray) -> ChainNoise:
-        everything = start.copy()
-        everything[free] = logs
-        everything = everything[owner]
-        sd = np.where(np.isnan(fixed), np.exp(everything[:channels]), noise.sd)
-        return replace(noise, sd=sd, process=np.exp(everything[channels:]))
+    chain: Chain
+    linear: ChainLinearisation
+    noise: ChainNoise
+    prior: QuadraticPrior
+    theta: FloatArray
+    movement: FloatArray
+    tuning: NoiseTuning
+    held: bool = False
 
-    def objective(logs: FloatArray) -> tuple[float, FloatArray]:
-        tried = split(logs)
+    @cached_property
+    def hold(self) -> Border:
+        """What holds theta besides the data."""
+        return border(self.prior, self.theta, eliminate_states(self.linear, self.noise).gradient)
+
+    @cached_property
+    def promised(self) -> float:
+        """Nats that a step of theta and states would gain at ``noise``, were all linear."""
+        return (
+            restricted(self.linear, self.noise, self.hold)[0] - restricted(self.linear, self.noise, self.hold, True)[0]
+        )
+
+    @cached_property
+    def least(self) -> FloatArray:
+        """Logarithms (C + D,) of the least sds."""
+        least_sd, least_process = self.chain.least
+        return np.log(np.concatenate([least_sd, np.maximum(least_process, self.tuning.least_share * self.movement)]))
+
+    @cached_property
+    def start(self) -> FloatArray:
+        """Logarithms (C + D,) of ``noise``."""
+        return np.maximum(np.log(np.concatenate([self.noise.sd, self.noise.process])), self.least)
+
+    @cached_property
+    def owner(self) -> IntArray:
+        """(C + D,): of channels of one scale the first stands for all."""
+        channels = len(self.noise.sd)
+        return np.concatenate([_first(self.chain.scales), channels + np.arange(len(self.noise.process))])
+
+    @cached_property
+    def free(self) -> BoolArray:
+        """(C + D,): which are unknown and stand for themselves."""
+        unknown = np.concatenate([np.isnan(self.chain.fixed_sd), np.full(len(self.noise.process), True)])
+        return unknown & (self.owner == np.arange(len(self.owner)))
+
+    def at(self, logs: FloatArray) -> ChainNoise:
+        """The noise of logarithms (F,)."""
+        everything, channels, fixed = self.start.copy(), len(self.noise.sd), self.chain.fixed_sd
+        everything[self.free] = logs
+        everything = everything[self.owner]
+        sd = np.where(np.isnan(fixed), np.exp(everything[:channels]), self.noise.sd)
+        return replace(self.noise, sd=sd, process=np.exp(everything[channels:]))
+
+    def loss(self, logs: FloatArray) -> tuple[float, FloatArray]:
+        """-log posterior of logarithms (F,), up to a constant, and its slopes (F,)."""
+        tried = self.at(logs)
         try:
-            value, by_sd, by_process = restricted(linear, tried, hold, held)
+            value, by_sd, by_process = restricted(self.linear, tried, self.hold, self.held)
         except np.linalg.LinAlgError:  # so far apart that rounding rules
             return 1e300, np.zeros(len(logs))  # L-BFGS takes no infinity
-        slope = tried.process / movement - tuning.prior_power
-        slopes = np.bincount(owner, np.concatenate([-by_sd, slope - by_process]), len(owner))
-        return process_penalty(tried, movement, tuning) - value, slopes[free]
+        slope = tried.process / self.movement - self.tuning.prior_power
+        slopes = np.bincount(self.owner, np.concatenate([-by_sd, slope - by_process]), len(self.owner))
+        return process_penalty(tried, self.movement, self.tuning) - value, np.asarray(slopes[self.free], float)
 
+
+def infer_noise(posterior: NoisePosterior) -> tuple[ChainNoise, float]:
+    """Noise that maximises the restricted likelihood of one linearisation, each sd within a factor of ten.
+
+    Begins at its ``noise``. Returns the noise, and the nats that it gains.
+    """
+    tuning, free = posterior.tuning, posterior.free
+    least, start = posterior.least[free], posterior.start[free]
     span = np.log(tuning.most_factor)
-    bounds = [(max(low, s - span), s + span) for low, s in zip(least[free], start[free], strict=True)]
-    before = objective(start[free])[0]
+    bounds = [(max(low, s - span), s + span) for low, s in zip(least, start, strict=True)]
+    before = posterior.loss(start)[0]
     limits = {"maxiter": tuning.search_steps, "maxfun": tuning.search_steps + 4}
-    best = scipy.optimize.minimize(objective, start[free], jac=True, method="L-BFGS-B", bounds=bounds, options=limits)
-    return split(best.x), float(before - best.fun)
+    best = scipy.optimize.minimize(posterior.loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=limits)
+    return posterior.at(best.x), float(before - best.fun)
 
 
 def _first(scales: IntArray) -> IntArray:

@@ -26,6 +26,16 @@ class NoiseTuning(Options):
 
 
 @dataclass(frozen=True)
+class AverageTuning(Options):
+    """How theta's normal is averaged over the noise; see ``noise_average``."""
+
+    draws: int = option(800, "Metropolis steps, along one axis of the noise each: an eliminated chain", least=2)
+    step: float = option(2.4, "length of a step", "sds of the normal", above=0)
+    least_curvature: float = option(0.5, "of an axis, which bounds that sd: process noise may be open below", above=0)
+    difference: float = option(0.2, "of the logarithms, for the curvature", above=0)
+
+
+@dataclass(frozen=True)
 class OutlierTuning(Options):
     """Which jumps become outliers; see ``outlying_jumps``."""
 
@@ -107,6 +117,7 @@ class ChainTuning(Options):
 
     damping: DampingRule = option(DampingRule(least_refused=1e-4), "how steps are damped: a refused one is far off")
     noise: NoiseTuning = option(NoiseTuning(), "how noise is guessed and estimated")
+    noise_average: AverageTuning = option(AverageTuning(), "how intervals are averaged over the noise")
     outliers: OutlierTuning = option(OutlierTuning(), "which jumps become outliers")
     smoothing: SmoothingTuning = option(SmoothingTuning(), "the search from measured states")
     wide: WideTuning = option(WideTuning(), "steps by differences as long as the posterior is wide")

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.state_space.noise import infer_noise
-from sipe_bayes.inference.laplace.state_space.smoother import border, smooth, solvable
+from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, infer_noise
+from sipe_bayes.inference.laplace.state_space.smoother import smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
     ChainSearch,
     ChainState,
@@ -27,7 +27,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
 )
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.differences import linearise_by
-from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, restricted
+from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,8 @@ class WideSearch(ChainSearch[S]):
         here, prior, tuning = state.here, self.problem.quadratic_prior, self.tuning.wide
         theta, noise = here.theta, solvable(linear, here.noise)
         # whether a step not yet taken is to be credited
-        hold = border(prior, theta, eliminate_states(linear, noise).gradient)
-        promised = restricted(linear, noise, hold)[0] - restricted(linear, noise, hold, held=True)[0]
-        held = promised > tuning.tolerance
-        estimate, gain = infer_noise(self.chain, linear, noise, prior, theta, here.movement, self.tuning.noise, held)
+        given = NoisePosterior(self.chain, linear, noise, prior, theta, here.movement, self.tuning.noise)
+        estimate, gain = infer_noise(replace(given, held=given.promised > tuning.tolerance))
         estimate = solvable(linear, estimate)
         # whether it has settled
         away = theta - here.estimate_theta

@@ -30,6 +30,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.inference.laplace.state_space.kalman_filter import filtered
 from sipe_bayes.inference.laplace.state_space.noise import (
+    NoisePosterior,
     first_noise,
     infer_noise,
     likeliest_share,
@@ -209,7 +210,8 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         """Estimate the noise, and take a step, or end; still: whether no step gains anything for the old noise."""
         chain, here, tuning = self.chain, state.here, self.tuning.smoothing
         prior, noise = self.problem.quadratic_prior, solvable(linear, here.noise)
-        estimate, gain = infer_noise(chain, linear, noise, prior, here.theta, here.movement, self.tuning.noise)
+        given = NoisePosterior(chain, linear, noise, prior, here.theta, here.movement, self.tuning.noise)
+        estimate, gain = infer_noise(given)
         settled, last = gain < tuning.settled and still, here.estimates >= tuning.most_estimates
         if here.estimates and (settled or last or self._struggles(here, linear, noise)):
             return self._ended(state, linear, noise, settled)

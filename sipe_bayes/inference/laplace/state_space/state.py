@@ -88,6 +88,8 @@ class ChainOptimum(Optimum):
         point: number of the starting point.
         absorbed: squares of the jumps over their variance: numbers of the log that process noise explains.
         rough: whether some step jumps by more than its process noise within the differences.
+        averaged: covariance (N, N) with the noise integrated out; ``covariance`` holds it, as the judges of the normal
+            do. None before the judges.
     """
 
     states: FloatArray
@@ -101,6 +103,12 @@ class ChainOptimum(Optimum):
     point: int
     absorbed: float = 0.0
     rough: bool = False
+    averaged: FloatArray | None = None
+
+    @property
+    def spread(self) -> FloatArray:
+        """Averaged over the noise, once it is."""
+        return self.covariance if self.averaged is None else self.averaged
 
     @property
     def noise(self) -> ChainNoise:
@@ -146,8 +154,8 @@ class ChainState(StrategyState[P]):
         return max((one.evidence for one in self.optima if one.point == self.point), default=-np.inf)
 
     def with_optimum(self, optimum: ChainOptimum) -> Self:
-        """With an optimum in place of this starting point's earlier one."""
-        return replace(self, optima=(*(one for one in self.optima if one.point != self.point), optimum))
+        """With an optimum in place of the earlier one of its starting point."""
+        return replace(self, optima=(*(one for one in self.optima if one.point != optimum.point), optimum))
 
     def after_divergence(self, begin: Callable[[FloatArray], P]) -> Self:
         """Turn to the next starting point after a linearisation that diverged.

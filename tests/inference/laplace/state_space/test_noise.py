@@ -10,7 +10,7 @@ import pytest
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.state_space.noise import first_noise, infer_noise
+from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, first_noise, infer_noise
 from sipe_bayes.inference.laplace.state_space.options import ChainTuning, NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.likelihood.binding import bind
@@ -56,7 +56,7 @@ def test_given_noise_is_kept_and_process_noise_shrinks_where_the_model_is_right(
     for _ in range(6):
         linear = linearise(chain, theta, states)
         assert linear is not None
-        noise, _ = infer_noise(chain, linear, noise, flat, theta, movement, tuning.noise)
+        noise, _ = infer_noise(NoisePosterior(chain, linear, noise, flat, theta, movement, tuning.noise))
         point, _ = smooth(chain, linear, noise, flat, ChainPoint(theta, states), 1e-4, 1e-3, tuning)
         theta, states = point.theta, point.states
     assert noise.sd[0] == 0.01
