@@ -48,6 +48,8 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "bayessim regressed, 5 members": ("bayessim", {"summary": "regressed", "members": 5}),
     "npe": ("npe", {}),
     "npe regressed": ("npe", {"embedding": "regressed"}),
+    "npe robust": ("npe", {"embedding": "robust"}),
+    "abc regressed": ("abc", {"summary": "regressed"}),
 }
 CACHE = HERE / "runs" / "simulations"
 

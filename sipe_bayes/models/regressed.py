@@ -7,8 +7,11 @@ kernel k, centred, and K_ij = k(x_i, x_j) of n simulations,
 
 .. math:: s(x) = \bar\theta + k(x)^T (K + \lambda I)^{-1} (\theta - \bar\theta) ,
 
-whose ridge lambda is, for each parameter, that of least error of the simulations when each is left out. These
-left-out estimates are also what a network is trained on: it then sees summaries as far off as those of a new log.
+whose ridge lambda is, for each parameter, that of least error of the simulations when each is left out; infinite where
+none is better than the mean by ``worth``. A network is trained on the estimates of simulations whose ``folds`` were
+left out: it then sees summaries as far off as those of a new log. (The mean is that of all. Without each simulation
+alone, estimates would give its theta away where x does not determine it, being then the mean of the others, (n
+\bar\theta - \theta_i) / (n - 1).)
 
 Deviations:
 
@@ -36,6 +39,8 @@ class RegressionOfTheta(Options):
 
     most: int = option(2000, "simulations that are regressed on", least=10)
     numbers: int = option(4000, "samples of each that count", least=1)
+    folds: int = option(10, "parts of the simulations that are left out in turn", least=2)
+    worth: float = option(10.0, "what a summary takes from the sum of squares, at least, in those of one simulation")
     least: float = option(0.04, "share of a sample's variance that is no noise, below which it does not count", above=0)
     ridges: tuple[float, ...] = option(
         tuple(float(x) for x in np.logspace(-7, 1, 25)), "that are tried", "of the largest eigenvalue of K"
@@ -108,7 +113,7 @@ class Regressed:
         noise: FloatArray | float,
         options: RegressionOfTheta = _OPTIONS,
     ) -> tuple[Self, FloatArray]:
-        """The regression, and summaries (n, N) of its simulations, each left out, those beyond ``most`` as new logs.
+        """The regression, and summaries (n, N) of its simulations, in folds left out, beyond ``most`` as new ones.
 
         Args:
             theta: (n, N).
@@ -125,7 +130,8 @@ class Regressed:
         centred = kernel - middle - middle[:, None] + middle.mean()
         eigenvalues, vectors = np.linalg.eigh(centred)
         eigenvalues = np.maximum(eigenvalues, 0)
-        ridge, left_out = _least_error(eigenvalues, vectors, theta[used] - mean, options)
+        ridge = _least_error(eigenvalues, vectors, theta[used] - mean, options)
+        left_out = _left_out(eigenvalues, vectors, theta[used] - mean, ridge, options)
         coefficients = vectors @ ((vectors.T @ (theta[used] - mean)) / (eigenvalues[:, None] + ridge))
         regressed = cls(*columns, points[used], middle, ridge, coefficients, mean)
         beyond = regressed.summaries(points[options.most :])
@@ -150,16 +156,33 @@ def _kernel(one: Float32Array, other: Float32Array) -> FloatArray:
 
 def _least_error(
     eigenvalues: FloatArray, vectors: FloatArray, theta: FloatArray, options: RegressionOfTheta
-) -> tuple[FloatArray, FloatArray]:
-    """For each parameter the ridge (N,) of least error of those left out, and these estimates (n, N)."""
-    inside, squared, n = vectors.T @ theta, vectors**2, len(theta)
-    best, ridge, left_out = np.full(theta.shape[1], np.inf), np.empty(theta.shape[1]), np.empty(theta.shape)
+) -> FloatArray:
+    """For each parameter, without its mean, the ridge (N,) of least error where each simulation is left out."""
+    inside, squared = vectors.T @ theta, vectors**2
+    best, ridge = (1 - options.worth / len(theta)) * (theta**2).mean(0), np.full(theta.shape[1], np.inf)
     for share in options.ridges:
         tried = max(share * float(eigenvalues.max()), 1e-12)
         kept = eigenvalues / (eigenvalues + tried)
-        own = squared @ kept + 1 / n
-        estimate = theta - (theta - vectors @ (kept[:, None] * inside)) / np.maximum(1 - own, 1e-9)[:, None]
-        error = ((estimate - theta) ** 2).mean(0)
+        own = squared @ kept
+        off = (theta - vectors @ (kept[:, None] * inside)) / np.maximum(1 - own, 1e-9)[:, None]
+        error = (off**2).mean(0)
         better = error < best
-        best[better], ridge[better], left_out[:, better] = error[better], tried, estimate[:, better]
-    return ridge, left_out
+        best[better], ridge[better] = error[better], tried
+    return ridge
+
+
+def _left_out(
+    eigenvalues: FloatArray, vectors: FloatArray, theta: FloatArray, ridge: FloatArray, options: RegressionOfTheta
+) -> FloatArray:
+    """Estimates (n, N) of theta, which has no mean, by regressions without the fold of each simulation."""
+    n, estimates = len(theta), np.zeros(theta.shape)
+    folds = [np.arange(k, n, options.folds) for k in range(min(options.folds, n))]
+    for one in np.unique(ridge[np.isfinite(ridge)]):
+        columns = np.flatnonzero(ridge == one)
+        kept = eigenvalues / (eigenvalues + one)
+        fitted = vectors @ (kept[:, None] * (vectors.T @ theta[:, columns]))
+        for fold in folds:
+            own = (vectors[fold] * kept) @ vectors[fold].T
+            others = fitted[fold] - own @ theta[np.ix_(fold, columns)]
+            estimates[np.ix_(fold, columns)] = np.linalg.solve(np.eye(len(fold)) - own, others)
+    return estimates
