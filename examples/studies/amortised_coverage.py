@@ -46,8 +46,8 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "bayessim": ("bayessim", {}),
     "bayessim regressed": ("bayessim", {"summary": "regressed"}),
     "bayessim regressed, 5 members": ("bayessim", {"summary": "regressed", "members": 5}),
+    "npe transitions": ("npe", {"embedding": "transitions"}),
     "npe": ("npe", {}),
-    "npe regressed": ("npe", {"embedding": "regressed"}),
     "npe robust": ("npe", {"embedding": "robust"}),
     "abc regressed": ("abc", {"summary": "regressed"}),
 }

@@ -80,7 +80,8 @@ class Columns:
     def __call__(self, x: FloatArray) -> Float32Array:
         """Standardised (n, F) of x (n, D); what was not measured counts as the simulations' mean."""
         centred = (x[:, self.kept] - self.mean) * self.weight
-        return np.nan_to_num(centred).astype(np.float32)
+        # by rows, as a checkpoint gives them back: products of another order round otherwise
+        return np.ascontiguousarray(np.nan_to_num(centred), dtype=np.float32)
 
 
 @dataclass(frozen=True)

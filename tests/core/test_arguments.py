@@ -35,7 +35,7 @@ from tests.problems.pendulums import log, pendulum
         ("npe", {"patience": 0}, "patience: expected at least 1, got 0"),
         ("npe", {"learning_rate": "x"}, "learning_rate: expected a positive number, got 'x'"),
         ("npe", {"held_out": "x"}, "held_out: expected a share above 0 and below 1, got 'x'"),
-        ("npe", {"embedding": 3}, "embedding: expected one of transitions, regressed, none, got 3"),
+        ("npe", {"embedding": 3}, "embedding: expected one of transitions, regressed, robust, none, got 3"),
         ("npe", {"device": "meta"}, "device: 'meta' is not available here"),
         ("npe", {"device": 3.5}, "device: 3.5 is not available here"),
         ("abc", {"regression": "no"}, "regression: expected True or False, got 'no'"),

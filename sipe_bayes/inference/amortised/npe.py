@@ -11,9 +11,10 @@ correction, and the trained flow conditions on other logs without training again
 
 ``rounds`` > 1: truncated proposals, see ``inference.amortised.rounds``.
 
-Trajectories enter as sets of control steps (s, a, s' - s) through ``models.transitions.StepEmbedding``, as theta that a
-regression on the simulations makes of them (``embedding="regressed"`` and "robust", ``inference.amortised.summaries``),
-or as they are ("none").
+Trajectories enter as theta that a regression on the simulations makes of them (``embedding="regressed"`` and "robust",
+``inference.amortised.summaries``), as sets of control steps (s, a, s' - s) through ``models.transitions.StepEmbedding``
+("transitions"), or as they are ("none"). By default motions are regressed, which says more for the same simulations;
+of a function, of which two values may explain the same x, their mean would say nothing.
 
 Deviations:
 
@@ -46,6 +47,7 @@ from sipe_bayes.models.training import Weights, check_device, weights
 from sipe_bayes.models.transitions import MOST_STEPS, Standardise, StepEmbedding, control_steps
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior.flow import Flow, spline_flow, to_line
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 _TABLE = 2**26  # numbers: control steps of all simulations that are held at once, ten of each at least
 
@@ -54,9 +56,10 @@ _TABLE = 2**26  # numbers: control steps of all simulations that are held at onc
 class NPEOptions(RoundsOptions):
     """Options of ``NPE``."""
 
-    embedding: str = option(
-        "transitions",
-        'of control steps, of any number; "regressed": theta as regressed on the simulations, for motions; '
+    embedding: str | None = option(
+        None,
+        '"transitions": of control steps, of any number, default for functions; '
+        '"regressed": theta as regressed on the simulations, default for motions; '
         '"robust": the same, of which the log\'s is by minimum distance; '
         '"none": every finite sample as it is, for functions with few outputs',
         among=("transitions", *REGRESSED, "none"),
@@ -110,7 +113,7 @@ class TrainedFlow:
 
 
 class NPE(Rounds[TrainedFlow]):
-    """Normalising flow (sbi) behind an embedding of logs of any length; amortised, or in rounds. A Flow."""
+    """Normalising flow (sbi) behind an embedding or a regression of logs; amortised, or in rounds. A Flow."""
 
     name: ClassVar[str] = "npe"
     options_type: ClassVar[type[Options]] = NPEOptions
@@ -127,7 +130,8 @@ class NPE(Rounds[TrainedFlow]):
     @property
     def summary(self) -> str:
         """See the base's."""
-        return self.options.embedding
+        functions = isinstance(self.simulator, CallableSimulator)
+        return self.options.embedding or ("transitions" if functions else "regressed")
 
     def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> TrainedFlow:
         """The flow with its embedding, of greatest likelihood of held-out simulations."""
@@ -151,7 +155,7 @@ class NPE(Rounds[TrainedFlow]):
                 f"trajectories: expected {trained.features} numbers as in training, got {x.shape[-1]}; "
                 "embedding='none' takes logs of one length only"
             )
-        if self.options.embedding == "transitions" and not x.isfinite().any():
+        if self.summary == "transitions" and not x.isfinite().any():
             raise ValueError("trajectories: no control step has all channels measured at both ends; resample the log")
         names = ("simulations", "epochs", "validation_loss", "converged")
         self.diagnostics |= {name: getattr(trained, name) for name in names}
@@ -174,7 +178,7 @@ class NPE(Rounds[TrainedFlow]):
         return control_steps(seen, actions, trajectories.length, most)
 
     def _embedding(self, features: int) -> Standardise | StepEmbedding:
-        if self.options.embedding != "transitions":
+        if self.summary != "transitions":
             return Standardise(features)
         return StepEmbedding(features, self.options.embedding_features)
 

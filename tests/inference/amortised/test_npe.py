@@ -225,7 +225,7 @@ def test_wrong_input() -> None:
         (lambda: NPE(simulator, learning_rate=0.0), "learning_rate"),
         (lambda: NPE(simulator, **TINY).fit(gap), r"x: npe learns from whole ones, but x\[0\] is NaN"),
         (lambda: NPE(pendulum(), embedding="none", budget=50).fit(missing), "use 'transitions'"),
-        (lambda: NPE(pendulum(), max_epochs=1, budget=50).fit(missing), "no control step"),
+        (lambda: NPE(pendulum(), max_epochs=1, budget=50, embedding="transitions").fit(missing), "no control step"),
         (lambda: NPE(simulator, **{**TINY, "budget": 5}).fit(seen(0.4, 0.5)), "raise the budget"),
         (lambda: trained.posterior(trained.state, Trajectories.stack(longer)), "logs of one length only"),
     ]
