@@ -20,6 +20,8 @@ Deviations:
 
 - theta goes through Phi^-1 before the flow (see ``posterior.flow``): support is the cube, so that there is no leakage
   to correct and no rejection.
+- The flow is of z less what is linear in a regression's summaries, which is most of it: what a network would have to
+  learn to a fraction of the posterior's width it is given.
 - Simulations lose the samples that the log lacks.
 """
 
@@ -49,6 +51,7 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior.flow import Flow, spline_flow, to_line
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
+_INSIDE = (0.01, 0.99)  # where summaries, which may leave the cube, have a z
 _TABLE = 2**26  # numbers: control steps of all simulations that are held at once, ten of each at least
 
 
@@ -94,7 +97,8 @@ class TrainedFlow:
 
     Attributes:
         weights: of both.
-        line_mean, line_sd: (N,), of z = Phi^-1(theta), standardising it.
+        line: (P, N), what ``NPE.line_terms`` are multiplied by for the expected z = Phi^-1(theta).
+        line_sd: (N,), of z about that; both standardise it.
         features: numbers of a control step, or of a log, that the embedding takes.
         simulations: that it was trained on and validated with.
         epochs: that were made.
@@ -103,7 +107,7 @@ class TrainedFlow:
     """
 
     weights: Weights
-    line_mean: FloatArray
+    line: FloatArray
     line_sd: FloatArray
     features: int
     simulations: int
@@ -135,17 +139,19 @@ class NPE(Rounds[TrainedFlow]):
 
     def train_network(self, inputs: Float32Array, theta: FloatArray, member: tuple[int, ...]) -> TrainedFlow:
         """The flow with its embedding, of greatest likelihood of held-out simulations."""
-        line = to_line(from_numpy(theta))
-        mean, sd = line.mean(0), line.std(0).clamp_min(1e-6)
+        z, terms = to_line(from_numpy(theta)), from_numpy(self.line_terms(inputs))
+        line = torch.linalg.lstsq(terms, z, driver="gelsd").solution
+        left = z - terms @ line
+        sd = left.std(0).clamp_min(1e-6)
         x, seed = from_numpy(inputs), seed_integer([self.seed, 4, *member])
         with seeded(seed), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            net, summary = self._optimise(((line - mean) / sd).float(), x)
+            net, summary = self._optimise((left / sd).float(), x)
         epochs = int(summary["epochs_trained"][-1])
         converged = epochs <= self.options.max_epochs
         self.still_improving(converged, self.options.max_epochs, "epochs", "max_epochs")
         loss = float(summary["best_validation_loss"][-1])
-        return TrainedFlow(weights(net), mean.numpy(), sd.numpy(), x.shape[-1], len(x), epochs, loss, converged)
+        return TrainedFlow(weights(net), line.numpy(), sd.numpy(), x.shape[-1], len(x), epochs, loss, converged)
 
     def infer_network(self, trained: TrainedFlow, inputs: Float32Array) -> Posterior:
         """The flow given the log; raises ValueError for one of another size, or without a whole control step."""
@@ -164,7 +170,16 @@ class NPE(Rounds[TrainedFlow]):
         with torch.no_grad():
             context = embedding(x)[0].double()
         flow = _part(trained.weights, "net.")
-        return Flow(flow, context, trained.line_mean, trained.line_sd, self.space, **self.options.architecture)
+        mean = (self.line_terms(inputs) @ trained.line)[0]
+        return Flow(flow, context, mean, trained.line_sd, self.space, **self.options.architecture)
+
+    def line_terms(self, inputs: Float32Array) -> FloatArray:
+        """What z is linear in (n, P): the mean alone, or also a regression's summaries, as they are and as z."""
+        constant = np.ones((len(inputs), 1))
+        if self.summary not in REGRESSED:
+            return constant
+        summaries = inputs.astype(float)
+        return np.hstack([constant, summaries, to_line(from_numpy(np.clip(summaries, *_INSIDE))).numpy()])
 
     def inputs(self, observations: NDArray[np.floating], trajectories: Trajectories) -> Float32Array:
         """What the embedding takes: control steps (n, M, F), or all samples (n, F); without what the log lacks."""
