@@ -18,6 +18,7 @@ Deviations:
 - The mixture is restricted to the cube, with its true normaliser.
 - Statistics are averages over control steps, so that length does not matter.
 - Early stopping on held-out simulations; standardised inputs.
+- The mixture is of theta less a regression's summaries, which is most of it.
 """
 
 from __future__ import annotations
@@ -131,28 +132,32 @@ class BayesSim(Rounds[TrainedNetwork]):
             size = options.summary_features
         n = len(self.space)
         density = MixtureDensity(size, n, options.components, options.features, options.units, self.seed)
-        return _Summarised(embedding, density)
+        return _Summarised(embedding, density, self.summary in REGRESSED)
 
 
 class _Summarised(nn.Module):
-    """An embedding, or none, before a MixtureDensity."""
+    """An embedding, or none, before a MixtureDensity, which may be of theta less the inputs."""
 
-    def __init__(self, embedding: StepEmbedding | None, density: MixtureDensity) -> None:
+    def __init__(self, embedding: StepEmbedding | None, density: MixtureDensity, less: bool) -> None:
         super().__init__()
-        self.embedding, self.density = embedding, density
+        self.embedding, self.density, self.less = embedding, density, less
 
     @torch.no_grad()
     def fit_inputs(self, inputs: Tensor, theta: Tensor) -> None:
         if self.embedding is not None:
             self.embedding.standardise.fit(inputs)
-        self.density.fit_inputs(self._summary(inputs), theta)
+        self.density.fit_inputs(self._summary(inputs), self._left(inputs, theta))
 
     def _summary(self, inputs: Tensor) -> Tensor:
         return inputs if self.embedding is None else self.embedding(inputs)
 
+    def _left(self, inputs: Tensor, theta: Tensor) -> Tensor:
+        return theta - inputs if self.less else theta
+
     def log_prob(self, inputs: Tensor, theta: Tensor) -> Tensor:
-        return self.density.log_prob(self._summary(inputs), theta)
+        return self.density.log_prob(self._summary(inputs), self._left(inputs, theta))
 
     @torch.no_grad()
     def mixture(self, inputs: Tensor) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return self.density.mixture(self._summary(inputs)[0])
+        weights, means, covariances = self.density.mixture(self._summary(inputs)[0])
+        return weights, means + inputs[0].double().numpy() if self.less else means, covariances

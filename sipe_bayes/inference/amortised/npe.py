@@ -151,7 +151,9 @@ class NPE(Rounds[TrainedFlow]):
         converged = epochs <= self.options.max_epochs
         self.still_improving(converged, self.options.max_epochs, "epochs", "max_epochs")
         loss = float(summary["best_validation_loss"][-1])
-        return TrainedFlow(weights(net), line.numpy(), sd.numpy(), x.shape[-1], len(x), epochs, loss, converged)
+        return TrainedFlow(
+            weights(net), line.contiguous().numpy(), sd.numpy(), x.shape[-1], len(x), epochs, loss, converged
+        )
 
     def infer_network(self, trained: TrainedFlow, inputs: Float32Array) -> Posterior:
         """The flow given the log; raises ValueError for one of another size, or without a whole control step."""
