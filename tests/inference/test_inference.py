@@ -178,7 +178,6 @@ def test_a_delay_of_none_is_found(likelihood: Any) -> None:
         log(simulator, [0.6, 0.1, 0.0], 2, steps=200)
     )
     low, middle, high = simulator.space.values(posterior.quantile([0.005, 0.5, 0.995]).numpy())
-    print(low, middle, high)
     assert middle[2] < 0.005
     assert low[0] < 0.6 < high[0]
     assert low[1] < 0.1 < high[1]

@@ -23,7 +23,7 @@ from sipe_bayes.inference.laplace.state_space.noise_average import averaged
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
-from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, merged, mixture
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
@@ -147,21 +147,22 @@ class Laplace(Estimator[LaplaceState]):
             state = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
             return replace(state, done=stands or not shots_left)
-        if windows.num_start or windows.settings.noise == "sandwich":
-            return ended
         kept = distinct(state.search.optima)
-        if len(kept) != 1 or not isinstance(kept[0], WindowOptimum) or kept[0].guessed:
+        best = kept[0]
+        if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
+            return ended
+        if not best.unsmooth and (windows.num_start or len(kept) != 1):
             return ended
         assert isinstance(state.search, WindowState)
-        if np.sqrt(np.diag(kept[0].covariance)).min() < 10 * SHORTEST:
+        if np.sqrt(np.diag(best.covariance)).min() < 10 * SHORTEST:
             return ended  # an sd that the look around the optimum may have set
         if not windows.has_room(importance.probe_size(n)):
             return replace(ended, unjudged=True)
-        target = self._target(windows, kept[0])
+        target = self._target(windows, best)
         if target.silent:
             return ended
-        if importance.is_normal(target, kept[0].theta, kept[0].mean, kept[0].covariance, tuning):
-            return replace(ended, search=_looked_around(state.search, kept[0]))
+        if not best.unsmooth and importance.is_normal(target, best.theta, best.mean, best.covariance, tuning):
+            return replace(ended, search=_looked_around(state.search, best))
         return replace(state, draws=Draws.none(n), done=not windows.has_room(importance.batch_size(n, tuning)))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
@@ -195,7 +196,7 @@ class Laplace(Estimator[LaplaceState]):
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts."""
         kept, tuning, n = distinct(state.search.optima), self.options.tuning.importance, len(self.space)
-        normal, target = mixture(kept, self.space), self._target(windows, kept[0])
+        normal, target = mixture([merged(kept)], self.space), self._target(windows, kept[0])
         draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
         effective = importance.effective(importance.weights(draws, self.prior))
         hopeless = draws.batches >= tuning.hopeless_after and effective < draws.batches
@@ -220,18 +221,19 @@ class Laplace(Estimator[LaplaceState]):
                 f"budget: {self.budget} rollouts were not enough for one optimum; "
                 f"one step takes {step} rollouts, so raise the budget"
             )
-        self._report(kept, state)
+        draws, tuning = state.draws or Draws.none(len(self.space)), self.options.tuning.importance
         normals = mixture(kept, self.space)
-        if state.draws is None:
-            return normals
-        tuning, weight = self.options.tuning.importance, importance.weights(state.draws, self.prior)
+        weight = importance.weights(draws, self.prior)
         effective = importance.effective(weight)
-        self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
-        if effective >= tuning.least:
-            return importance.kernels(state.draws.points, weight, self.space, self.seed, tuning)
-        if state.done:
-            self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
-        return normals
+        enough = effective >= tuning.least
+        if enough and isinstance(kept[0], WindowOptimum):
+            kept = [replace(kept[0], finding=None) if kept[0].unsmooth else kept[0]]  # draws ask for no slope
+        self._report(kept, state)
+        if state.draws is not None:
+            self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
+            if state.done and not enough:
+                self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
+        return importance.kernels(draws.points, weight, self.space, self.seed, tuning) if enough else normals
 
     def _report(self, kept: list[Optimum], state: LaplaceState) -> None:
         """Diagnostics of the best optimum, and what is to be said against any that is kept."""

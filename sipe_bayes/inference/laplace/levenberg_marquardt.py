@@ -128,6 +128,9 @@ def descend(
 ) -> Descent[P]:
     """The first of ever shorter damped steps that lowers the energy.
 
+    Where damping left over from earlier steps is why nothing is to be gained, one nearly undamped step is tried as
+    well: at a kink, as of dry friction, damping grows until it promises nothing, whatever the slope says.
+
     Args:
         linearised: the energy at a point and around it.
         damping: of the first step tried.
@@ -135,25 +138,49 @@ def descend(
         rule: how the damping changes.
         stale: whether the linearisation is of an earlier point; a refused step is then left to a fresh one.
     """
+    fit = _shortened(linearised, damping, tolerance, rule, stale)
+    step = _tried(linearised, rule.first, tolerance) if fit.converged and damping > rule.first else None
+    if step is None or step.converged:
+        return fit
+    if step.gained > fit.gained:
+        return replace(step, damping=rule.after(rule.first, lowered=True), converged=step.gained < tolerance)
+    return replace(fit, expected=np.inf, converged=False) if stale else replace(fit, refused=step.expected)
+
+
+def _shortened(
+    linearised: LinearisedEnergy[P], damping: float, tolerance: float, rule: DampingRule, stale: bool
+) -> Descent[P]:
+    """The first of ever shorter steps that lowers the energy, from one damping on."""
     standing: Descent[P] = Descent(None, linearised.energy, damping)
     refused = 0.0
     while damping <= rule.most:
-        try:
-            model = linearised.model(damping)
-        except np.linalg.LinAlgError:
-            damping = rule.after(damping, lowered=False)
-            continue
-        move = model.step(linearised.theta, damping)
-        expected = model.gain(move)
-        if expected < tolerance:
+        step = _tried(linearised, damping, tolerance)
+        if step is not None and step.converged:
             return replace(standing, converged=True, refused=refused)
-        theta = np.clip(linearised.theta + move, 0.0, 1.0)
-        point, energy = linearised.simulated(theta, model.rest(move))
-        gained = linearised.energy - energy
-        if gained > 0:
-            damping = rule.after(damping, lowered=True)
-            return Descent(point, energy, damping, gained < tolerance, expected, gained)
-        if stale:
+        if step is not None and step.point is not None:
+            return replace(step, damping=rule.after(damping, lowered=True), converged=step.gained < tolerance)
+        if step is not None and stale:
             return replace(standing, expected=np.inf)
-        damping, refused = rule.after(damping, lowered=False), max(refused, expected)
+        damping, refused = rule.after(damping, lowered=False), max(refused, step.expected if step else 0.0)
     return replace(standing, converged=True, refused=refused, exhausted=True)
+
+
+def _tried(linearised: LinearisedEnergy[P], damping: float, tolerance: float) -> Descent[P] | None:
+    """A damped step: converged where it is to gain less than ``tolerance``, without a point where it gained nothing.
+
+    None where rounding leaves no model.
+    """
+    try:
+        model = linearised.model(damping)
+    except np.linalg.LinAlgError:
+        return None
+    move = model.step(linearised.theta, damping)
+    expected = model.gain(move)
+    if expected < tolerance:
+        return Descent(None, linearised.energy, damping, converged=True, expected=expected)
+    theta = np.clip(linearised.theta + move, 0.0, 1.0)
+    point, energy = linearised.simulated(theta, model.rest(move))
+    gained = linearised.energy - energy
+    if gained > 0:
+        return Descent(point, energy, damping, expected=expected, gained=gained)
+    return Descent(None, linearised.energy, damping, expected=expected)

@@ -187,4 +187,8 @@ def judged(
         left = misfit(windows, ending.residual) / ending.first_misfit
         way = float(np.sqrt(((ending.theta - ending.begin) ** 2).mean()))
         covariance = covariance + (way * min(1.0, left)) ** 2 * np.eye(len(ending.theta))
+    if windows.num_start and unsmooth:
+        # the normal's middle lies where a slope led that no simulation follows
+        refused = np.clip(optimum.mean, 0.0, 1.0) - ending.theta
+        optimum, covariance = replace(optimum, mean=ending.theta), covariance + np.outer(refused, refused)
     return replace(optimum, covariance=covariance, guessed=guessed, finding=reason)

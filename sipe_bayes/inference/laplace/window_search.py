@@ -334,6 +334,7 @@ class WindowSearch:
         windows, tuning, here = self.windows, self._tuning, state.here
         theta, noise = before.theta, step.noise
         moments = windows.moments(step.lin) if before.phase in _ROUGH and not self._white else step.moments
+        tells = bool(windows.num_start) and not windows.least_steps(theta).any()  # else points around, or a secant
         ending = Ending(
             theta,
             before.starts,
@@ -344,7 +345,7 @@ class WindowSearch:
             begin=state.points[state.point],
             steps=here.iteration,
             first_misfit=here.misfit,
-            refused=step.fit.refused if windows.num_start or step.fit.exhausted else 0.0,  # else points around tell
+            refused=step.fit.refused if tells or step.fit.exhausted else 0.0,
             settled=settled,
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,

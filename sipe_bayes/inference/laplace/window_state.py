@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.core.findings import Finding
+from sipe_bayes.core.findings import Code, Finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.strategy import Optimum, StrategyState
 from sipe_bayes.likelihood.noise import Noise
@@ -134,6 +134,11 @@ class WindowOptimum(Optimum):
     slope: FloatArray
     guessed: bool = False
     finding: Finding | None = None
+
+    @property
+    def unsmooth(self) -> bool:
+        """Whether the simulation does not follow its slope there."""
+        return self.finding is not None and self.finding.code is Code.NOT_SMOOTH
 
 
 @dataclass(frozen=True)

@@ -114,3 +114,18 @@ def test_a_refused_search_says_what_it_was_to_gain(tolerance: float) -> None:
     assert fit.exhausted == (tolerance < 1e-6)
     assert fit.refused == pytest.approx(problem.energy, rel=1e-3)
     assert fit.converged
+
+
+@pytest.mark.parametrize("kinked", [False, True])
+def test_damping_of_earlier_steps_hides_no_kink(kinked: bool) -> None:
+    """Where damping promises nothing, one nearly undamped step is tried: it leads on, or a kink is said."""
+    problem = bowl((lambda t: np.inf) if kinked else None)
+    fit = descend(problem, 1e5, 1e-3, DampingRule())
+    assert problem.simulations == 1
+    if kinked:
+        assert fit.converged
+        assert fit.point is None
+        assert fit.refused == pytest.approx(problem.energy, rel=1e-3)
+    else:
+        np.testing.assert_allclose(fit.point, problem.middle, atol=1e-3)
+        assert fit.damping < 1e-4
