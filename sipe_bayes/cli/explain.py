@@ -2,29 +2,80 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sipe_bayes.cli.errors import exit_on_error
 
+if TYPE_CHECKING:
+    from sipe_bayes.core.finding_texts import Code, Severity
+
 
 def explain(
-    codes: Annotated[list[str] | None, typer.Argument(help="Of findings, such as not_mixed; none lists all.")] = None,
+    codes: Annotated[
+        list[str] | None,
+        typer.Argument(help="Of findings, such as not_mixed, or the folder of a run, for its own; none lists all."),
+    ] = None,
 ) -> None:
     """What a finding of a report or of result.json means, and what to do."""
-    from sipe_bayes.core.finding_advice import ADVICE, plain
+    from sipe_bayes.core.finding_advice import ADVICE
+    from sipe_bayes.core.finding_texts import Code
+
+    if not codes:
+        print("\n".join(f"{code} ({code.value.severity})" for code in Code))
+    with exit_on_error():
+        entries = [one for name in codes or () for one in (_of_run(name) or [_alone(_named(name))])]
+    for entry in entries:
+        times = f", {entry.count} times, of which the first" if entry.count > 1 else ""
+        print(f"{entry.code} ({entry.severity}{times})\n  {entry.text}\n  {ADVICE[entry.code]}")
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A finding to explain, and how many of its code there are."""
+
+    code: Code
+    severity: Severity
+    text: str
+    count: int = 1
+
+
+def _alone(code: Code) -> _Entry:
+    from sipe_bayes.core.finding_advice import plain
+
+    return _Entry(code, code.value.severity, plain(code))
+
+
+def _named(name: str) -> Code:
+    """The code of that name."""
     from sipe_bayes.core.finding_texts import Code
     from sipe_bayes.core.validation import nearest_name
 
     known = {str(one): one for one in Code}
-    with exit_on_error():
-        for name in codes or ():
-            if name.lower() not in known:
-                hint = nearest_name(name, known) or "; `sipe explain` lists them"
-                raise ValueError(f"CODES: expected the code of a finding, got {name!r}{hint}")
-    if not codes:
-        print("\n".join(f"{name} ({one.value.severity})" for name, one in known.items()))
-    for name in codes or ():
-        code = known[name.lower()]
-        print(f"{code} ({code.value.severity})\n  {plain(code)}\n  {ADVICE[code]}")
+    if name.lower() not in known:
+        hint = nearest_name(name, known) or "; `sipe explain` lists them"
+        raise ValueError(f"CODES: expected the code of a finding, or the folder of a run, got {name!r}{hint}")
+    return known[name.lower()]
+
+
+def _of_run(name: str) -> list[_Entry]:
+    """What a run found, worst first, of each code the first one; empty where the name is no folder."""
+    from pydantic import TypeAdapter
+
+    from sipe_bayes.core.files import is_folder, read_json, reading
+    from sipe_bayes.core.finding_texts import Severity
+
+    if not is_folder(name):
+        return []
+    record, what, remedy = Path(name) / "result.json", "the result of a run", "calibrate again"
+    plain = read_json(record, what, remedy)
+    entries: dict[Code, _Entry] = {}
+    with reading(record, what, remedy):
+        for item in TypeAdapter(list[dict[str, object]]).validate_python(plain["findings"]):
+            new = _Entry(_named(str(item["code"])), Severity(str(item["severity"])), str(item["text"]))
+            first = entries.get(new.code)
+            entries[new.code] = replace(first, count=first.count + 1) if first else new
+    return sorted(entries.values(), key=lambda entry: -list(Severity).index(entry.severity))
