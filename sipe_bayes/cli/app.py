@@ -235,7 +235,7 @@ def print_calibration(calibration: Calibration) -> None:
     sentences = verdicts(calibration, brief=True)
     for verdict in sentences[:_SENTENCES]:
         console.print(Text(_cut(verdict.text), style=_TONES[verdict.tone]))
-    below = [*_pooled(calibration), *_worst(findings)]
+    below = [*_pooled(calibration), *_worst(findings, calibration.out)]
     below.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s" + _report(calibration))
     _print_parameters(console, calibration, findings, _LINES - 1 - min(len(sentences), _SENTENCES) - len(below))
     for line in below:
@@ -300,14 +300,14 @@ def _errors(scores: Sequence[ChannelScore]) -> tuple[list[float], list[float]]:
     return [s.rmse for s in scores], [s.rmse_default for s in scores]
 
 
-def _worst(findings: Findings) -> list[str]:
+def _worst(findings: Findings, out: str) -> list[str]:
     """The warnings that matter most; how many there are beside them."""
     kinds = findings.kinds
     lines = [f"warning: {_cut(text)}" for text in kinds[:_WARNINGS]]
     if len(kinds) > len(lines):
         lines[-1] += f" [{len(kinds) - len(lines)} more in the report]"
-    codes = dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS])
-    return lines + [f"what these mean and what to do: sipe explain {' '.join(codes)}"] * bool(codes)
+    where = out or " ".join(dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS]))
+    return lines + [f"what these mean and what to do: sipe explain {where}"] * bool(lines)
 
 
 def _report(calibration: Calibration) -> str:

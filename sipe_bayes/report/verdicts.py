@@ -17,7 +17,7 @@ from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report.words import listed, number
 
 _ONE = "The one value may be trusted within its interval"
-_NAMED, _DOUBTS = 6, 2  # parameters and doubts that a sentence lists
+_NAMED, _DOUBTS = 3, 2  # parameters and doubts that a sentence lists
 _FIVE_TO_95 = 0.9 * math.sqrt(12)  # sds of a uniform prior
 
 _PROBLEMS = (
@@ -95,12 +95,12 @@ def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: Band
     usable, open_ = [n for n, tone in tones.items() if tone != "bad"], [n for n, tone in tones.items() if tone == "bad"]
     text = "It does not tell how well it predicts"
     if bands is not None:
-        share, error = 100 * bands.share, 100 * bands.error
-        text = f"Use it to predict: its 90 % bands hold {share:.0f} ± {error:.0f} % of the held-out samples"
+        held = f"hold {100 * bands.share:.0f} ± {number(100 * bands.error, 1)} % of the held-out samples"
+        text = f"Use it to predict: its 90 % bands {held}"
         off = bands.share - THRESHOLDS.shown_interval
         if abs(off) > 2 * bands.error + THRESHOLDS.band_off:
             text = "Use it to predict, within less than its bands" if off > 0 else "Do not rely on its bands"
-            text += f": those of 90 % hold {share:.0f} ± {error:.0f} % of the held-out samples"
+            text += f": those of 90 % {held}"
         widths = list(bands.half.items())[:_DOUBTS]
         half = ", ".join(f"± {number(width, 2)} {unit}".rstrip() + f" in {name}" for name, (width, unit) in widths)
         text += f" ({half})"
@@ -112,7 +112,7 @@ def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: Band
 
 
 def _few(names: Sequence[str]) -> str:
-    return listed(names) if len(names) <= _NAMED else f"{listed(names[:_NAMED])} and others"
+    return listed(names) if len(names) <= _NAMED + 1 else f"{listed(names[:_NAMED])} and {len(names) - _NAMED} others"
 
 
 def headline(

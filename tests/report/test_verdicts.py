@@ -209,7 +209,7 @@ def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
     off = judged.headline([narrow, wide], lacks, dataclasses.replace(held, share=0.6))
     assert off.text.startswith("Do not rely on its bands: those of 90 % hold 60 ± 3 %")
     cautious = judged.headline([narrow, wide], lacks, dataclasses.replace(held, share=0.99, error=0.004))
-    assert cautious.text.startswith("Use it to predict, within less than its bands: those of 90 % hold 99 ± 0 %")
+    assert cautious.text.startswith("Use it to predict, within less than its bands: those of 90 % hold 99 ± 0.4 %")
     assert judged.headline([wide], lacks).text == "It does not tell how well it predicts; damping not at all."
     doubted = Findings([*lacks, doubt("the chains have not mixed", Code.NOT_MIXED)])
     assert "yet: the chains have not mixed" in judged.headline([narrow, wide], doubted, held).text
