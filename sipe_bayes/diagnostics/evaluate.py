@@ -28,7 +28,8 @@ from sipe_bayes.posterior import Posterior
 
 _BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
 _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
-_SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried
+_SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
+_SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
@@ -167,8 +168,7 @@ def _best_squares(windows: Windows, theta: FloatArray) -> FloatArray:
 def _best_residuals(windows: Windows, theta: FloatArray) -> tuple[FloatArray, bool]:
     """Residuals (W, L, C) of theta (N,) from the starts that fit best, and whether the simulation is valid."""
     noise = Noise(np.maximum(0.05 * np.nan_to_num(windows.spread), windows.rounding), np.zeros(len(windows.fitted)))
-    residual, valid = windows.residuals(theta[None], best_starts(windows, theta, noise)[None])
-    return residual[0], bool(valid[0])
+    return _from_best_starts(windows, theta, noise)[1:]
 
 
 def _share_of_starts(windows: Windows, square: FloatArray, fitted: FloatArray) -> float:
@@ -322,19 +322,33 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
 
 def best_starts(windows: Windows, theta: FloatArray, noise: Noise, iterations: int = 4) -> FloatArray:
     """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,)."""
+    return _from_best_starts(windows, theta, noise, iterations)[0]
+
+
+def _from_best_starts(
+    windows: Windows, theta: FloatArray, noise: Noise, iterations: int = 4
+) -> tuple[FloatArray, FloatArray, bool]:
+    """The best starts (W, D), the residuals (W, L, C) from them, and whether that simulation is valid."""
+
+    def simulated(starts: FloatArray) -> tuple[FloatArray, bool]:
+        residual, valid = windows.residuals(theta[None], starts[None])
+        return residual[0], bool(valid[0])
+
     if grows(windows):
-        return grown_starts(windows, theta, noise, GrowingTuning())
+        starts = grown_starts(windows, theta, noise, GrowingTuning())
+        return starts, *simulated(starts)
     starts = windows.no_starts()
-    for _ in range(iterations):
-        linearisation = windows.linearise(theta, starts, with_theta=False)
-        if not (linearisation.valid and np.isfinite(linearisation.residual).all()):
-            break
+    residual, valid = simulated(starts)
+    for _ in range(iterations if valid and np.isfinite(residual).all() else 0):
+        linearisation = windows.linearise(theta, starts, with_theta=False, residual=residual)
         move = marginal(windows.moments(linearisation), noise, starts, windows.start_precision)[1]
-        before = windows.chi_square(linearisation.residual[None], noise)[0]
-        trials = starts + np.array(_SHORTER)[:, None, None] * move
-        residuals, valid = windows.residuals(np.tile(theta, (len(trials), 1)), trials)
-        after = np.where(valid, windows.chi_square(residuals, noise), np.inf)
-        if not after.min() < before:
+        before = after = windows.chi_square(residual[None], noise)[0]
+        for share in _SHORTER:
+            tried, good = simulated(starts + share * move)
+            after = windows.chi_square(tried[None], noise)[0] if good else np.inf
+            if after < before:
+                starts, residual = starts + share * move, tried
+                break
+        if not after < (1 - _SETTLED) * before:
             break
-        starts = trials[int(after.argmin())]
-    return starts
+    return starts, residual, valid

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,13 +34,14 @@ _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 class MisfitOptions(Options):
     """What residuals are asked, and how the null is simulated."""
 
-    simulated: int = option(99, "draws of the null: p resolves a percent", least=1)
+    simulated: int = option(99, "draws of the null at most: p resolves a percent", least=1)
+    exceeded: int = option(10, "draws odder than the logs, after which no more are made: they are not odd", least=1)
     pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
     alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
     steps: int = option(1600, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
-    batch: int = option(16, "draws of the null whose products are formed together", least=1)
+    batch: int = option(20, "draws of the null whose products are formed together", least=1)
 
 
 MISFIT = MisfitOptions()
@@ -69,6 +70,14 @@ class Solved:
     answer: FloatArray
     variance: FloatArray
     arrow: Eliminated
+
+
+@dataclass
+class _Null:
+    """Draws of the null as far as they were asked for, and where the next come from."""
+
+    rng: np.random.Generator
+    rows: list[FloatArray] = field(default_factory=list)
 
 
 class ProbedLogs:
@@ -118,7 +127,7 @@ class ProbedLogs:
         self.free, self.pull = np.ones(n, bool), prior.pull(theta)
         arrow = self._arrow(self.moments().normal(noise))
         total = arrow.gradient[:n] + self.pull
-        self._nulls: dict[tuple[int, int], FloatArray] = {}
+        self._nulls: dict[int, _Null] = {}
         self.free = ~(((theta <= _PRESSED) & (total < 0)) | ((theta >= 1 - _PRESSED) & (total > 0)))
 
     def seen(self) -> Solved:
@@ -127,18 +136,13 @@ class ProbedLogs:
 
     def null(self, seed: int, simulated: int) -> FloatArray:
         """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated; made once."""
-        key = seed, simulated
-        if key not in self._nulls:
-            self._nulls[key] = self._simulated(np.random.default_rng(seed), simulated)
-        return self._nulls[key]
-
-    def _simulated(self, rng: np.random.Generator, simulated: int) -> FloatArray:
-        draws, rows = self.drawn(rng, simulated), []
-        for part in np.array_split(np.arange(simulated), max(1, simulated // MISFIT.batch)):
-            for s, (plain, normal) in zip(part, self.together(draws[..., part]), strict=True):
+        made = self._nulls.setdefault(seed, _Null(np.random.default_rng(seed)))
+        while len(made.rows) < simulated:
+            draws = self.drawn(made.rng, MISFIT.batch)
+            for s, (plain, normal) in enumerate(self.together(draws)):
                 noise = self.estimated(plain)
-                rows.append(self.solved(draws[..., s], normal(noise), noise).statistics)
-        return np.stack(rows)
+                made.rows.append(self.solved(draws[..., s], normal(noise), noise).statistics)
+        return np.stack(made.rows[:simulated])
 
     def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         """Residuals (W, L, C, S) of the noise alone."""
