@@ -19,7 +19,7 @@ from sipe_bayes.calibration.init.matching import Matches, match_columns
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
-from sipe_bayes.calibration.init.unknowns import Sizes, candidates, delay_of, told_apart
+from sipe_bayes.calibration.init.unknowns import RELATIVE, Sizes, candidates, delay_of, scale_is_open, told_apart
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,
@@ -45,6 +45,7 @@ _CHECKED = 60  # logs whose columns are looked at
 _HELD = 0.75  # share of a single log that trains
 _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
 _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
+_BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
 _SHORT = 2.0  # s: logs as short are one window each
 
 
@@ -76,7 +77,8 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
         doubts=(*dropped, *_unmatched(model, machine, matches, commands)),
         notes=_unused(matches, commands),
     )  # fmt: skip
-    trained = _decided(draft, model, machine, sources, folder)
+    positions = bool(tried_part(draft).measurements)
+    trained = _decided(draft, model, machine, sources, folder) if positions else _undecided(draft, model, machine)
     trained = replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
     return _felt(trained) if _is_felt(machine, matches) else trained
 
@@ -240,6 +242,13 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
     )  # fmt: skip
 
 
+def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
+    """Where no position is measured, from which windows could start: what the names and the model alone tell."""
+    doubt = "no column measures a position, so nothing was simulated: units and signs are those of the names"
+    unknowns = rough_unknowns(model, machine, draft.readings)
+    return replace(draft, unknowns=tuple(unknowns), window=_BLIND, doubts=(*draft.doubts, doubt))
+
+
 def _unknowns(
     draft: Draft, model: mujoco.MjModel, machine: Machine, logs: Sequence[Trajectory], folder: Path
 ) -> tuple[list[Unknown], float, list[str]]:
@@ -260,13 +269,18 @@ def _unknowns(
     left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
-    return [*late, *told_apart(unknowns, left)], samples, [note] if note and not late else []
+    told = told_apart(unknowns, left, scale_is_open(model, machine, draft.readings))
+    return [*late, *told], samples, [note] if note and not late else []
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:
     """The unknowns, all of them asked for where the simulations told none apart, and what is said of that."""
     if any(not unknown.left_out for unknown in unknowns):
-        return unknowns, []
+        relative = [u for u in unknowns if u.left_out == RELATIVE]
+        doubts = [
+            f"no force is known: all forces and masses are relative to {u.name}, {u.note}; weigh it" for u in relative
+        ]
+        return unknowns, doubts
     if not unknowns:
         return [], ["nothing of the model could be proposed as unknown; add [[parameters]] by hand"]
     doubt = "no unknown shows in the windows that were simulated, so all are asked for; look at the log and the model"

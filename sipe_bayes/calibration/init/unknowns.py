@@ -17,7 +17,9 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.targets import bind
 
-_MOST = 12  # parameters that are asked for
+RELATIVE = "no force is known, so that all others are relative to it; weigh it"
+"""Why a mass is left out."""
+_MOST = 20  # parameters that are asked for: what shows and is left out is in all others
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
 _APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
@@ -79,18 +81,27 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     """
     measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
     joints = [joint for joint in machine.joints if joint.name in measured]
-    driven = [(a, r) for a in machine.actuators for r in readings if r.match.target == f"actuator:{a.name}"]
-    gains = [unknown for a, r in driven for unknown in _of_actuator(model, a, r)]
-    known_force = any(r.match.label.kind == Kind.TORQUE or r.unit in ("N m", "N") for _, r in driven)
-    fixed_scale = not driven or (bool(gains) and not known_force and any(a.drive != Drive.POSITION for a, _ in driven))
+    gains = [unknown for a, r in _driven(machine, readings) for unknown in _of_actuator(model, a, r)]
+    open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
-    free = [] if fixed_scale else [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
-    sole = fixed_scale and len(joints) < 2
-    masses = [] if sole else _masses(model, [*behind, *free], first=fixed_scale)
+    free = [] if open_scale else [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
+    masses, attached = _masses(model, [*behind, *free])
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
-    if sole:  # a rotor is so much more mass, to which the gain is relative
+    if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
-    return gains + masses + of_joints + _contacts(model, machine)
+    return gains + masses + of_joints + attached + _contacts(model, machine)
+
+
+def _driven(machine: Machine, readings: Sequence[Reading]) -> list[tuple[Actuator, Reading]]:
+    return [(a, r) for a in machine.actuators for r in readings if r.match.target == f"actuator:{a.name}"]
+
+
+def scale_is_open(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]) -> bool:
+    """Whether no force is known: with all forces and masses as many times larger, everything moves alike."""
+    driven = _driven(machine, readings)
+    known_force = any(r.match.label.kind == Kind.TORQUE or r.unit in ("N m", "N") for _, r in driven)
+    gains = [unknown for a, r in driven for unknown in _of_actuator(model, a, r)]
+    return not driven or (bool(gains) and not known_force and any(a.drive != Drive.POSITION for a, _ in driven))
 
 
 def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) -> list[Unknown]:
@@ -128,18 +139,20 @@ def _factor(name: str, target: str, low: float, high: float, note: str) -> Unkno
     return Unknown(name, (target,), low, high, True, note)
 
 
-def _masses(model: mujoco.MjModel, bodies: Sequence[int], first: bool) -> list[Unknown]:
-    """The heaviest of what moves with each body; with ``first`` not of the first one, to which others are relative."""
-    out, seen = [], set()
-    for body in bodies:
-        moved = [b for b in range(1, model.nbody) if int(model.body_weldid[b]) == int(model.body_weldid[body])]
-        heaviest = max(moved, key=lambda b: float(model.body_mass[b]))
-        mass, name = float(model.body_mass[heaviest]), model.body(heaviest).name
-        if mass <= 0 or not name or name in seen:
-            continue
-        seen.add(name)
-        out.append(_factor(f"{_word(name)}_mass", f"body:{name}.mass", 0.5, 2.0, f"{mass:g} kg in the model"))
-    return out[1:] if first else out
+def _masses(model: mujoco.MjModel, bodies: Sequence[int]) -> tuple[list[Unknown], list[Unknown]]:
+    """The heaviest of what moves with each body, and what else is attached to it: payloads, tools."""
+    heaviest: list[Unknown] = []
+    attached: list[Unknown] = []
+    for moving in dict.fromkeys(int(model.body_weldid[body]) for body in bodies):
+        moved = [b for b in range(1, model.nbody) if int(model.body_weldid[b]) == moving]
+        by_mass = sorted(moved, key=lambda b: -float(model.body_mass[b]))
+        for k, body in enumerate(by_mass):
+            mass, name = float(model.body_mass[body]), model.body(body).name
+            if mass > 0 and name:
+                note = f"{mass:g} kg in the model" + (f", attached to {model.body(by_mass[0]).name}" if k else "")
+                unknown = _factor(f"{_word(name)}_mass", f"body:{name}.mass", 0.5, 2.0, note)
+                (attached if k else heaviest).append(unknown)
+    return heaviest, attached
 
 
 def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown]:
@@ -213,13 +226,18 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
     return out
 
 
-def told_apart(unknowns: Sequence[Unknown], fit: Fit) -> list[Unknown]:
+def told_apart(unknowns: Sequence[Unknown], fit: Fit, open_scale: bool = False) -> list[Unknown]:
     """The unknowns, with the reason where one is better left out: it shows too little, or as another one does.
 
     Args:
         unknowns: of the fit, those first that are to be kept first.
         fit: with the effects of each.
+        open_scale: whether forces and masses are known relative to each other alone: the mass that shows most is left
+            out, to which the others then are.
     """
+    sizes = np.linalg.norm(fit.jacobian, axis=0)
+    masses = [k for k, unknown in enumerate(unknowns) if any(t.endswith(".mass") for t in unknown.targets)]
+    scale = max(masses, key=lambda k: float(sizes[k])) if masses and open_scale else None
     kept: list[int] = []
     out = []
     effects = fit.jacobian / np.sqrt(max(1.0, len(fit.jacobian) / 400.0))  # residuals are correlated
@@ -227,7 +245,9 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit) -> list[Unknown]:
         effect = effects[:, k]
         size = float(np.linalg.norm(effect))
         reason = ""
-        if size < _WEAK:
+        if k == scale:
+            reason = RELATIVE
+        elif size < _WEAK:
             reason = "moves too little in these logs"
         elif kept:
             basis = effects[:, kept]
@@ -256,10 +276,10 @@ def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknow
     if best == fit.delays[-1]:
         why = "which other things than a delay do as well: look at the model and at what drives it; none is asked for"
         return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
-    high = _round(dt * max(2 * best, best + 3))
+    low, high = dt * max(0, best - max(3, best // 2)), _round(dt * max(2 * best, best + 3))
     targets = tuple(f"actuator:{name}.delay" for name in actuators)
     note = (
         f"commands arrive about {1e3 * dt * late:.3g} ms late, {late:.2g} samples: without that, simulated windows "
         f"miss {np.sqrt(at_zero):.2f} times as much"
     )
-    return [Unknown("delay", targets, 0.0, high, False, note)], note
+    return [Unknown("delay", targets, float(f"{low:.2g}"), high, False, note)], note

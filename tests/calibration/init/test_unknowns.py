@@ -39,3 +39,10 @@ def test_a_delay_at_the_end_of_those_tried_is_none(miss: list[float], asked: boo
     unknowns, note = delay_of(["motor"], fit, 0.005)
     assert bool(unknowns) is asked
     assert ("none is asked for" in note) is not asked
+
+
+def test_a_late_delay_is_searched_from_where_it_shows() -> None:
+    """A search from no delay at all follows all else that does nearly the same before it finds this."""
+    fit = Fit((0, 9, 10, 11), np.array([1.6, 1.1, 1.0, 1.1]), np.zeros(0), np.zeros((400, 0)), np.ones(1))
+    (delay,), _ = delay_of(["motor"], fit, 0.002)
+    assert 0 < delay.low < 0.018 < 0.022 < delay.high
