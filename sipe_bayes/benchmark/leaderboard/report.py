@@ -184,7 +184,7 @@ def _summary(one: Scored, tasks: Sequence[Task]) -> tuple[Value, ...]:
     skills = [one.tasks[t.name].skill or 0.0 if t.name in one.tasks else 0.0 for t in tasks if t.truths]
     errors = [one.tasks[t.name].heldout or 1.0 if t.name in one.tasks else 1.0 for t in tasks if t.heldout]
     covers = [(s.coverage, s.coverage_error or 0.0) for s in scores if s.coverage is not None]
-    right = sum(abs(cover - LEVEL) <= _NEAR for cover, _ in covers)
+    right = sum(round(abs(cover - LEVEL), 9) <= _NEAR for cover, _ in covers)  # 17 of 20 are .85
     failed, logs = sum(s.failed for s in scores), sum(len(s.logs) for s in scores)
     error = math.hypot(*(e for _, e in covers)) / len(covers) if covers else 0.0
     return (
