@@ -56,6 +56,7 @@ class ImportanceTuning(Options):
     enough: float = option(100.0, "effective draws with which it ends", above=1)
     least: float = option(30.0, "effective draws that may be relied on", above=1)
     judges: int = option(120, "draws that judge a normal: 33 of them are the tail that its k is fitted to", least=40)
+    most_share: float = option(0.25, "of the budget that a search leaves to them, at most", least=0, most=1)
     at_once: int = option(50_000, "control steps simulated at a time when a normal is judged: memory", least=1)
     kernels: int = option(60, "kernels of the posterior", least=2)
     narrower: float = option(0.5, "width of kernels over Silverman's rule, for the bounds' sake", above=0, below=1)

@@ -117,18 +117,38 @@ class Laplace(Estimator[LaplaceState]):
             windows.mask(state.search.wild)
             return self._drawn(windows, state, state.draws)
         strategy = self._strategy(windows)
-        if state.search.done:
-            assert isinstance(strategy, StateSpaceSearch)
-            assert isinstance(state.search, StateSpaceState)
-            search = strategy.shoot(state.search)
-            if not search.done:
-                return replace(state, search=search, judgements=())
-            if state.judgements:
-                return replace(state, search=search, done=not self._shots_left(search))
-            return self._probed(windows, replace(state, search=search))
-        search = strategy.step(state.search)
+        windows.budget = self.budget - self._judges_share(windows, state)
+        try:
+            if state.search.done:
+                assert isinstance(strategy, StateSpaceSearch)
+                assert isinstance(state.search, StateSpaceState)
+                search = strategy.shoot(state.search)
+            else:
+                search = strategy.step(state.search)
+        except BudgetExhausted:
+            windows.budget = self.budget
+            if not isinstance(windows, Chain) or state.judgements or not state.search.optima:
+                raise
+            judged = self._judged(windows, state, distinct(state.search.optima))
+            if not judged.judgements:
+                raise
+            return judged
+        windows.budget = self.budget
+        if search.optima is not state.search.optima:
+            state = replace(state, judgements=())
         state = replace(state, search=search)
-        return self._probed(windows, state) if search.done else state
+        if not search.done:
+            return state
+        return replace(state, done=not self._shots_left(search)) if state.judgements else self._probed(windows, state)
+
+    def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
+        """Rollouts that the search of a chain leaves to those who judge its optima; none where they are dear."""
+        if not isinstance(windows, Chain) or not state.search.optima or state.judgements:
+            return 0
+        linearised = 2 * (windows.num_theta + windows.num_start) + 1
+        each = (self.options.tuning.importance.judges + linearised) * len(windows.trajectories)
+        share = each * len(distinct(state.search.optima))
+        return share if share < self.options.tuning.importance.most_share * self.budget else 0
 
     def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
         """The search that fits the likelihood."""

@@ -11,10 +11,11 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
 from sipe_bayes.likelihood.state_space.linearisation import ChainNoise
 from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
 from sipe_bayes.simulation.simulator import Simulator
@@ -109,6 +110,28 @@ def test_no_budget_loses_what_was_found() -> None:
     assert (np.diff(evidence) >= 0).all()
     assert found[0][1] == 0
     assert found[-1][1] == 2
+
+
+def test_a_search_that_the_budget_ends_is_judged_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an optimum after which no step fits the normal is judged and averaged, within the budget, once."""
+    step, limits = StateSpaceSearch.step, []
+
+    def spent(self: StateSpaceSearch, state: StateSpaceState) -> StateSpaceState:
+        if state.optima:
+            limits.append(self.chain.budget)
+            raise BudgetExhausted("no step fits")
+        return step(self, state)
+
+    monkeypatch.setattr(StateSpaceSearch, "step", spent)
+    logs = spring_logs()
+    estimator = Laplace(spring(), likelihood=StateSpace(), seed=1, budget=1500)
+    estimator.fit(logs)
+    assert estimator.state is not None
+    assert len(estimator.diagnostics["pareto_k"]) == 1
+    assert estimator.state.search.optima[0].spread is not estimator.state.search.optima[0].covariance
+    assert estimator.rollouts <= 1500
+    assert limits[0] <= 1500 - estimator.options.tuning.importance.judges * len(logs)  # what the search left
+    assert len(limits) == 2
 
 
 def test_the_pendulums_intervals_hold_the_truth() -> None:
