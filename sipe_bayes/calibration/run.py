@@ -43,7 +43,7 @@ from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import open_gains, tolerance_findings
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Misfit, Mixing, Residual, Signal
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Mixing, Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
@@ -102,7 +102,7 @@ def calibrate(
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
     missing = _missing(probed, alone, problem, method.seed) if doubted else None
     predictions = _Predictions.of(problem, theta)
-    outside = _outside(problem, method, fit, lacks, predictions, unknown)
+    outside = _outside(problem, method, fit, predictions, unknown)
     bands = predictions.bands(posterior, missing, method.seed)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
@@ -313,10 +313,9 @@ def _residuals(
 
 
 def _outside(
-    problem: Problem, method: Estimator, fit: _Fit, lacks: Misfit | None, seen: _Predictions, unknown: list[Finding]
+    problem: Problem, method: Estimator, fit: _Fit, seen: _Predictions, unknown: list[Finding]
 ) -> list[OutsidePrior]:
-    matters = lacks is not None and lacks.matters
-    followed = matters and follows(seen.windows["train"], seen.predicted["train"][0])
+    followed = follows(seen.windows["train"], seen.predicted["train"][0])
     noise = observation_noise(method.diagnostics, problem.train, problem.likelihood)
     try:
         return outside_prior(fit.windows, problem.prior, noise, seed=method.seed, followed=followed)

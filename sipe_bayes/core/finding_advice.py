@@ -152,8 +152,8 @@ ADVICE: dict[Code, str] = {
         "model that was given wrong masses. Then the bounds."
     ),
     Code.OUTSIDE_PRIOR_FOLLOWED: (
-        "No values within the bounds simulate such a log, but units and signs are right, since simulations bend as it "
-        "does. What is left is the physics that the model lacks: `sipe discover`."
+        "Units and signs are right, since the simulation bends as the log does. One of twenty right logs is called so. "
+        "Else widen the bounds that a value lies at, or ask for the physics that the model lacks: `sipe discover`."
     ),
     Code.OUTSIDE_PRIOR_UNKNOWN: "Judge by the signals in the report.",
     Code.LOGS_DISAGREE: (

@@ -271,8 +271,8 @@ class Code(Enum):
         "bounds, or correct the model, units or signs"
     )
     OUTSIDE_PRIOR_FOLLOWED = caution(
-        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s: the calibrated "
-        "model follows it, and what it lacks all the same is told beside this"
+        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s; the calibrated "
+        "model follows it all the same"
     )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")
     LOGS_DISAGREE = blocking(

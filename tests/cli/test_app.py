@@ -217,6 +217,20 @@ def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, m
     assert strict_json((tmp_path / "out" / "result.json").read_text())["doubts"] == [outside.text]
 
 
+def test_a_log_that_the_model_follows_is_no_doubt(
+    tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of twenty right logs is unlike the prior's simulations by chance."""
+
+    def outside(*_: object, followed: bool, **__: object) -> list[OutsidePrior]:
+        return [OutsidePrior(0.01, "log", "angle", 1.0, followed)]
+
+    monkeypatch.setattr("sipe_bayes.calibration.run.outside_prior", outside)
+    found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
+    assert found["doubts"] == []
+    assert "outside_prior_followed" in [item["code"] for item in found["findings"]]
+
+
 def test_what_the_model_lacks_is_a_warning(tmp_path: Path, log: pd.DataFrame) -> None:
     """A torque that is 0.2 N m stronger than logged."""
     config = write_case(tmp_path, log.assign(torque=log["torque"] - 0.2))

@@ -20,6 +20,8 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states, energy
 
+_RAISES = 40  # of the process noise by three: from rounding's size far beyond any motion
+
 
 @dataclass(frozen=True)
 class ChainPoint:
@@ -85,11 +87,17 @@ def smooth(
 
 
 def solvable(linear: ChainLinearisation, noise: ChainNoise) -> ChainNoise:
-    """The noise, its process noise raised as far as the equations need it to be solved in spite of rounding."""
-    while True:
+    """The noise, its process noise raised as far as the equations need it to be solved in spite of rounding.
+
+    Raises:
+        numpy.linalg.LinAlgError: where no process noise is enough, as where slopes are beyond numbers.
+    """
+    for _ in range(_RAISES):
         try:
             eliminate_states(linear, noise)
         except np.linalg.LinAlgError:
             noise = replace(noise, process=3.0 * noise.process)
         else:
             return noise
+    eliminate_states(linear, noise)
+    return noise

@@ -208,7 +208,11 @@ class ChainSearch(Generic[S]):
         states = self.chain.predicted(here.theta) if here.phase is Phase.FOLLOW else None
         state = state if states is None else state.at(replace(here, states=states))
         linear = self._linearised(state.here)
-        after = state.after_divergence(self._begin) if linear is None else self.phases()[here.phase](state, linear)
+        try:
+            after = None if linear is None else self.phases()[here.phase](state, linear)
+        except np.linalg.LinAlgError:  # no process noise makes these slopes' equations solvable
+            after = None
+        after = state.after_divergence(self._begin) if after is None else after
         return replace(after, uncounted=self.chain.uncounted)
 
 

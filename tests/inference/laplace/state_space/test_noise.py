@@ -41,6 +41,16 @@ def test_noise_that_rounding_cannot_bear_is_raised() -> None:
         eliminate_states(linear, ChainNoise(raised.sd, raised.process / 3))
 
 
+def test_what_no_noise_makes_solvable_is_an_error() -> None:
+    """Where a block is negative, whatever the noise, raising it would go on for ever."""
+    chain = bind(StateSpace(), hung(), Trajectories.stack(hung_log(np.array([0.4]), 0)))
+    linear = linearise(chain, np.array([0.4]), chain.reference)
+    assert linear is not None
+    negative = replace(linear, precision=np.full_like(linear.precision, -1e12))
+    with pytest.raises(np.linalg.LinAlgError):
+        solvable(negative, ChainNoise(np.array([0.01]), np.full(4, 1e-4)))
+
+
 def test_given_noise_is_kept_and_process_noise_shrinks_where_the_model_is_right() -> None:
     """Without process noise in the log the inferred one falls to less than a tenth of the measurement's effect."""
     simulator = pendulum()
