@@ -99,6 +99,7 @@ class TrainedFlow:
         weights: of both.
         line: (P, N), what ``NPE.line_terms`` are multiplied by for the expected z = Phi^-1(theta).
         line_sd: (N,), of z about that; both standardise it.
+        span: (2, P), least and largest of these terms in training: a log beyond them is taken for the nearest.
         features: numbers of a control step, or of a log, that the embedding takes.
         simulations: that it was trained on and validated with.
         epochs: that were made.
@@ -109,6 +110,7 @@ class TrainedFlow:
     weights: Weights
     line: FloatArray
     line_sd: FloatArray
+    span: FloatArray
     features: int
     simulations: int
     epochs: int
@@ -151,9 +153,8 @@ class NPE(Rounds[TrainedFlow]):
         converged = epochs <= self.options.max_epochs
         self.still_improving(converged, self.options.max_epochs, "epochs", "max_epochs")
         loss = float(summary["best_validation_loss"][-1])
-        return TrainedFlow(
-            weights(net), line.contiguous().numpy(), sd.numpy(), x.shape[-1], len(x), epochs, loss, converged
-        )
+        fitted, span = line.contiguous().numpy(), torch.stack([terms.amin(0), terms.amax(0)]).numpy()
+        return TrainedFlow(weights(net), fitted, sd.numpy(), span, x.shape[-1], len(x), epochs, loss, converged)
 
     def infer_network(self, trained: TrainedFlow, inputs: Float32Array) -> Posterior:
         """The flow given the log; raises ValueError for one of another size, or without a whole control step."""
@@ -172,7 +173,7 @@ class NPE(Rounds[TrainedFlow]):
         with torch.no_grad():
             context = embedding(x)[0].double()
         flow = _part(trained.weights, "net.")
-        mean = (self.line_terms(inputs) @ trained.line)[0]
+        mean = (np.clip(self.line_terms(inputs), *trained.span) @ trained.line)[0]
         return Flow(flow, context, mean, trained.line_sd, self.space, **self.options.architecture)
 
     def line_terms(self, inputs: Float32Array) -> FloatArray:
