@@ -114,6 +114,9 @@ class Thresholds(Options):
     pareto_k: float = option(
         0.7, "above it importance weights have so heavy a tail that no number of draws mends them", "Pareto shape k"
     )
+    least_effective_share: float = option(
+        0.1, "weights of which less is effective are of a normal one and a half sds off, whatever k", "of the draws"
+    )
     effective_share: float = option(
         0.5, "weights of which more is effective are nearly alike, whatever the shape of their tail", "of the draws"
     )

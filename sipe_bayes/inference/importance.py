@@ -129,7 +129,12 @@ class Judgement:
 
     @property
     def normal(self) -> bool:
-        """Whether it stands; weights that are nearly alike have a tail of any shape."""
+        """Whether it stands; weights that are nearly alike have a tail of any shape.
+
+        Of draws that all lie far from the posterior, few weights rule, and k is no large one.
+        """
+        if self.effective < THRESHOLDS.least_effective_share * self.draws:
+            return False
         return self.pareto_k <= THRESHOLDS.pareto_k or self.effective >= THRESHOLDS.effective_share * self.draws
 
 
