@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -306,7 +307,11 @@ def _worst(findings: Findings, out: str) -> list[str]:
     lines = [f"warning: {_cut(text)}" for text in kinds[:_WARNINGS]]
     if len(kinds) > len(lines):
         lines[-1] += f" [{len(kinds) - len(lines)} more in the report]"
-    where = out or " ".join(dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS]))
+    where = (
+        shlex.quote(out)
+        if out
+        else " ".join(dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS]))
+    )
     return lines + [f"what these mean and what to do: sipe explain {where}"] * bool(lines)
 
 

@@ -27,7 +27,7 @@ def explain(
     if not codes:
         print("\n".join(f"{code} ({code.value.severity})" for code in Code))
     with exit_on_error():
-        entries = [one for name in codes or () for one in (_of_run(name) or [_alone(_named(name))])]
+        entries = [one for name in codes or () for one in _entries(name)]
     for entry in entries:
         times = f", {entry.count} times, of which the first" if entry.count > 1 else ""
         print(f"{entry.code} ({entry.severity}{times})\n  {entry.text}\n  {ADVICE[entry.code]}")
@@ -49,6 +49,18 @@ def _alone(code: Code) -> _Entry:
     return _Entry(code, code.value.severity, plain(code))
 
 
+def _entries(name: str) -> list[_Entry]:
+    """Of a run's folder what it found, else of the code of that name what it means."""
+    from sipe_bayes.core.files import is_folder
+
+    if not is_folder(name):
+        return [_alone(_named(name))]
+    entries = _of_run(Path(name) / "result.json")
+    if not entries:
+        print(f"{name}: nothing was noticed")
+    return entries
+
+
 def _named(name: str) -> Code:
     """The code of that name."""
     from sipe_bayes.core.finding_texts import Code
@@ -61,16 +73,14 @@ def _named(name: str) -> Code:
     return known[name.lower()]
 
 
-def _of_run(name: str) -> list[_Entry]:
-    """What a run found, worst first, of each code the first one; empty where the name is no folder."""
+def _of_run(record: Path) -> list[_Entry]:
+    """What a run found, worst first, of each code the first one."""
     from pydantic import TypeAdapter
 
-    from sipe_bayes.core.files import is_folder, read_json, reading
+    from sipe_bayes.core.files import read_json, reading
     from sipe_bayes.core.finding_texts import Severity
 
-    if not is_folder(name):
-        return []
-    record, what, remedy = Path(name) / "result.json", "the result of a run", "calibrate again"
+    what, remedy = "the result of a calibration", "give the folder of sipe calibrate"
     plain = read_json(record, what, remedy)
     entries: dict[Code, _Entry] = {}
     with reading(record, what, remedy):

@@ -39,3 +39,10 @@ def test_a_folder_without_a_result(content: str | None, words: str, tmp_path: Pa
     assert done.exit_code == 2
     assert words in done.output
     assert done.output.count("\n") == 1
+
+
+def test_a_run_that_found_nothing(tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text('{"findings": []}')
+    done = CliRunner().invoke(app, ["explain", str(tmp_path)])
+    assert done.exit_code == 0
+    assert done.output.rstrip().endswith("nothing was noticed")

@@ -13,7 +13,8 @@ against a bound) and autoregressive noise, two kinds of statistics are looked at
 
 The null is simulated: noise as estimated, drawn anew, estimated anew, projected alike. Each statistic's cube root is
 standardised by its mean and sd over these; the largest is compared with the largest of each. Draws end where ten were
-odder (J. Besag, P. Clifford 1991, "Sequential Monte Carlo p-values", https://doi.org/10.1093/biomet/78.2.301). So the
+odder (J. Besag, P. Clifford 1991, "Sequential Monte Carlo p-values", https://doi.org/10.1093/biomet/78.2.301), looked
+at after 40, 60 and 80 and not after each, so that p is (1 + odder) / (1 + drawn). So the
 p-value holds for white and first-order autoregressive sensor noise, whatever the number of probes, up to the
 linearisation.
 

@@ -139,7 +139,9 @@ class Laplace(Estimator[LaplaceState]):
         state = replace(state, search=search)
         if not search.done:
             return state
-        return replace(state, done=not self._shots_left(search)) if state.judgements else self._probed(windows, state)
+        if len(state.judgements) == len(distinct(search.optima)):
+            return replace(state, done=not self._shots_left(search))
+        return self._probed(windows, state)
 
     def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
         """Rollouts that the search of a chain leaves to those who judge its optima; none where they are dear."""
@@ -210,6 +212,7 @@ class Laplace(Estimator[LaplaceState]):
                     importance.judged(ChainTarget(self.prior, chain, fit), held, self.seed, tuning, steps)
                 )
             except BudgetExhausted:
+                chain.short = True  # a larger budget goes on from here
                 break
         return replace(state, search=search, judgements=tuple(judgements))
 

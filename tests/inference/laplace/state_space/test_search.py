@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -132,6 +134,20 @@ def test_a_search_that_the_budget_ends_is_judged_all_the_same(monkeypatch: pytes
     assert estimator.rollouts <= 1500
     assert limits[0] <= 1500 - estimator.options.tuning.importance.judges * len(logs)  # what the search left
     assert len(limits) == 2
+
+
+def test_a_larger_budget_judges_what_a_smaller_one_left(tmp_path: Path) -> None:
+    """The fit goes on from its checkpoint to where one that had the budget at once ends."""
+    fits = []
+    for budget, path in [(300, "fit"), (5000, "fit"), (5000, "fresh")]:
+        estimator = Laplace(
+            spring(), likelihood=StateSpace(), seed=1, budget=budget, checkpoint=tmp_path / f"{path}.safetensors"
+        )
+        estimator.fit(spring_logs())
+        fits.append((estimator.rollouts, {item.code for item in estimator.findings}))
+    assert Code.NOT_JUDGED in fits[0][1]
+    assert fits[1] == fits[2]
+    assert Code.NOT_JUDGED not in fits[1][1]
 
 
 def test_the_pendulums_intervals_hold_the_truth() -> None:
