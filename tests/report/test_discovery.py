@@ -100,6 +100,12 @@ NEXT = {
 @pytest.mark.parametrize(("discovery", "words"), NEXT.values(), ids=NEXT)
 def test_what_to_do_next(discovery: Discovery, words: str) -> None:
     assert words in next_steps(discovery)
+    assert "with probability" not in next_steps(discovery)
+
+
+def test_a_structure_that_may_be_another_is_not_calibrated_without_a_word() -> None:
+    unsure = make_discovery(dataclasses.replace(FRICTION, probability=0.57))
+    assert next_steps(unsure).endswith("with probability 0.57: use those above")
 
 
 def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixture[str]) -> None:

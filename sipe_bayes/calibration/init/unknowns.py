@@ -131,7 +131,7 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
     if actuator.drive != Drive.FORCE or in_force:
         return []
     gear = float(model.actuator_gear[index, 0])
-    note = f"force for each unit of command, {gear * gain:g} in the model: the command is no force"
+    note = f"gain, {gain:g} in the model, before the gear of {gear:g}: the command is no force"
     return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, note)]
 
 
@@ -156,7 +156,7 @@ def _masses(model: mujoco.MjModel, bodies: Sequence[int]) -> tuple[list[Unknown]
 
 
 def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown]:
-    """Friction and the inertia of rotor and gears."""
+    """Friction, the inertia of rotor and gears, and the spring where the model has one."""
     name, at, dof = joint.name, f"joint:{joint.name}", int(model.joint(joint.name).dofadr[0])
     force, speed, inertia = (table[name] for table in (sizes.force, sizes.speed, sizes.inertia))
     damping, dry, rotor = (
@@ -168,10 +168,13 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
         ("frictionloss", _round(max(4 * dry, 0.4 * force)), dry, "dry friction"),
         ("armature", _round(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
     )
-    return [
+    out = [
         Unknown(f"{word}_{field}", (f"{at}.{field}",), 0.0, high, False, f"{what}, {own:g} in the model")
         for field, high, own, what in rows
     ]
+    if (spring := float(np.ravel(model.joint(name).stiffness)[0])) > 0:
+        out.append(_factor(f"{word}_stiffness", f"{at}.stiffness", 0.5, 2.0, f"spring, {spring:g} in the model"))
+    return out
 
 
 def _contacts(model: mujoco.MjModel, machine: Machine) -> list[Unknown]:

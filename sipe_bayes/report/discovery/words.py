@@ -162,7 +162,10 @@ def next_steps(discovery: Discovery) -> str:
     """What to do with it."""
     out = Path(discovery.out)
     if discovery.kept or discovery.columns:
-        return f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
+        least = min((piece.probability for piece in discovery.kept), default=1.0)
+        alone = f"; its intervals hold if that is so, with probability {probability_text(least)}: use those above"
+        onward = f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
+        return onward + alone * (least < THRESHOLDS.shown_interval)
     if discovery.passes:
         return "nothing to put in; go on with the configuration as it is"
     return (
