@@ -12,6 +12,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 _REGULAR = 0.1  # of a period: a clock whose samples are as near to the grid as this is regular
 _JITTER = 0.45  # of a period: so far a time stamp may be off while it is certain which sample is meant
 _SMOOTHER = 0.8  # of what a cubic misses: so much better, and the stamps are right that the samples jitter
+_USUAL = 0.9  # of the samples: the others may be steps and glitches
 _GAP_PERIODS = 5.0  # default max_gap, in a column's own median sample periods
 
 
@@ -114,10 +115,17 @@ def _counted(time: FloatArray, dt: float) -> FloatArray:
 def _as_smooth(regular: FloatArray, stamped: FloatArray, measured: Sequence[FloatArray]) -> bool:
     """Whether signals (n,) pass about as smoothly through regular times as through their stamps.
 
-    Each sample is held against the cubic through its four neighbours.
+    Each sample is held against the cubic through its four neighbours; the mean of most, since the median of a coarse
+    encoder's readings jumps by its ticks.
     """
-    sizes = [[np.median(np.abs(_off_cubic(times, y))) for times in (regular, stamped)] for y in measured]
+    sizes = [[_usual(_off_cubic(times, y)) for times in (regular, stamped)] for y in measured]
     return bool(sizes) and all(not by_stamp < _SMOOTHER * plain for plain, by_stamp in sizes)
+
+
+def _usual(off: FloatArray) -> float:
+    """Mean size of what is off, of all but the largest."""
+    size = np.sort(np.abs(off))
+    return float(size[: max(1, round(_USUAL * len(size)))].mean())
 
 
 def _off_cubic(time: FloatArray, values: FloatArray) -> FloatArray:

@@ -41,3 +41,15 @@ def test_dropped_samples_stay_dropped_under_jitter() -> None:
     stamps = regular + np.clip(np.random.default_rng(1).normal(0, 3e-4, len(regular)), -1e-3, 1e-3)
     grid = control_grid(stamps - stamps[0], None, signals(regular))
     np.testing.assert_array_equal(grid.rows, np.delete(np.arange(760), [100, 101, 300]))
+
+
+def test_a_coarse_encoder_on_a_slow_ramp_says_nothing_of_jitter() -> None:
+    """Regular samples to ticks of 1.5 mrad, of slow ramps: none of 40 logs is resampled."""
+    regular = np.arange(760) / RATE
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        stamps = np.round(regular + np.clip(rng.normal(0, 3e-4, 760), -1e-3, 1e-3), 4)
+        tick = 2 * np.pi / 4096
+        ramp = rng.uniform(0.2, 1.2) * np.arcsin(np.sin(2 * np.pi * rng.uniform(0.2, 0.4) * regular))
+        encoder = tick * np.round((ramp + rng.normal(0, 5e-4, 760)) / tick)
+        assert control_grid(stamps - stamps[0], None, [encoder]).regular, seed
