@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,8 @@ def test_an_interrupted_command_says_so_once(
 
     def stop(*_: object, **__: object) -> None:
         os.kill(os.getpid(), number)
-        signal.pause()
+        for _ in range(3000):  # any thread may be given the signal, so that a pause of this one might never end
+            time.sleep(0.01)
 
     if begun:
         monkeypatch.setattr(run, "run", stop)
