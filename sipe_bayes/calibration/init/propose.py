@@ -269,8 +269,8 @@ def _unknowns(
     left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
-    told = told_apart(unknowns, left, scale_is_open(model, machine, draft.readings))
-    return [*late, *told], samples, [note] if note and not late else []
+    shown = told_apart(unknowns, left, scale_is_open(model, machine, draft.readings))
+    return [*late, *shown], samples, [note] if note and not late else []
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:

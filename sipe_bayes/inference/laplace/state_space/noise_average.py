@@ -51,10 +51,10 @@ def averaged(problem: SearchProblem, chain: Chain, fit: ChainFit) -> FloatArray:
     axes, rng = _axes(of_noise, logs, average), np.random.default_rng([problem.seed, 2])
     here, means, covariances = at(logs), [], []
     for draw in range(average.draws):
-        there = logs + average.step * rng.standard_normal() * axes[draw % len(axes)]
-        tried = at(there)
+        proposed = logs + average.step * rng.standard_normal() * axes[draw % len(axes)]
+        tried = at(proposed)
         if np.log(rng.random()) < tried[0] - here[0]:
-            logs, here = there, tried
+            logs, here = proposed, tried
         means.append(here[1])
         covariances.append(here[2])
     spread = np.array(means) - np.mean(means, axis=0)
