@@ -6,11 +6,12 @@ multiple importance sampling (J.-M. Cornuet, J.-M. Marin, A. Mira, C. Robert 201
 Sampling", Scand. J. Stat. 39, https://arxiv.org/abs/0907.1254).
 
 The first batch comes in equal parts from the widened normal and from the prior; later ones from a normal with the
-weighted draws' moments, widened, and to a fifth from the prior, which keeps the weights bounded (T. Hesterberg 1995,
-"Weighted Average Importance Sampling and Defensive Mixture Distributions", Technometrics 37). A draw's weight is the
-posterior's density by that of all batches together. They end with enough effective draws, and become a mixture of
-kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M. West 1993,
-"Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
+weighted draws' moments, widened, and to a tenth from the prior, which keeps the weights bounded (T. Hesterberg 1995,
+"Weighted Average Importance Sampling and Defensive Mixture Distributions", Technometrics 37). What widening costs in
+effective draws grows with the dimension and the square of what is added, which therefore shrinks with the dimension's
+root. A draw's weight is the posterior's density by that of all batches together. They end with enough effective draws,
+and become a mixture of kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M.
+West 1993, "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
 
 ``judged``: how far draws from a normal are from the posterior that it stands for, by the shape k of the Pareto
 distribution of their largest weights (A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, "Pareto Smoothed Importance
@@ -50,9 +51,9 @@ class ImportanceTuning(Options):
     most_batches: int = option(20, "batches at most", least=1)
     hopeless_after: int = option(6, "batches with less than one effective draw each after which it ends", least=1)
     first_share: float = option(0.5, "share of the first batch that comes from the prior", above=0, below=1)
-    share: float = option(0.2, "share of later ones: bounds the weights", above=0, below=1)
+    share: float = option(0.1, "share of later ones: bounds the weights", above=0, below=1)
     first_wider: float = option(1.5, "width of the first proposal over the normal's", above=0)
-    wider: float = option(1.3, "width of later ones over the draws'", above=0)
+    wider: float = option(0.3, "by how much wider than the draws' later ones are, over the root of N", above=0)
     enough: float = option(100.0, "effective draws with which it ends", above=1)
     least: float = option(30.0, "effective draws that may be relied on", above=1)
     judges: int = option(120, "draws that judge a normal: 33 of them are the tail that its k is fitted to", least=40)
@@ -225,8 +226,7 @@ def kernels(
     # rounding leaves some kernels' covariance singular
     spread = width**2 * covariance + 1e-9 * np.diag(np.diag(covariance))
     means, spreads = shrunk[which], np.tile(spread, (len(which), 1, 1))
-    masses = GaussianMixture(np.log(counts), means, spreads, space).log_masses.numpy()  # at a bound not whole
-    return GaussianMixture(np.log(counts) - masses, means, spreads, space)
+    return GaussianMixture(np.log(counts), means, spreads, space).of_masses()  # at a bound not whole
 
 
 def _moments(
@@ -239,4 +239,5 @@ def _moments(
         return normal.means.numpy()[0], base
     mean, trust = weight @ points, count / (count + 2 * points.shape[1])
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
-    return mean, tuning.wider**2 * (trust * covariance + (1 - trust) * base)
+    width = 1 + tuning.wider / np.sqrt(points.shape[1])
+    return mean, width**2 * (trust * covariance + (1 - trust) * base)

@@ -80,6 +80,12 @@ class GaussianMixture(Posterior):
         rows = zip(self.means.numpy(), self.covariances.numpy(), self._known_masses, strict=True)
         return [TruncatedNormal(mean, covariance, mass) for mean, covariance, mass in rows]
 
+    def of_masses(self) -> GaussianMixture:
+        """The mixture whose draws come from each component as often as the weights say, whatever the cube cuts off."""
+        mixture = GaussianMixture(self.log_weights - self.log_masses, self.means, self.covariances, self.space)
+        mixture.__dict__["_components"] = self._components  # whose masses and moments are known
+        return mixture
+
     @cached_property
     def log_masses(self) -> Tensor:
         """The log Z_k (K,): the log mass of each untruncated component in the cube."""

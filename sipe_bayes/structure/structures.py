@@ -178,8 +178,7 @@ class Structures:
         means = np.stack([one.mean[at] for one, at in own])
         covariances = np.stack([one.covariance[at, at] for one, at in own])
         # a draw is to come from a structure with its probability, however much of its normal the cube cuts off
-        masses = GaussianMixture(np.zeros(len(own)), means, covariances, space).log_masses.numpy()
-        return GaussianMixture(np.log([p for p, _, _ in parts]) - masses, means, covariances, space)
+        return GaussianMixture(np.log([p for p, _, _ in parts]), means, covariances, space).of_masses()
 
     def posterior_of(self, one: FittedStructure) -> GaussianMixture:
         """Of all parameters of one structure, the extensions' behind the user's."""

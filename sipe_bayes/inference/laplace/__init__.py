@@ -23,7 +23,7 @@ mean lies beyond it, and the truncated density is right up to the bound.
 **Steps** (``estimator.Laplace``):
 
 1. Choose starting points: the model as given and the best of a few draws from the prior (``screening``); where windows
-   begin at known states of a model with contact, by single control steps first (``contact_starts``).
+   begin at known states, through contact or over long logs, by beginnings that grow (``contact_starts``).
 2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
 3. Record where that ends (``window_optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
    over a handful of weighted noise values.

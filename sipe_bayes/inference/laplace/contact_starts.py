@@ -11,6 +11,11 @@ to gain over them, and begin on longer beginnings as long as theta is still open
 what is left of it: what is minimised is the sum of these sizes' logarithms, by the number of samples. Single control
 steps go downhill twice, first by Student's t (K. L. Lange, R. J. A. Little, J. M. G. Taylor 1989, "Robust Statistical
 Modeling Using the t Distribution", JASA 84), which bears the few windows that are still beyond an impact.
+
+Where nothing touches, a whole log that begins at a known state is all the same hard to fit from afar: small errors of
+theta grow with the time that is simulated, until a search stops in a side valley, or takes dozens of steps along the
+bottom of one. There too the search goes downhill on beginnings of the log, from a sixteenth on, each twice as long; the
+simulation is smooth, so that beginnings need neither wide differences nor single control steps.
 """
 
 from __future__ import annotations
@@ -38,6 +43,36 @@ from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.simulation.contacts import may_touch
 from sipe_bayes.simulation.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How beginnings grow.
+
+    Args:
+        horizons: their control steps.
+        widest: differences at first, of the cube.
+        attempts: how often the search begins anew while more than the starts' noise is left.
+        robust: whether the first go downhill by Student's t before.
+    """
+
+    horizons: tuple[int, ...]
+    widest: float
+    attempts: int
+    robust: bool
+
+    @classmethod
+    def of(cls, problem: SearchProblem, windows: Windows) -> _Plan | None:
+        """As the windows ask for; None where they are searched as they are."""
+        tuning, longest = problem.options.tuning.contact, int(windows.steps.max())
+        if begins_in_contact(windows):
+            horizons = [1]
+            while horizons[-1] < longest:
+                horizons.append(min(longest, math.ceil(tuning.growth * horizons[-1])))
+            return cls(tuple(horizons), tuning.widest, tuning.attempts, robust=True)
+        if windows.num_start or not isinstance(windows.simulator, Simulator) or longest < tuning.long:
+            return None
+        return cls(tuple(longest // share for share in (16, 8, 4, 2)), 0.0, 1, robust=False)
 
 
 @dataclass(frozen=True)
@@ -79,27 +114,31 @@ def begins_in_contact(windows: Windows) -> bool:
 
 
 def starting_points(problem: SearchProblem, windows: Windows) -> FloatArray:
-    """Starting points (R, N): those given, those through contact, or else by screening.
+    """Starting points (R, N): those given, those that beginnings lead to, or else by screening.
 
     Raises:
         ValueError: where every one diverges.
     """
     points = problem.options.initial
-    if points is None and begins_in_contact(windows):
-        points = contact_starts(problem, windows)
+    if points is None:
+        points = grown_starts(problem, windows)
     return screen(problem, windows) if points is None else points
 
 
-def contact_starts(problem: SearchProblem, windows: Windows) -> FloatArray | None:
-    """Starting points (R, N), the best first; None where the budget is too small for them, or all diverge.
+def grown_starts(problem: SearchProblem, windows: Windows) -> FloatArray | None:
+    """Starting points (R, N), the best first.
 
-    The search begins anew from other candidates where the best one leaves more than the noise of the known starts.
+    None where windows are searched as they are, the budget is too small, or all diverge. The search begins anew from
+    other candidates where the best one leaves more than the noise of the known starts.
     """
+    plan = _Plan.of(problem, windows)
+    if plan is None:
+        return None
     options, tuning = problem.options, problem.options.tuning.contact
     limit, rests = windows.rollouts + tuning.budget_share * (windows.budget - windows.rollouts), list[_Rest]()
     generator = torch.Generator().manual_seed(problem.seed)
-    for _ in range(tuning.attempts):
-        new, whole = _attempt(problem, windows, limit, generator)
+    for _ in range(plan.attempts):
+        new, whole = _attempt(problem, windows, plan, limit, generator)
         for one in new if whole or not rests else []:
             rests = _with(rests, one)
         if not whole or (rests and rests[0].fits):
@@ -110,20 +149,24 @@ def contact_starts(problem: SearchProblem, windows: Windows) -> FloatArray | Non
 
 
 def _attempt(
-    problem: SearchProblem, windows: Windows, limit: float, generator: torch.Generator
+    problem: SearchProblem, windows: Windows, plan: _Plan, limit: float, generator: torch.Generator
 ) -> tuple[list[_Rest], bool]:
-    """Where searches from some candidates come to rest, the best first, and whether the windows are whole there."""
-    tuning, rests, horizon, longest = problem.options.tuning.contact, list[_Rest](), 1, int(windows.steps.max())
+    """Where searches from some candidates come to rest, the best first, and whether all beginnings were fitted."""
+    rests, first = list[_Rest](), plan.horizons[0]
+    widest = np.full(windows.num_theta, plan.widest)
     try:
-        for point in _screened(problem, windows, limit, generator):
-            first = _rest(problem, windows, 1, limit, point, robust=True)
-            if first is not None:
-                rests = _with(rests, _rest(problem, windows, 1, limit, first.theta, first.sd))
-        while rests and horizon < longest:
-            before = rests[: max(problem.options.restarts, len(rests) // 2)]
-            horizon, after = min(longest, math.ceil(tuning.growth * horizon)), list[_Rest]()
+        for point in _screened(problem, windows, first, limit, generator):
+            if not plan.robust:
+                rests = _with(rests, _rest(problem, windows, first, limit, point, widest))
+                continue
+            robust = _rest(problem, windows, first, limit, point, widest, robust=True)
+            if robust is not None:
+                rests = _with(rests, _rest(problem, windows, first, limit, robust.theta, robust.sd))
+        for horizon in plan.horizons[1:]:
+            before, after = rests[: max(problem.options.restarts, len(rests) // 2)], list[_Rest]()
             for one in before:
-                after = _with(after, _rest(problem, windows, horizon, limit, one.theta, one.sd))
+                widths = np.minimum(one.sd, widest)
+                after = _with(after, _rest(problem, windows, horizon, limit, one.theta, widths))
             rests = after
     except BudgetExhausted:
         return rests, False
@@ -136,8 +179,10 @@ def _with(rests: list[_Rest], new: _Rest | None) -> list[_Rest]:
     return [one for k, one in enumerate(every) if not any(better.holds(one) for better in every[:k])]
 
 
-def _screened(problem: SearchProblem, windows: Windows, limit: float, generator: torch.Generator) -> FloatArray:
-    """The best (S, N) of the model as given and draws of the prior, by the first control step of every window.
+def _screened(
+    problem: SearchProblem, windows: Windows, horizon: int, limit: float, generator: torch.Generator
+) -> FloatArray:
+    """The best (S, N) of the model as given and draws of the prior, by the first control steps of every window.
 
     Raises:
         BudgetExhausted: where the budget ends.
@@ -145,7 +190,7 @@ def _screened(problem: SearchProblem, windows: Windows, limit: float, generator:
     tuning, count = problem.options.tuning.contact, problem.options.candidates
     draws = problem.prior.sample((max(count, tuning.candidates),), generator=generator).numpy()
     points = np.concatenate([problem.space.default_theta[None], draws])
-    view, share = _beginning(windows, 1, limit)
+    view, share = _beginning(windows, horizon, limit)
     residual, valid = view.residuals(points, np.tile(view.no_starts(), (len(points), 1, 1)))
     windows.rollouts += math.ceil(view.rollouts * share)
     misfits = [_misfit(view, one) if good else np.inf for one, good in zip(residual, valid, strict=True)]
@@ -158,12 +203,12 @@ def _rest(
     horizon: int,
     limit: float,
     theta: FloatArray,
-    widths: FloatArray | None = None,
+    widths: FloatArray,
     robust: bool = False,
 ) -> _Rest | None:
     """Where a search from theta (N,) on beginnings comes to rest; None where it diverges.
 
-    widths: (N,), of the first differences; None: the widest ones. robust: by Student's t.
+    widths: (N,), of the first differences. robust: by Student's t.
 
     Raises:
         BudgetExhausted: where the budget ends.
@@ -171,7 +216,7 @@ def _rest(
     view, share = _beginning(windows, horizon, limit)
     tuning, rule, starts = problem.options.tuning.contact, problem.options.tuning.damping, view.no_starts()
     least = np.maximum(max(view.theta_step, tuning.narrowest), view.least_steps(theta))
-    size = np.clip(tuning.widest if widths is None else widths, least, np.maximum(tuning.widest, least))
+    size = np.maximum(widths, least)
     damping, residual = rule.first, np.zeros(0)
     try:
         for number in range(tuning.most_steps):

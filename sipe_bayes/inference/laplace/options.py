@@ -69,7 +69,7 @@ class GrowingTuning(Options):
 
 @dataclass(frozen=True)
 class ContactTuning(Options):
-    """How starting points through contact are found from known states; see ``contact_starts``."""
+    """How starting points are found from beginnings at known states; see ``contact_starts``."""
 
     candidates: int = option(60, "points among which they are chosen, by one control step: it is cheap", least=1)
     followed: int = option(6, "of them that go downhill: half of them come to the same place", least=1)
@@ -83,6 +83,7 @@ class ContactTuning(Options):
     hopeless: float = option(0.1, "how much worse a place is that is left aside", "nats of a sample", above=0)
     attempts: int = option(4, "how often it begins anew while more than the starts' noise is left", least=1)
     budget_share: float = option(0.6, "of the budget in all: the rest is the search's", above=0, below=1)
+    long: int = option(256, "control steps from which a log on which nothing touches is fitted so as well", least=32)
 
 
 @dataclass(frozen=True)

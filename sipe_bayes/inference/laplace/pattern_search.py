@@ -15,7 +15,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 
 SHORTEST = 1e-6  # of the cube: the way over which an optimum's neighbours are as good in a smooth simulation
-_LENGTHS = 10.0 ** np.arange(-6, 0)  # of the cube, along the axes: SHORTEST and five powers of ten
+_LENGTHS = 10.0 ** np.arange(-5, 0)  # of the cube, along the axes: powers of ten beyond SHORTEST
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,9 @@ class PatternTuning(Options):
     open_sd: float = option(0.5, "sd from which a direction counts as open, and is cut", "of the cube", above=0)
     better: float = option(0.5, "a difference that counts", "nats", above=0)
     saddle: float = option(1.0, "how much worse points between two of one optimum may be", "nats", above=0)
+    smooth: float = option(3.0, "distance up to which a simulation is looked at for being smooth", "sd", above=0)
+    least_rise: float = option(0.6, "a rise, over that of the normal, with which it is", above=0, below=1)
+    most_rise: float = option(2.0, "the same above", above=1)
     luck: float = option(3.0, "how much worse the nearest neighbours may be in a smooth simulation", "nats", above=0)
     growth: float = option(10.0, "how much worse still, at least, points ten times farther are there", above=1)
 
@@ -53,7 +56,7 @@ class Surroundings:
 
 def pattern_size(size: int, tuning: PatternTuning) -> int:
     """Points that ``pattern_search`` looks at in ``size`` dimensions, at most."""
-    return 1 + 2 * size * (1 + len(_LENGTHS) + len(tuning.sds) + len(_LENGTHS) - 2)
+    return 1 + 2 * size * (1 + len(_LENGTHS) + len(tuning.sds) + len(_LENGTHS) - 1)
 
 
 def nearest_points(theta: FloatArray) -> FloatArray:
@@ -83,19 +86,31 @@ def pattern_search(
     size = len(theta)
     variance, principal = np.linalg.eigh(covariance)
     along = np.sqrt(np.clip(variance, 0, tuning.open_sd**2))[:, None] * principal.T
-    ways = np.concatenate([k * np.eye(size) for k in _LENGTHS] + [k * along for k in tuning.sds])
+    ways = np.concatenate([k * along for k in tuning.sds])
     trials = np.clip(theta + np.concatenate([np.zeros((1, size)), ways, -ways]), 0, 1)
     values = energies(trials)
-    best, wide = int(values.argmin()), covariance + SHORTEST**2 * np.eye(size)
-    # is the optimum better than its neighbours by more than a smooth simulation allows?
-    luck, apart = level - values[0], values[_tenfold(size, len(tuning.sds))].max() - values[0]
-    rough = luck > max(tuning.luck, apart / tuning.growth)
+    lengths, wide = _LENGTHS, covariance + SHORTEST**2 * np.eye(size)
+    luck = level - values[0]
+    if luck <= tuning.luck and values.min() < values[0] - tuning.better:
+        lengths = _LENGTHS[:0]  # the search goes on from a better one
+    elif luck <= tuning.luck and _smooth(trials - theta, values, wide, tuning):
+        lengths = _LENGTHS[tuning.smooth * np.sqrt(variance[-1]) < _LENGTHS]
+    ways = np.kron(lengths[:, None], np.eye(size))
+    further = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
+    rough = False
+    if len(further):
+        apart = energies(further)
+        # is the optimum better than its neighbours by more than a smooth simulation allows?
+        tenfold = np.abs(further - theta).sum(1) < 1.5 * _LENGTHS[0]
+        rough = luck > max(tuning.luck, (apart[tenfold].max(initial=-np.inf) - values[0]) / tuning.growth)
+        trials, values = np.concatenate([trials, further]), np.concatenate([values, apart])
+    best = int(values.argmin())
     luck = luck if rough else 0.0
     if values[best] < values[0] - tuning.better - luck:
         return Surroundings(trials[best], _holding(wide, trials[best] - theta), None)
     level = values[0] + luck
     if rough:
-        ways = np.concatenate([k * np.eye(size) for k in tuning.between * _LENGTHS[2:]])
+        ways = np.concatenate([k * np.eye(size) for k in tuning.between * _LENGTHS[1:]])
         more = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
         trials, values = np.concatenate([trials, more]), np.concatenate([values, energies(more)])
     # the ways to what fits as well, the farthest first
@@ -117,10 +132,12 @@ def pattern_search(
     return Surroundings(None, wide, theta + others[0] if len(others) else None)
 
 
-def _tenfold(size: int, sds: int) -> list[int]:
-    """Where in a pattern the points are that lie ten times SHORTEST away."""
-    half = (len(_LENGTHS) + sds) * size
-    return [1 + size + k + side for side in (0, half) for k in range(size)]
+def _smooth(ways: FloatArray, values: FloatArray, covariance: FloatArray, tuning: PatternTuning) -> bool:
+    """Whether energies (B,) rise as the normal says along ways (B, N) within a few sds, the first of them nothing."""
+    foretold = 0.5 * np.einsum("bn,bn->b", ways, np.linalg.solve(covariance, ways.T).T)
+    near = foretold <= 0.5 * (1.01 * tuning.smooth) ** 2
+    ratio = (values[near] - values[0] + tuning.better) / (foretold[near] + tuning.better)
+    return bool((ratio > tuning.least_rise).all() and (ratio < tuning.most_rise).all())
 
 
 def _holding(covariance: FloatArray, way: FloatArray) -> FloatArray:

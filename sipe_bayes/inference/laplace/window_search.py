@@ -351,12 +351,12 @@ class WindowSearch:
             bettered=state.optima[-1] if here.patterns else None,
         )
         optimum = summarised(self.problem, windows, ending)
-        searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
-        around = surroundings(self.problem, windows, theta, searched, optimum.covariance)
-        optimum = judged(self.problem, windows, optimum, around, ending)
         further = None if here.centred else middle_of_ridge(self.problem, windows, optimum)
         if further is not None:
             return replace(state, here=replace(here.afresh(tuning.damping), theta=further, centred=True))
+        searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
+        around = surroundings(self.problem, windows, theta, searched, optimum.covariance)
+        optimum = judged(self.problem, windows, optimum, around, ending)
         # one that is searched on from is none
         optima = (*state.optima[: len(state.optima) - here.revisits], optimum)
         state = replace(state, optima=optima)

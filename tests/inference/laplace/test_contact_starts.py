@@ -12,7 +12,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting
-from sipe_bayes.inference.laplace.contact_starts import begins_in_contact, contact_starts
+from sipe_bayes.inference.laplace.contact_starts import begins_in_contact, grown_starts
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.window_energy import beyond_start_noise, present_noise, start_noise
 from sipe_bayes.likelihood.settings import Segments
@@ -85,7 +85,7 @@ def test_a_small_budget_leaves_it_to_the_plain_screening() -> None:
     windows = Windows(likelihood, simulator, log)
     estimator = Laplace(simulator, likelihood=likelihood)
     windows.budget = 10
-    assert contact_starts(estimator.problem, windows) is None
+    assert grown_starts(estimator.problem, windows) is None
     assert windows.rollouts <= 10
 
 
