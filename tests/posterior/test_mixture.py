@@ -33,6 +33,14 @@ def test_components_keep_their_truncated_share() -> None:
     assert share == pytest.approx(expected * tail, abs=SIGMAS * math.sqrt(expected * (1 - expected) / 20_000))
 
 
+def test_of_masses_draws_components_as_often_as_the_weights_say() -> None:
+    mixture = GaussianMixture(np.log([0.9, 0.1]), [[-0.5], [0.5]], [[[0.0625]], [[0.0001]]], space_of(1)).of_masses()
+    np.testing.assert_allclose(mixture.probabilities.numpy(), [0.9, 0.1], rtol=1e-12)
+    anew = GaussianMixture(mixture.log_weights, mixture.means, mixture.covariances, space_of(1))
+    theta = torch.linspace(0.01, 0.99, 9, dtype=torch.float64)[:, None]
+    torch.testing.assert_close(mixture.log_prob(theta), anew.log_prob(theta), rtol=1e-12, atol=0)
+
+
 def test_mode_on_the_boundary() -> None:
     """With the mean outside, the mode is not the clipped mean: theta_2 is its regression on theta_1 = 1."""
     covariance = np.array([[0.04, 0.03], [0.03, 0.04]])

@@ -14,8 +14,8 @@ Modeling Using the t Distribution", JASA 84), which bears the few windows that a
 
 Where nothing touches, a whole log that begins at a known state is all the same hard to fit from afar: small errors of
 theta grow with the time that is simulated, until a search stops in a side valley, or takes dozens of steps along the
-bottom of one. There too the search goes downhill on beginnings of the log, from a sixteenth on, each twice as long; the
-simulation is smooth, so that beginnings need neither wide differences nor single control steps.
+bottom of one. There too the search goes downhill on beginnings of the log, from a sixteenth on, every other one twice
+as long; the simulation is smooth, so that beginnings need neither wide differences nor single control steps.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class _Plan:
             return cls(tuple(horizons), tuning.widest, tuning.attempts, robust=True)
         if windows.num_start or not isinstance(windows.simulator, Simulator) or longest < tuning.long:
             return None
-        return cls(tuple(longest // share for share in (16, 8, 4, 2)), 0.0, 1, robust=False)
+        return cls(tuple(int(longest * 2.0 ** (k / 2)) for k in range(-8, 0)), 0.0, 1, robust=False)
 
 
 @dataclass(frozen=True)

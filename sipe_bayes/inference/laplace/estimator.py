@@ -183,7 +183,8 @@ class Laplace(Estimator[LaplaceState]):
         target = self._target(windows, best)
         if target.silent:
             return ended
-        if not best.unsmooth and importance.is_normal(target, best.theta, best.mean, best.covariance, tuning):
+        seen_normal = not best.unsmooth and not best.heavier
+        if seen_normal and importance.is_normal(target, best.theta, best.mean, best.covariance, tuning):
             return replace(ended, search=_looked_around(state.search, best))
         return replace(state, draws=Draws.none(n), done=not windows.has_room(importance.batch_size(n, tuning)))
 

@@ -32,6 +32,7 @@ class PatternTuning(Options):
     smooth: float = option(3.0, "distance up to which a simulation is looked at for being smooth", "sd", above=0)
     least_rise: float = option(0.6, "a rise, over that of the normal, with which it is", above=0, below=1)
     most_rise: float = option(2.0, "the same above", above=1)
+    excluded: float = option(6.0, "rise with which a place hardly counts, however far it is", "nats", above=0)
     luck: float = option(3.0, "how much worse the nearest neighbours may be in a smooth simulation", "nats", above=0)
     growth: float = option(10.0, "how much worse still, at least, points ten times farther are there", above=1)
 
@@ -46,12 +47,14 @@ class Surroundings:
             well with no worse ones in between, or as well in a simulation that is rough at every scale.
         other: (N,), a point that fits as well, but apart.
         rough: whether the simulation is rough at every scale.
+        heavier: whether places that the normal all but excludes fit nearly as well.
     """
 
     better: FloatArray | None
     covariance: FloatArray
     other: FloatArray | None
     rough: bool = False
+    heavier: bool = False
 
 
 def pattern_size(size: int, tuning: PatternTuning) -> int:
@@ -109,6 +112,8 @@ def pattern_search(
     if values[best] < values[0] - tuning.better - luck:
         return Surroundings(trials[best], _holding(wide, trials[best] - theta), None)
     level = values[0] + luck
+    due = np.minimum(_foretold(trials - theta, wide), tuning.excluded)
+    heavier = bool((values - values[0] + tuning.better < tuning.least_rise * (due + tuning.better)).any())
     if rough:
         ways = np.concatenate([k * np.eye(size) for k in tuning.between * _LENGTHS[1:]])
         more = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
@@ -123,21 +128,26 @@ def pattern_search(
         return Surroundings(None, wide, None, rough)
     good = good[:size]
     if not len(good):
-        return Surroundings(None, wide, None)
+        return Surroundings(None, wide, None, heavier=heavier)
     # half-way points say whether it is one optimum
     one = energies(theta + 0.5 * good) < level + tuning.saddle
     for way in good[one]:
         wide = _holding(wide, way)
     others = good[~one]
-    return Surroundings(None, wide, theta + others[0] if len(others) else None)
+    return Surroundings(None, wide, theta + others[0] if len(others) else None, heavier=heavier)
 
 
 def _smooth(ways: FloatArray, values: FloatArray, covariance: FloatArray, tuning: PatternTuning) -> bool:
     """Whether energies (B,) rise as the normal says along ways (B, N) within a few sds, the first of them nothing."""
-    foretold = 0.5 * np.einsum("bn,bn->b", ways, np.linalg.solve(covariance, ways.T).T)
+    foretold = _foretold(ways, covariance)
     near = foretold <= 0.5 * (1.01 * tuning.smooth) ** 2
     ratio = (values[near] - values[0] + tuning.better) / (foretold[near] + tuning.better)
     return bool((ratio > tuning.least_rise).all() and (ratio < tuning.most_rise).all())
+
+
+def _foretold(ways: FloatArray, covariance: FloatArray) -> FloatArray:
+    """How far the normal says that energies (B,) rise along ways (B, N)."""
+    return np.asarray(0.5 * np.einsum("bn,bn->b", ways, np.linalg.solve(covariance, ways.T).T))
 
 
 def _holding(covariance: FloatArray, way: FloatArray) -> FloatArray:

@@ -191,4 +191,5 @@ def judged(
         # the normal's middle lies where a slope led that no simulation follows
         refused = np.clip(optimum.mean, 0.0, 1.0) - ending.theta
         optimum, covariance = replace(optimum, mean=ending.theta), covariance + np.outer(refused, refused)
-    return replace(optimum, covariance=covariance, guessed=guessed, finding=reason)
+    heavier = around is not None and around.heavier
+    return replace(optimum, covariance=covariance, guessed=guessed, heavier=heavier, finding=reason)

@@ -127,12 +127,14 @@ class WindowOptimum(Optimum):
         starts: (W, D).
         slope: (W, D, N): starts follow theta by minus this.
         guessed: whether the normal's width is only a guess.
+        heavier: whether places that the normal all but excludes fit nearly as well.
         finding: why its intervals are not to be trusted; None where they may be.
     """
 
     starts: FloatArray
     slope: FloatArray
     guessed: bool = False
+    heavier: bool = False
     finding: Finding | None = None
 
     @property
