@@ -69,8 +69,8 @@ from sipe_bayes.inference.laplace.window_optimum import (
     judged,
     middle_of_ridge,
     sandwiches,
-    summarised,
     surroundings,
+    widened,
 )
 from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowState
 from sipe_bayes.likelihood.moments import Moments
@@ -350,7 +350,7 @@ class WindowSearch:
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,
         )
-        optimum = summarised(self.problem, windows, ending)
+        optimum = widened(self.problem, windows, ending)
         searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
         around = surroundings(self.problem, windows, theta, searched, optimum.covariance)
         optimum = judged(self.problem, windows, optimum, around, ending)
