@@ -155,8 +155,8 @@ class Code(Enum):
         "{count} samples of {channels} in {logs} logs were left out of the fit: no motion passes through them"
     )
     NOT_SMOOTH = blocking(
-        "at the optimum the linearisation still foretold a gain of {gain:.1f} nats that no step found: the "
-        "simulation is not smooth there (friction, contact or delay); compare with mcmc before you trust the "
+        "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "
+        "point nearby: it is not smooth there (friction, contact or delay); compare with mcmc before you trust the "
         "intervals"
     )
     STARTS_AT_REST = blocking(

@@ -368,7 +368,7 @@ class Windows:
             again, rows = np.tile(theta, (len(wrong), 1)), np.array(wrong) + 1
             again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
             predicted[rows], valid[rows] = self.predict(np.clip(again, 0, 1), all_starts[: len(wrong)], True)
-        predicted[1:] = self._continued(predicted[1:], predicted[0])
+        predicted[1:] = self.continued(predicted[1:], predicted[0])
         scale = np.concatenate([sign[:n] * size[:n], of_starts])[:, None, None, None]
         with np.errstate(invalid="ignore"):
             jacobian = (predicted[1:] - predicted[0]) / scale
@@ -376,7 +376,7 @@ class Windows:
         residual = np.where(self.observed, self.measured - predicted[0], 0.0)
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
 
-    def _continued(self, predicted: FloatArray, here: FloatArray) -> FloatArray:
+    def continued(self, predicted: FloatArray, here: FloatArray) -> FloatArray:
         """Predictions (B, W, L, C) whose differences from those ``here`` (W, L, C) jump nowhere.
 
         The residual of an orientation does where it is half a turn.

@@ -26,7 +26,8 @@ mean lies beyond it, and the truncated density is right up to the bound.
    begin at known states, through contact or over long logs, by beginnings that grow (``contact_starts``).
 2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
 3. Record where that ends (``window_optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
-   over a handful of weighted noise values.
+   over a handful of weighted noise values; where starts are estimated, ask points two sds away whether it is too narrow
+   and take slopes between them then (``wide_differences``).
 4. Look around (``pattern_search``) and go on from a better place, or from the middle of a ridge.
 5. Send scouts from draws of the prior: whoever comes to rest as low elsewhere is a further starting point
    (``scouting``).
@@ -75,8 +76,9 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
   noise (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts
   the misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what
   predicts best.
-- Whether the posterior is normal is not asked where starts are estimated or states inferred, where there are several
-  optima, where residuals are as small as the simulation's rounding or intervals as small as the search resolves, where
-  the intervals are guessed. Where the budget has no room for it (2 N + 1 rollouts to ask, and some hundreds for draws
-  where it is none), a finding says so.
+- Whether the posterior is normal is not asked where states are inferred, where there are several optima, where
+  residuals are as small as the simulation's rounding or intervals as small as the search resolves, where the intervals
+  are guessed; where starts are estimated it is only asked whether it is wider. Where the budget has no room for it
+  (2 N + 1 rollouts to ask, and some hundreds for draws where it is none), a finding says so; not where starts are
+  estimated, which a larger budget asks then.
 """

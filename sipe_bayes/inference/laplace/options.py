@@ -43,6 +43,15 @@ class WindowTuning(Options):
 
 
 @dataclass(frozen=True)
+class WideTuning(Options):
+    """Differences as long as the posterior is wide; see ``wide_differences``."""
+
+    rounds: int = option(3, "in which the normal grows, and is asked again", least=0)
+    wider: float = option(1.25, "their normal over that of short ones, from which it takes its place", above=1)
+    least_room: float = option(0.1, "of the way to both sides that the cube must leave an axis", above=0, most=2)
+
+
+@dataclass(frozen=True)
 class GrowingTuning(Options):
     """How beginnings of windows grow."""
 
@@ -108,6 +117,7 @@ class LaplaceTuning(Options):
     damping: DampingRule = option(DampingRule(), "how steps are damped")
     screening: ScreeningTuning = option(ScreeningTuning(), "how starting points are chosen")
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
+    wide: WideTuning = option(WideTuning(), "differences as long as the posterior is wide")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
     contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
     scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")

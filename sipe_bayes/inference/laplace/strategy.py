@@ -59,6 +59,12 @@ class Optimum:
         gap = other.mean - self.mean
         return float(np.sqrt(gap @ np.linalg.solve(self.covariance, gap)))
 
+    def over(self, other: Optimum) -> float:
+        """How many times as wide as another one's its normal is, in the direction where it is most."""
+        root = np.linalg.cholesky(other.covariance)
+        ratios = np.linalg.solve(root, np.linalg.solve(root, self.covariance).T)
+        return float(np.sqrt(np.linalg.eigvalsh(ratios)[-1]))
+
     def resembles(self, mean: FloatArray, covariance: FloatArray, tolerance: float) -> bool:
         """Whether a normal's mean (N,) is as near, in sds, and its sds in any direction, as logarithms."""
         root = np.linalg.cholesky(self.covariance)

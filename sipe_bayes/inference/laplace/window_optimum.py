@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.laplace.pattern_search import Surroundings, nearest_points, pattern_search, pattern_size
 from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.inference.laplace.wide_differences import WideDifferences
 from sipe_bayes.inference.laplace.window_energy import (
     WindowEnergy,
     beyond_rounding,
@@ -26,7 +28,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
 from sipe_bayes.likelihood.restricted import eliminate_starts, restricted
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,30 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
     for weight, centre in centres:
         covariance += weight * np.outer(centre - mean, centre - mean)
     return WindowOptimum(theta, mean, covariance, evidence, noise.sd, noise.tau, starts, solved.slope)
+
+
+def widened(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
+    """The same, by differences as long as the normal is wide where that makes it wider; see ``wide_differences``.
+
+    Not asked where the starts are known, where an end is none, where differences are long already or windows grow.
+    """
+    optimum, tuning = summarised(problem, windows, ending), problem.options.tuning.wide
+    ends = ending.settled and ending.refused <= problem.options.tuning.windows.most_drift
+    if not ends or not windows.num_start or grows(windows) or windows.least_steps(ending.theta).any():
+        return optimum
+    missing = 0.0
+    for _ in range(tuning.rounds):
+        if not windows.has_room(2 * len(ending.theta)):
+            break
+        seen = WideDifferences.of(problem, windows, optimum, ending.noise, ending.residual, ending.jacobian)
+        lin = Linearisation(ending.residual, seen.jacobian, True)
+        moments = windows.moments(lin, white=windows.settings.noise == "white")
+        wide = summarised(problem, windows, replace(ending, moments=moments, jacobian=seen.jacobian))
+        missing = 0.0 if sandwiches(windows) else seen.missing  # whose width is no likelihood's
+        if wide.over(optimum) < tuning.wider:
+            break
+        optimum = wide
+    return replace(optimum, finding=finding(Code.NOT_SMOOTH, gain=missing)) if missing else optimum
 
 
 def sandwiches(windows: Windows) -> bool:
@@ -165,7 +191,7 @@ def judged(
     ``around`` is None where they were not looked at.
     """
     unsmooth, covariance = ending.refused > problem.options.tuning.windows.most_drift, optimum.covariance
-    reason: Finding | None = None
+    reason = optimum.finding
     if ending.cut_short and not ending.settled:
         reason = finding(Code.SEARCH_CUT_SHORT)
     elif not ending.settled:

@@ -69,8 +69,8 @@ from sipe_bayes.inference.laplace.window_optimum import (
     judged,
     middle_of_ridge,
     sandwiches,
-    summarised,
     surroundings,
+    widened,
 )
 from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowState
 from sipe_bayes.likelihood.moments import Moments
@@ -350,7 +350,7 @@ class WindowSearch:
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,
         )
-        optimum = summarised(self.problem, windows, ending)
+        optimum = widened(self.problem, windows, ending)
         further = None if here.centred else middle_of_ridge(self.problem, windows, optimum)
         if further is not None:
             return replace(state, here=replace(here.afresh(tuning.damping), theta=further, centred=True))
