@@ -143,7 +143,7 @@ if __name__ == "__main__":
     parser.add_argument("--budget", type=int, default=2000)
     parser.add_argument("--truths", type=int, default=400)
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
-    parser.add_argument("--calibration", nargs="+", type=float, default=[0.0, 0.2])
+    parser.add_argument("--calibration", nargs="+", type=float, default=[0.2, 0.0])
     parser.add_argument("--out", type=Path, help="default: results/amortised_coverage_TASK.json")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -3,15 +3,16 @@ r"""A log's summary by regression: what simulations say of E[theta | x].
 P. Fearnhead, D. Prangle 2012, "Constructing summary statistics for approximate Bayesian computation: semi-automatic
 approximate Bayesian computation" (https://arxiv.org/abs/1004.1112): of all summaries with as many numbers as
 parameters, the posterior's mean loses least, and a regression of theta on what was simulated estimates it. With a
-kernel k, centred, and K_ij = k(x_i, x_j) of n simulations,
+kernel k and K_ij = k(x_i, x_j) of n simulations,
 
 .. math:: s(x) = \bar\theta + k(x)^T (K + \lambda I)^{-1} (\theta - \bar\theta) ,
 
-whose ridge lambda is, for each parameter, that of least error of the simulations when each is left out; infinite where
-none is better than the mean by ``worth``. A network is trained on the estimates of simulations whose ``folds`` were
-left out: it then sees summaries as far off as those of a new log. (The mean is that of all. Without each simulation
-alone, estimates would give its theta away where x does not determine it, being then the mean of the others, (n
-\bar\theta - \theta_i) / (n - 1).)
+whose ridge lambda is, for each parameter, that of least mean absolute error of the simulations when each is left out
+(squares would follow the few that are far off); infinite where none is better than the mean by ``worth``. A network is
+trained on the estimates of simulations whose ``folds`` were left out: it then sees summaries as far off as those of a
+new log. (The mean is that of all. Without each simulation alone, estimates would give its theta away where x does not
+determine it, being then the mean of the others, (n \bar\theta - \theta_i) / (n - 1). For the same reason k is not
+centred over the simulations: all others would hold a trace of each, in its own direction, which gives its theta away.)
 
 Deviations:
 
@@ -40,7 +41,7 @@ class RegressionOfTheta(Options):
     most: int = option(2000, "simulations that are regressed on", least=10)
     numbers: int = option(4000, "samples of each that count", least=1)
     folds: int = option(10, "parts of the simulations that are left out in turn", least=2)
-    worth: float = option(10.0, "what a summary takes from the sum of squares, at least, in those of one simulation")
+    worth: float = option(10.0, "what a summary takes from the sum of errors, at least, in those of one simulation")
     least: float = option(0.04, "share of a sample's variance that is no noise, below which it does not count", above=0)
     ridges: tuple[float, ...] = option(
         tuple(float(x) for x in np.logspace(-7, 1, 25)), "that are tried", "of the largest eigenvalue of K"
@@ -91,7 +92,6 @@ class Regressed:
     Attributes:
         samples, statistics: columns of both.
         points: (n, F) of the simulations.
-        middle: (n,), means of the kernel's rows.
         ridge: (N,).
         coefficients: (n, N).
         theta: (N,), mean.
@@ -100,7 +100,6 @@ class Regressed:
     samples: Columns
     statistics: Columns
     points: Float32Array
-    middle: FloatArray
     ridge: FloatArray
     coefficients: FloatArray
     theta: FloatArray
@@ -126,15 +125,13 @@ class Regressed:
         used = slice(0, options.most)
         columns = Columns.of(samples[used], noise, options), Columns.of(statistics[used], 0.0, options)
         points = np.concatenate([columns[0](samples), columns[1](statistics)], axis=1)
-        kernel = _kernel(points[used], points[used])
-        middle, mean = kernel.mean(0), theta[used].mean(0)
-        centred = kernel - middle - middle[:, None] + middle.mean()
-        eigenvalues, vectors = np.linalg.eigh(centred)
+        mean = theta[used].mean(0)
+        eigenvalues, vectors = np.linalg.eigh(_kernel(points[used], points[used]))
         eigenvalues = np.maximum(eigenvalues, 0)
         ridge = _least_error(eigenvalues, vectors, theta[used] - mean, options)
         left_out = _left_out(eigenvalues, vectors, theta[used] - mean, ridge, options)
         coefficients = vectors @ ((vectors.T @ (theta[used] - mean)) / (eigenvalues[:, None] + ridge))
-        regressed = cls(*columns, points[used], middle, ridge, coefficients, mean)
+        regressed = cls(*columns, points[used], ridge, coefficients, mean)
         beyond = regressed.summaries(points[options.most :])
         return regressed, np.concatenate([mean + left_out, beyond])
 
@@ -144,11 +141,7 @@ class Regressed:
 
     def summaries(self, points: Float32Array) -> FloatArray:
         """(m, N) of points (m, F)."""
-        return np.asarray(self.theta + self._centred(points) @ self.coefficients)
-
-    def _centred(self, points: Float32Array) -> FloatArray:
-        kernel = _kernel(points, self.points)
-        return np.asarray(kernel - kernel.mean(1)[:, None] - self.middle + self.middle.mean())
+        return np.asarray(self.theta + _kernel(points, self.points) @ self.coefficients)
 
 
 def _kernel(one: Float32Array, other: Float32Array) -> FloatArray:
@@ -160,13 +153,13 @@ def _least_error(
 ) -> FloatArray:
     """For each parameter, without its mean, the ridge (N,) of least error where each simulation is left out."""
     inside, squared = vectors.T @ theta, vectors**2
-    best, ridge = (1 - options.worth / len(theta)) * (theta**2).mean(0), np.full(theta.shape[1], np.inf)
+    best, ridge = (1 - options.worth / len(theta)) * np.abs(theta).mean(0), np.full(theta.shape[1], np.inf)
     for share in options.ridges:
         tried = max(share * float(eigenvalues.max()), 1e-12)
         kept = eigenvalues / (eigenvalues + tried)
         own = squared @ kept
         off = (theta - vectors @ (kept[:, None] * inside)) / np.maximum(1 - own, 1e-9)[:, None]
-        error = (off**2).mean(0)
+        error = np.abs(off).mean(0)
         better = error < best
         best[better], ridge[better] = error[better], tried
     return ridge

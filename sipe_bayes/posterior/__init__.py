@@ -7,6 +7,7 @@ from sipe_bayes.posterior.flow import Flow
 from sipe_bayes.posterior.independent import IndependentPrior, prior, uniform
 from sipe_bayes.posterior.mixture import GaussianMixture
 from sipe_bayes.posterior.particles import Particles
+from sipe_bayes.posterior.quantile_mapped import QuantileMapped
 from sipe_bayes.posterior.registry import FAMILIES, load_posterior
 from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
@@ -20,6 +21,7 @@ __all__ = [
     "NoDensityError",
     "Particles",
     "Posterior",
+    "QuantileMapped",
     "SurrogatePosterior",
     "load_posterior",
     "prior",

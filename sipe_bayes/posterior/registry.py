@@ -20,12 +20,16 @@ from sipe_bayes.posterior.flow import Flow
 from sipe_bayes.posterior.independent import IndependentPrior
 from sipe_bayes.posterior.mixture import GaussianMixture
 from sipe_bayes.posterior.particles import Particles
+from sipe_bayes.posterior.quantile_mapped import QuantileMapped
 from sipe_bayes.posterior.storage import SAVE_AGAIN, read_pair
 from sipe_bayes.posterior.surrogate import SurrogatePosterior
 
 FAMILIES: dict[str, type[Posterior]] = {
     family.__name__: family
-    for family in (Dirac, Particles, GaussianMixture, IndependentPrior, SurrogatePosterior, Flow, Averaged)
+    for family in (
+        *(Dirac, Particles, GaussianMixture, IndependentPrior, SurrogatePosterior),
+        *(Flow, Averaged, QuantileMapped),
+    )
 }
 
 

@@ -17,6 +17,7 @@ from sipe_bayes.posterior import (
     IndependentPrior,
     Particles,
     Posterior,
+    QuantileMapped,
 )
 from sipe_bayes.posterior.flow import Flow, spline_flow
 from tests.problems.surrogates import example_surrogate
@@ -75,6 +76,9 @@ EXAMPLES: dict[str, Callable[[int], Posterior]] = {
     "SurrogatePosterior": lambda n: example_surrogate(space_of(n)),
     "Flow": example_flow,
     "Averaged": lambda n: Averaged([random_mixture(n, 1, seed) for seed in (1, 2)]),
+    "QuantileMapped": lambda n: QuantileMapped(
+        random_mixture(n), np.linspace(-1, 1, 5)[:, None].repeat(n, 1), np.linspace(-1.3, 1.2, 5)[:, None].repeat(n, 1)
+    ),
 }
 
 

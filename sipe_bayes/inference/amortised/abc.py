@@ -31,6 +31,7 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.amortised.held_back import HeldBackOptions
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.inference.amortised.summaries import REGRESSED, Summaries
@@ -41,7 +42,7 @@ from sipe_bayes.posterior.flow import to_cube, to_line
 
 
 @dataclass(frozen=True)
-class ABCOptions(PriorSamplingOptions):
+class ABCOptions(HeldBackOptions, PriorSamplingOptions):
     """Options of ``ABC``."""
 
     accepted: float = option(0.05, "fraction of the valid simulations that is kept, at least one", above=0, most=1)

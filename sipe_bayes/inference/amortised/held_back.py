@@ -9,8 +9,8 @@ is done here.
 
 For a parameter of a posterior, z = Phi^-1(theta) and p the posterior's distribution function, t = Phi^-1(p(z)) is
 standard normal for truths that are draws. G is the distribution of the held-back simulations' t, weighted by the
-distance of their medians from the log's; the log's draws t become G^-1(Phi(t)), and keep their order, so that
-dependencies between parameters remain.
+distance of their medians from the log's; the log's t become G^-1(Phi(t)), a map of each parameter that keeps the order,
+so that dependencies between parameters remain, and the density with it (``posterior.quantile_mapped``).
 
 Deviations:
 
@@ -27,19 +27,24 @@ from typing import Self
 
 import numpy as np
 import torch
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtri
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.amortised.simulations import Simulations
-from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior import Particles, Posterior, QuantileMapped
 from sipe_bayes.posterior.flow import to_line
+from sipe_bayes.posterior.quantile_mapped import mapped
 
 DRAWS = 500  # of each simulation's posterior
-_KEPT = 4000  # draws of the mended posterior
+_KEPT = 4000  # draws of the log's own
 _LEVELS = np.arange(1, 100) / 100
+_KNOTS = np.linspace(ndtri(_LEVELS[0]), ndtri(_LEVELS[-1]), 25)  # t that the maps go through; scores jump between more
+_APART = 1e-9  # of points that a map goes through, in z
 _NEAREST, _SHARE = 100, 0.5  # simulations that count at least, and as a share of all
+_DEFAULT = 0.2  # of the simulations
 
 
 @dataclass(frozen=True)
@@ -65,16 +70,19 @@ class HeldBack:
             scores[i] = [_through(q, ndtri(_LEVELS), z) for q, z in zip(quantiles.T, line[i], strict=True)]
         return cls(medians, scores)
 
-    def mended(self, posterior: Posterior, generator: torch.Generator) -> Particles:
-        """A log's posterior with draws moved."""
+    def mended(self, posterior: Posterior, generator: torch.Generator) -> Posterior:
+        """A log's posterior, moved; draws where it has no density."""
         theta = posterior.sample((_KEPT,), generator=generator)
-        quantiles, line = _quantiles(theta), to_line(theta).numpy()
-        weights, moved = self._weights(quantiles[len(_LEVELS) // 2]), np.empty(line.shape)
-        for j, (q, z) in enumerate(zip(quantiles.T, line.T, strict=True)):
-            normal, scores = self._distribution(j, weights)
-            t = _through(normal, scores, _through(q, ndtri(_LEVELS), z))
-            moved[:, j] = _through(ndtri(_LEVELS), q, t)
-        return Particles(np.clip(ndtr(moved), 0, 1), posterior.space)
+        quantiles = _quantiles(theta)
+        weights, before, after = self._weights(quantiles[len(_LEVELS) // 2]), [], []
+        for j, q in enumerate(quantiles.T):
+            t = _through(*self._distribution(j, weights), _KNOTS)
+            before.append(_through(ndtri(_LEVELS), q, _KNOTS))
+            after.append(_through(ndtri(_LEVELS), q, t))
+        ends = [torch.from_numpy(_apart(np.stack(points, axis=1))) for points in (before, after)]
+        if not posterior.has_density:
+            return Particles(mapped(theta, *ends), posterior.space)
+        return QuantileMapped(posterior, *ends)
 
     def _weights(self, median: FloatArray) -> FloatArray:
         """Of the simulations (M,), by the distance of their medians from the log's (N,): tricube."""
@@ -94,8 +102,26 @@ class HeldBack:
         return ndtri(place), self.scores[order, parameter]
 
 
-def parted(simulations: Simulations, share: float) -> tuple[Simulations, Simulations]:
+@dataclass(frozen=True)
+class HeldBackOptions(Options):
+    """Options of methods whose posteriors are mended."""
+
+    calibration: float | None = option(
+        None,
+        "share of the simulations that is not trained on and mends the posteriors' widths; default a fifth, where that "
+        "is ten or more",
+        least=0,
+        below=1,
+    )
+
+
+def parted(simulations: Simulations, options: Options) -> tuple[Simulations, Simulations]:
     """Those to train on and those that are held back; raises ValueError where the latter are too few."""
+    if not isinstance(options, HeldBackOptions):
+        return simulations, simulations[:0]
+    share = options.calibration
+    if share is None:
+        share = _DEFAULT if _DEFAULT * len(simulations) >= THRESHOLDS.few_valid else 0.0
     count = int(share * len(simulations))
     if share and count < THRESHOLDS.few_valid:
         raise ValueError(
@@ -124,8 +150,12 @@ def scored(
 
 def _quantiles(theta: torch.Tensor) -> FloatArray:
     """Of draws (D, N) at the levels, in z, strictly increasing (99, N)."""
-    quantiles = np.quantile(to_line(theta).numpy(), _LEVELS, axis=0)
-    return np.asarray(quantiles + 1e-9 * np.arange(len(_LEVELS))[:, None])
+    return _apart(np.quantile(to_line(theta).numpy(), _LEVELS, axis=0))
+
+
+def _apart(points: FloatArray) -> FloatArray:
+    """Increasing rows, strictly so."""
+    return np.asarray(np.maximum.accumulate(points, axis=0) + _APART * np.arange(len(points))[:, None])
 
 
 def _through(x: FloatArray, y: FloatArray, at: FloatArray) -> FloatArray:

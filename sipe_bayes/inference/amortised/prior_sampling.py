@@ -112,9 +112,6 @@ class PriorSamplingOptions(Options):
         None,
         "folder for simulations, shared between estimators of one seed; default beside the checkpoint, else in memory",
     )
-    calibration: float = option(
-        0.0, "share of the simulations that is not trained on and mends the posteriors' widths", least=0, below=1
-    )
 
 
 class PriorSampling(Estimator[S], Generic[S, L]):
@@ -340,7 +337,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         known = isinstance(self.simulator, CallableSimulator) or trajectories.states is not None
         every = np.tile(noise, trajectories.observations[..., 0].size)
         outside = Outside.of(*self._looks(simulations.observations[-_SEEN:], trajectories), every, known)
-        simulations, kept_back = parted(simulations, self.options.calibration)
+        simulations, kept_back = parted(simulations, self.options)
         content = self.train(simulations, trajectories)
         held_back = scored(partial(self.infer, content), kept_back, trajectories, torch_generator([self.seed, 5]))
         experiment = Experiment.of(self.simulator, trajectories, noise, simulations.observations[:, :, 0])

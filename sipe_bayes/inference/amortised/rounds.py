@@ -36,6 +36,7 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import option
 from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.amortised.held_back import HeldBackOptions
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import BLOCK, Simulations
 from sipe_bayes.inference.amortised.summaries import REGRESSED, Summaries
@@ -79,7 +80,7 @@ class RoundsState(PriorSamplingState[Members[L]], Generic[L]):
 
 
 @dataclass(frozen=True)
-class RoundsOptions(PriorSamplingOptions):
+class RoundsOptions(HeldBackOptions, PriorSamplingOptions):
     """Options of methods that work in rounds."""
 
     rounds: int = option(1, "more than one conditions on the log in hand and is not amortised", least=1)

@@ -37,7 +37,7 @@ def test_statistics_against_a_plain_loop() -> None:
 @pytest.mark.parametrize("x", [(0.4, 0.5), (0.05, 0.3)])
 def test_rejection_is_near_the_exact_posterior_and_wider(x: tuple[float, float]) -> None:
     """400 draws of 20,000: means within 4 standard errors (false alarm 0.03 % in all) and 0.1 sd for the bandwidth."""
-    method = ABC(linear(), budget=20_000, accepted=0.02, likelihood=QUIET)
+    method = ABC(linear(), budget=20_000, accepted=0.02, likelihood=QUIET, calibration=0.0)
     posterior = method.fit(seen(*x))
     assert isinstance(posterior, Particles)
     mean, sd = exact(*x)
@@ -53,7 +53,7 @@ def test_regression_takes_the_acceptance_window_away() -> None:
     mean, sd = exact(0.4, 0.5)
     width = {}
     for regression in (False, True):
-        method = ABC(linear(), budget=4000, accepted=0.2, regression=regression, likelihood=QUIET)
+        method = ABC(linear(), budget=4000, accepted=0.2, regression=regression, likelihood=QUIET, calibration=0.0)
         posterior = method.fit(seen(0.4, 0.5))
         width[regression] = posterior.stddev.numpy() / sd
         assert ((posterior.theta >= 0) & (posterior.theta <= 1)).all()
@@ -79,7 +79,7 @@ def test_the_pendulum(tmp_path: Path) -> None:
 
 
 def test_other_logs_need_no_other_simulations() -> None:
-    method = ABC(linear(), budget=2000, likelihood=QUIET)
+    method = ABC(linear(), budget=2000, likelihood=QUIET, calibration=0.0)
     method.fit(seen(0.4, 0.5))
     assert method.state is not None
     other = method.posterior(method.state, Trajectories.stack(seen(0.7, 0.6)))

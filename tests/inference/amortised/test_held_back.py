@@ -10,9 +10,11 @@ import torch
 from scipy.stats import binom
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.inference.amortised.abc import ABC
 from sipe_bayes.inference.amortised.bayessim import BayesSim
 from sipe_bayes.inference.amortised.held_back import HeldBack
-from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.inference.amortised.npe import NPE
+from sipe_bayes.posterior import Flow, Particles, Posterior, QuantileMapped
 from tests.problems.linear_gaussian import function_problem
 
 SPACE = ParameterSpace([Parameter("a", low=0.0, high=1.0), Parameter("b", low=0.0, high=1.0)])
@@ -66,6 +68,21 @@ def test_posteriors_that_are_right_stay_as_they_are() -> None:
     np.testing.assert_allclose(mended.stddev.numpy(), SD, rtol=0.25)
 
 
+def test_a_fifth_is_held_back_where_it_is_enough() -> None:
+    """Ten of fifty are; of fewer, none. A network is trained on the others alone; ABC's draws are moved."""
+    simulator, log, _, likelihood = function_problem()
+    settings = {"likelihood": likelihood, "max_epochs": 2, "transforms": 1, "hidden": 8}
+    for budget, family in ((49, Flow), (50, QuantileMapped)):
+        npe = NPE(simulator, budget=budget, **settings)
+        assert type(npe.fit(log)) is family
+        assert npe.diagnostics["simulations"] == (budget if family is Flow else 40)
+    assert isinstance(NPE(simulator, budget=50, calibration=0.0, **settings).fit(log), Flow)
+    abc = ABC(simulator, budget=200, likelihood=likelihood, accepted=0.2)
+    posterior = abc.fit(log)
+    assert abc.diagnostics["accepted"] == 32  # of 160
+    assert isinstance(posterior, Particles)
+
+
 def test_a_method_keeps_simulations_back_by_option(tmp_path: Path) -> None:
     """The same answer from a checkpoint; too few simulations are refused by name."""
     simulator, log, exact, likelihood = function_problem()
@@ -73,7 +90,7 @@ def test_a_method_keeps_simulations_back_by_option(tmp_path: Path) -> None:
         simulator, budget=400, likelihood=likelihood, calibration=0.05, checkpoint=tmp_path / "fit.safetensors"
     )
     posterior = method.fit(log)
-    assert isinstance(posterior, Particles)
+    assert isinstance(posterior, QuantileMapped)
     assert ((posterior.mean - exact.mean).abs() < 2 * exact.stddev + 0.1).all()
     again = BayesSim(
         simulator, budget=400, likelihood=likelihood, calibration=0.05, checkpoint=tmp_path / "fit.safetensors"

@@ -23,7 +23,7 @@ from tests.problems import quick
 from tests.problems.noisy_sums import QUIET, SPACE, exact, linear, seen
 from tests.problems.pendulums import log, pendulum
 
-SMALL: dict[str, Any] = {**quick.SMALL["npe"], "likelihood": QUIET, "patience": 8}
+SMALL: dict[str, Any] = {**quick.SMALL["npe"], "likelihood": QUIET, "patience": 8, "calibration": 0.0}
 
 
 def seeded(seed: int) -> torch.Generator:

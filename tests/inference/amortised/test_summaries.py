@@ -50,14 +50,13 @@ def test_left_out_estimates_are_those_of_regressions_without_them() -> None:
     """Solved anew without the folds of three simulations, about the mean of all; and summaries are near theta."""
     regressed, left_out, theta, rng = made(60)
     kernel = (1 + regressed.points.astype(float) @ regressed.points.T.astype(float)) ** 2
-    centred = kernel - kernel.mean(0) - kernel.mean(0)[:, None] + kernel.mean()
     mean = theta.mean(0)
     for i in (0, 7, 31):
         others = np.delete(np.arange(60), np.arange(i % 10, 60, 10))
         for j in range(2):
-            ridged = centred[np.ix_(others, others)] + regressed.ridge[j] * np.eye(54)
+            ridged = kernel[np.ix_(others, others)] + regressed.ridge[j] * np.eye(54)
             solved = np.linalg.solve(ridged, theta[others, j] - mean[j])
-            assert mean[j] + centred[i, others] @ solved == pytest.approx(left_out[i, j], abs=2e-3)
+            assert mean[j] + kernel[i, others] @ solved == pytest.approx(left_out[i, j], abs=2e-3)
     fresh = rng.uniform(0.2, 0.9, (200, 2))
     samples = motions(fresh, rng)
     error = regressed.summaries(regressed.points_of(samples, squares(samples))) - fresh
@@ -73,6 +72,15 @@ def test_left_out_estimates_do_not_give_away_what_a_log_does_not_tell() -> None:
     _, left_out = Regressed.of(theta, samples, squares(samples), np.full(len(STEPS), 0.1))
     np.testing.assert_allclose(left_out[:, 2], theta[:, 2].mean(), rtol=1e-12)
     assert np.corrcoef(left_out[:, 0], theta[:, 0])[0, 1] > 0.9
+
+
+def test_logs_with_more_samples_than_simulations_that_tell_nothing_are_not_regressed_on() -> None:
+    """Each is alone in its direction; of a kernel centred over all of them the others hold its trace, and its theta."""
+    rng = np.random.default_rng(4)
+    theta, samples = rng.uniform(size=(300, 2)), rng.standard_normal((300, 800))
+    regressed, left_out = Regressed.of(theta, samples, squares(samples), np.zeros(800))
+    assert np.isinf(regressed.ridge).all()
+    np.testing.assert_allclose(left_out - theta.mean(0), 0, atol=1e-12)
 
 
 def test_simulations_beyond_the_most_are_summarised_as_new_ones() -> None:
@@ -152,7 +160,7 @@ def test_an_ensemble_averages_its_members(tmp_path: Path) -> None:
     """Other networks than the first, which is the single one's; a checkpoint holds all of them."""
     simulator = pendulum()
     recorded = log(simulator, [0.6, 0.05], 1, steps=40)
-    settings = {"budget": 100, "transforms": 1, "hidden": 16, "max_epochs": 5, "seed": 2, "embedding": "regressed"}
+    settings = {"budget": 100, "transforms": 1, "hidden": 16, "max_epochs": 5, "seed": 2, "calibration": 0.0}
     path = tmp_path / "fit.safetensors"
     both = NPE(simulator, members=2, checkpoint=path, **settings)
     posterior = both.fit(recorded)
