@@ -38,7 +38,7 @@ from scipy import stats
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark.cells import Cell
-from sipe_bayes.benchmark.log import recorded
+from sipe_bayes.benchmark.records import Record
 from sipe_bayes.benchmark.transfer.study import settings as small_agent
 from sipe_bayes.core.files import to_json, write_text
 from sipe_bayes.datasets.demonstrations import agent_file
@@ -68,7 +68,6 @@ MEASURES = {"mean_accuracy": "accuracy", "skill_over_prior": "CRPS skill"}
 TITLES = {
     "expert": "The agent begins as the shipped expert",
     "scratch": "From scratch",
-    "none": "Without a policy, on the benchmark's log",
 }
 BUDGET = ("start", "budget", "updates")
 Row = dict[str, Any]
@@ -106,7 +105,7 @@ class Budget:
     """Of a cell.
 
     Args:
-        start: what the agent begins as: expert, scratch; none is the setting without an agent, on the benchmark's log.
+        start: what the agent begins as, expert or scratch.
         steps: of a training, None for the task's own.
         rollouts: of the estimator.
         updates: of the estimate.
@@ -119,8 +118,6 @@ class Budget:
 
     def described(self, task: str) -> dict[str, Any]:
         """As a cell's record has it."""
-        if self.start == "none":
-            return {"start": "none", "steps": 0, "budget": self.rollouts, "updates": 1, "episodes": 0}
         steps, episodes = self.steps or size(task).steps, size(task).episodes
         counts = {"steps": steps, "budget": self.rollouts, "updates": self.updates, "episodes": episodes}
         return {"start": self.start, **counts}
@@ -158,19 +155,14 @@ def run_cell(budget: Budget, task: str, method: str, seed: int) -> None:
     out, begin, cpu = budget.folder(task, method, seed), time.perf_counter(), time.process_time()
     resumed = (out / "checkpoint" / "state.safetensors").exists()
     record: dict[str, Any] = {"task": task, "method": method, "seed": seed, **budget.described(task)}
-    if budget.start == "none":
-        posterior = estimator.fit(recorded(task, VARIANT, seed, Cell(task, name).horizon).trajectories)
-        record |= {"warnings": estimator.warnings}
-    else:
-        result = in_the_loop(budget, estimator, out)
-        posterior = result.posterior
-        record |= {"converged": result.converged, "solved_reference": result.solved_reference}
-        record |= {"warnings": result.warnings, "history": [asdict(row) for row in result.history]}
+    result = in_the_loop(budget, estimator, out)
+    record |= {"converged": result.converged, "solved_reference": result.solved_reference}
+    record |= {"warnings": result.warnings, "history": [asdict(row) for row in result.history]}
     record |= {"cpu_seconds": None if resumed else round(time.process_time() - cpu, 1)}
-    record |= {"scores": score(posterior, simulator.task.theta(VARIANT)).to_dict()}
+    record |= {"scores": score(result.posterior, simulator.task.theta(VARIANT)).to_dict()}
     write_text(out / "cell.json", to_json(record))
     accuracy, seconds = record["scores"]["mean_accuracy"], time.perf_counter() - begin
-    print(f"{task}/{method}/{seed}: accuracy {accuracy:.3f}, {record.get('converged')}, {seconds:.0f} s", flush=True)
+    print(f"{task}/{method}/{seed}: accuracy {accuracy:.3f}, {result.converged}, {seconds:.0f} s", flush=True)
 
 
 def in_the_loop(budget: Budget, estimator: Estimator, out: Path) -> LoopResult:
@@ -251,10 +243,12 @@ def table() -> None:
         groups.setdefault(tuple(cell[key] for key in BUDGET), []).append(cell)
     lines = ["# A policy in the loop\n", "Written by `python examples/studies/policy_in_the_loop.py table`.\n"]
     for (start, rollouts, updates), rows in groups.items():
-        steps = ", ".join(f"{task} {n:,}" for task, n in {row["task"]: row["steps"] for row in rows}.items() if n)
-        named = TITLES[start] + (f", {updates} updates; control steps: {steps}" if steps else "")
-        lines += [f"## {named}; {rollouts:,} rollouts\n", *scores_of(rows), *policies_of(rows, summary)]
-    lines += compared(groups)
+        steps = ", ".join(f"{task} {n:,}" for task, n in {row["task"]: row["steps"] for row in rows}.items())
+        lines += [f"## {TITLES[start]}: {rollouts:,} rollouts, {updates} updates\n", f"Control steps: {steps}.\n"]
+        lines += [*scores_of(rows), *policies_of(rows, summary)]
+    alone = without_policy()
+    lines += ["## Without a policy: the benchmark's records, 1,000 rollouts\n", *scores_of(alone)]
+    lines += compared(groups.get(("expert", 300, 2), []), alone)
     write_text(KEPT.with_suffix(".md"), "\n".join(lines) + "\n")
     print("\n".join(lines))
 
@@ -278,8 +272,6 @@ def scores_of(rows: list[Row]) -> list[str]:
 
 def policies_of(rows: list[Row], summary: dict[str, Any]) -> list[str]:
     """How many converged, what the policies earn, and their estimates alone."""
-    if not any(row.get("history") for row in rows):
-        return []
     lines = [
         "**policies**: returns, and success where the task has it, in simulators drawn from the estimate / in the "
     ]
@@ -318,23 +310,31 @@ def policies_of(rows: list[Row], summary: dict[str, Any]) -> list[str]:
     return [*lines, ""]
 
 
-def compared(groups: dict[tuple[Any, ...], list[Row]]) -> list[str]:
+def without_policy() -> list[Row]:
+    """The same methods' records of the settings direct and learned_reward, three seeds."""
+    names = {"direct": "", "learned_reward": ", learned reward"}
+    return [
+        {"task": r.task, "method": r.estimator + names[r.setting], "seed": r.seed, "scores": r.scored.to_dict()}
+        for r in Record.all_in(HERE.parents[1] / "results")
+        if r.variant == VARIANT and r.setting in names and r.done
+    ]
+
+
+def compared(rows: list[Row], alone: list[Row]) -> list[str]:
     """Paired over tasks: with a policy less without, learned rewards less plain, each less the prior."""
-    rows, alone = groups.get(("expert", 300, 2), []), groups.get(("none", 300, 1), [])
     lines = [
         "## Compared\n",
-        "Means over tasks of differences between means over seeds, ± standard error over the tasks; ",
+        "Means over tasks of differences between means over seeds, ± standard error over the tasks, p of a paired "
+        "t-test over the tasks, not corrected for the number of lines, and in how many tasks the difference is above zero. "
+        "With a policy there are 300 rollouts and two trajectories, without 1,000 and one.\n",
+        "| | accuracy | CRPS skill |",
+        "|---" * 3 + "|",
     ]
-    lines[-1] += "p of a paired t-test over the tasks, not corrected for their number; better on so many tasks.\n"
-    lines += ["| | accuracy | CRPS skill |", "|---" * 3 + "|"]
     for name, one, other in (
         *((f"{m}: with a policy less prior", (rows, m), None) for m in METHODS),
         *((f"{m}: with a policy less without", (rows, m), (alone, m)) for m in METHODS),
-        *(
-            (f"{m}, learned reward less plain, with a policy", (rows, f"{m}, learned reward"), (rows, m))
-            for m in LEARNED
-        ),
-        *((f"{m}, learned reward less plain, without", (alone, f"{m}, learned reward"), (alone, m)) for m in LEARNED),
+        *((f"{m}: learned reward less plain, policy", (rows, f"{m}, learned reward"), (rows, m)) for m in LEARNED),
+        *((f"{m}: learned reward less plain, none", (alone, f"{m}, learned reward"), (alone, m)) for m in LEARNED),
     ):
         lines.append(f"| {name} | {' | '.join(difference(one, other, key) for key in MEASURES)} |")
     return lines
@@ -377,7 +377,7 @@ def mean_or_none(values: list[float | None]) -> float | None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("run", "table"))
-    parser.add_argument("--start", choices=("expert", "scratch", "none"), default="expert", help="see Budget")
+    parser.add_argument("--start", choices=("expert", "scratch"), default="expert", help="see Budget")
     parser.add_argument("--steps", type=int, help="control steps of a cell's training, default the task's own")
     parser.add_argument("--budget", type=int, default=300, help="rollouts of a cell's estimator")
     parser.add_argument("--updates", type=int, default=2, help="of the estimate")
