@@ -325,7 +325,7 @@ def compared(rows: list[Row], alone: list[Row]) -> list[str]:
     lines = [
         "## Compared\n",
         "Means over tasks of differences between means over seeds, ± standard error over the tasks, p of a paired "
-        "t-test over the tasks, not corrected for the number of lines, and in how many tasks the difference is above zero. "
+        "t-test over the tasks, not corrected for the number of lines, and how often it is above zero. "
         "With a policy there are 300 rollouts and two trajectories, without 1,000 and one.\n",
         "| | accuracy | CRPS skill |",
         "|---" * 3 + "|",
