@@ -143,6 +143,7 @@ def agent(task: str, steps: int) -> Settings:
     settings = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))["deviations"]
     lanes = size(task).lanes
     settings |= {"demonstration_share": SHARE, "cloning": CLONING, "learning_rate": 3e-4, "lanes": lanes}
+    settings |= {"end_hopeless": False}  # an episode that ends where the humanoid has fallen is too short a trajectory
     settings |= {"start_steps": steps // 10, "actor_waits": steps // WAITS, "capacity": 2 * steps + 5_000}
     return Settings(**settings)
 
