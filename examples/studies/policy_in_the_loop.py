@@ -351,7 +351,7 @@ def difference(one: tuple[list[Row], str], other: tuple[list[Row], str] | None, 
     if len(values) < 2:
         return ""
     error, p = np.std(values, ddof=1) / len(values) ** 0.5, stats.ttest_1samp(values, 0).pvalue
-    return f"{np.mean(values):+.3f} ± {error:.3f}, p {p:.2f}, {sum(v > 0 for v in values)} of {len(values)}"
+    return f"{np.mean(values):+.3f} ± {error:.3f}, p {p:.3f}, {sum(v > 0 for v in values)} of {len(values)}"
 
 
 def of(rows: list[Row], task: str, method: str, key: str) -> list[float]:
