@@ -114,7 +114,7 @@ class Training:
         weights, *moments = (
             _of_shape(values, (sum(sizes),)) for values in (state.weights, state.first_moment, state.second_moment)
         )
-        mean, sd = (_of_shape(values, tuple(features)) for values in (state.mean, state.sd))
+        mean, sd = _of_shape(state.mean, tuple(features)), _of_shape(state.sd, tuple(features), still=True)
         if not 0 <= state.steps < 2**63:
             raise ValueError("the checkpoint's discriminator claims impossibly many steps; delete it to start again")
         vector_to_parameters(weights, parameters)
@@ -130,8 +130,10 @@ class Training:
         self.network.standardise.sd.copy_(sd)
 
 
-def _of_shape(values: Float32Array, shape: tuple[int, ...]) -> Tensor:
-    if values.shape != shape or values.dtype != np.float32 or not np.isfinite(values).all():
+def _of_shape(values: Float32Array, shape: tuple[int, ...], still: bool = False) -> Tensor:
+    """As a tensor; ``still`` allows the infinite sd of features that do not change."""
+    sound = ~np.isnan(values) if still else np.isfinite(values)
+    if values.shape != shape or values.dtype != np.float32 or not sound.all():
         raise ValueError(
             f"the checkpoint's discriminator has {values.dtype} {values.shape}, expected float32 {shape} of finite "
             "numbers; it is of other options or damaged: delete the checkpoint to start again"

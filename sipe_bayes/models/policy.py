@@ -86,6 +86,11 @@ class Policy:
         half, middle = (self.action_high - self.action_low) / 2, (self.action_high + self.action_low) / 2
         return np.asarray(middle + half * np.tanh((x @ weight.T + bias).astype(float)))
 
+    @property
+    def checksum(self) -> str:
+        """Of the arrays, as the file has it."""
+        return _checksum(self._arrays())
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one safetensors file, atomically; missing folders are made."""
         arrays = self._arrays()
@@ -98,7 +103,7 @@ class Policy:
             "normalised": self.mean is not None,
             "clip": self.clip,
             "goal_size": self.goal_size,
-            "sha256": _checksum(arrays),
+            "sha256": self.checksum,
         }
         write_bytes(Path(path), save(arrays, {"policy": json.dumps(header)}))
 

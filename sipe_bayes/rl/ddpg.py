@@ -26,6 +26,8 @@ Options (``sipe_bayes.rl.settings``), each off unless asked for and each a devia
   their mean: Nair et al., "Overcoming Exploration in Reinforcement Learning with Demonstrations", 2018,
   https://arxiv.org/abs/1709.10089, without their filter and in units of the mean |Q|, as Fujimoto, Gu, "A Minimalist
   Approach to Offline Reinforcement Learning", 2021, https://arxiv.org/abs/2106.06860;
+- ``actor_waits``: the critic learns alone at first, of an actor that begins as a given policy (``begin``): climbing a
+  critic that knows nothing would undo it. A policy's file holds neither critic nor optimisers;
 - ``end_hopeless``: episodes of the training end where the humanoid has fallen, as the published class's;
 - ``lanes``: environments stepped together before the updates;
 - ``updates_per_step``, ``clip_targets``, ``action_penalty`` and ``random_share``: those of hindsight experience replay
@@ -212,8 +214,25 @@ class Agent:
         x = self._normalised(torch.from_numpy(observations.astype(np.float32)).to(self._device))
         return np.asarray(self._bounded(self.actor.forward(x)[0].tanh_()).cpu().numpy(), float)
 
-    def update(self, batch: Batch) -> None:
-        """One step of the critic, the actor and the targets; the batch lies on the agent's device."""
+    def begin(self, policy: Policy) -> None:
+        """Act as a policy does, whose statistics of observations stay; raises ValueError where the networks differ."""
+        given, made = ((x.layers, x.mean is not None, x.action_low, x.action_high) for x in (policy, self.policy("")))
+        shapes = [[tuple(w.shape) for w, _ in layers] for layers in (given[0], made[0])]
+        if shapes[0] != shapes[1] or given[1:] != made[1:]:
+            raise ValueError(
+                f"policy: expected layers {shapes[1]}, normalise {made[1]} and actions from {made[2]} to {made[3]}, "
+                f"got {shapes[0]}, {given[1]} and {given[2]} to {given[3]}; take the settings that it was trained with"
+            )
+        for network in (self.actor, self.target_actor):
+            for (weight, bias), layer in zip(policy.layers, network.layers, strict=True):
+                layer[0].copy_(torch.from_numpy(weight))
+                layer[1].copy_(torch.from_numpy(bias))
+        if self.normaliser is not None and policy.mean is not None and policy.scale is not None:
+            mean, scale = policy.mean.astype(float), policy.scale.astype(float)
+            self.normaliser.restore(Moments(np.ones(1), mean, scale**2))
+
+    def update(self, batch: Batch, climb: bool = True) -> None:
+        """One step of the critic, the actor (if it is to ``climb``) and the targets; the batch is on the device."""
         observations, following = (self._normalised(x) for x in (batch.observations, batch.next_observations))
         actions = batch.actions
         # the critic follows its target
@@ -223,7 +242,8 @@ class Agent:
         self.critic.backward(tape, (values - targets).mul_(2 / len(values)))
         self._critic_optimiser.step()
         # the actor climbs the critic, and the targets follow
-        self._climb(observations, actions)
+        if climb:
+            self._climb(observations, actions)
         for network, target in ((self.actor, self.target_actor), (self.critic, self.target_critic)):
             target.parameters.lerp_(network.parameters, self.settings.tau)
         self.updates += 1

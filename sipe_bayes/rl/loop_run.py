@@ -160,9 +160,10 @@ class LoopRun:
         plan: how it goes.
         threads: of the simulation.
         demonstrations: that the agent learns from besides.
+        policy: that the agent begins as.
 
     Raises:
-        ValueError: for an estimator that is not fresh, another reference, and a plan that does not fit the task.
+        ValueError: for an estimator that is not fresh, another reference, and a plan or policy that does not fit.
     """
 
     def __init__(
@@ -172,6 +173,7 @@ class LoopRun:
         plan: Plan,
         threads: int,
         demonstrations: Trajectories | None = None,
+        policy: Policy | None = None,
     ) -> None:
         self.task = task = _task(estimator)
         self.truth = task.theta(reference) if isinstance(reference, str) else _theta(task, reference)
@@ -183,6 +185,7 @@ class LoopRun:
             "reference": self.truth.tolist(),
             **asdict(plan),
             **({} if demonstrations is None else {"demonstrations": checksum(demonstrations)}),
+            **({} if policy is None else {"policy": policy.checksum}),
         }
         self.fingerprint = hashlib.sha256(json.dumps(described, sort_keys=True, default=repr).encode()).hexdigest()
         self.simulator = Simulator(task, threads)  # of the reference and of evaluations
@@ -191,7 +194,7 @@ class LoopRun:
         self.idle = False  # a search that is over
         self.history: list[Update] = []
         drawn = Randomization(self.posterior)
-        self.trainer = Trainer(task, plan.settings, estimator.seed, drawn, demonstrations, threads)
+        self.trainer = Trainer(task, plan.settings, estimator.seed, drawn, demonstrations, threads, policy=policy)
         assert self.trainer.draws is not None
         self.draw = self.trainer.draws
 

@@ -37,6 +37,8 @@ Deviations:
   for starting states" alone): the methods that compare states need equal actions.
 - Of an episode its first ``trajectory_steps`` are used, not the whole.
 - How often the estimator is updated, and the pace of its budget, are not in the paper.
+- Where a ``policy`` is given the agent begins as it, where the paper trains from scratch: a short training solves
+  nothing otherwise, and whoever calibrates a simulator has a policy that works in the nominal one.
 """
 
 from __future__ import annotations
@@ -52,6 +54,7 @@ from sipe_bayes.core.findings import Finding, Findings
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.search.base import Search
+from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.loop_run import LoopResult, LoopRun, Plan, Update
 from sipe_bayes.rl.settings import Settings
@@ -72,6 +75,7 @@ def train_in_the_loop(
     trajectory_steps: int | None = None,
     settings: Settings | None = None,
     demonstrations: Trajectories | None = None,
+    policy: Policy | None = None,
     evaluation_episodes: int = 10,
     folder: str | Path | None = None,
     resume: bool = False,
@@ -91,6 +95,8 @@ def train_in_the_loop(
         settings: how the agent learns.
         demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is taken;
             given with a share alone.
+        policy: that the agent begins as, such as one that works in the published model; ``settings`` are to have its
+            layers, and ``actor_waits``.
         evaluation_episodes: of the policy, in the simulators and in the reference, at each update.
         folder: where ``history.csv``, ``result.json``, ``policy.safetensors``, ``posterior`` and a checkpoint, written
             at each update, are kept.
@@ -103,7 +109,7 @@ def train_in_the_loop(
             the first update gives no estimate.
     """
     plan = Plan(steps, updates, trajectories, trajectory_steps, evaluation_episodes, settings or Settings())
-    run = LoopRun(estimator, reference, plan, threads, demonstrations)
+    run = LoopRun(estimator, reference, plan, threads, demonstrations, policy)
     kept = None if folder is None else _Folder(Path(folder), run, resume)
     while len(run.history) < updates:
         run.iterate(report)

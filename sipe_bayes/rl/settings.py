@@ -21,6 +21,11 @@ class Settings(Options):
     learning_rate: float = option(3e-4, "Of Adam, for actor and critic.", least=0)
     exploration: float = option(0.1, "Sd of the noise on actions, in half ranges.", "half ranges", least=0)
     start_steps: int = option(25_000, "Steps with uniformly random actions, before any update.", least=0)
+    actor_waits: int = option(
+        0,
+        "Steps before the actor learns, too: of one that begins as a given policy, whose critic knows nothing yet.",
+        least=0,
+    )
     capacity: int = option(1_000_000, "Steps that the replay buffer holds.", least=2)
     hindsight: int = option(
         4, "Transitions with a goal reached later to one with its own; tasks with goals only.", least=0

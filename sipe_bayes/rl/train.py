@@ -47,7 +47,7 @@ Report = Callable[[str, int, int], None]
 
 CHECKPOINT = "checkpoint/state.safetensors"
 COUNTS = "counts.json"
-_LATER = ("cloning", "end_hopeless")  # settings without which earlier runs go on
+_LATER = ("cloning", "end_hopeless", "actor_waits")  # settings without which earlier runs go on
 REPORTED = 100  # control steps between two reports
 
 

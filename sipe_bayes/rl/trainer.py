@@ -74,10 +74,12 @@ class Trainer:
         demonstrations: trajectories with rewards, from which ``settings.demonstration_share`` of each batch is taken.
         threads: of the simulation.
         device: that is simulated, remembered and learnt on, as ``Simulator`` has them.
+        policy: that the actor begins as; it acts in place of random actions, and the shift and scale of its
+            observations stay.
 
     Raises:
-        ValueError: for settings that do not fit the task, demonstrations without a share of them, or a task that the
-            device can not simulate.
+        ValueError: for settings that do not fit the task or the policy, demonstrations without a share of them, or a
+            task that the device can not simulate.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class Trainer:
         demonstrations: Trajectories | None = None,
         threads: int = 1,
         device: str = "cpu",
+        policy: Policy | None = None,
     ) -> None:
         if bool(settings.demonstration_share) != (demonstrations is not None):
             raise ValueError(
@@ -103,6 +106,9 @@ class Trainer:
         size = len(task.channels)
         self._device = "cpu" if device == "warp:cpu" else device  # torch's name of it
         self.agent = Agent(size, task.num_actions, task.action_low, task.action_high, settings, initial, self._device)
+        self._begun = policy is not None
+        if policy is not None:
+            self.agent.begin(policy)
         self.replay = self._buffer(settings.capacity, settings.lanes)
         self._shown = None if demonstrations is None else self._demonstrated(demonstrations)
         self.simulator = Simulator(task, threads, device)
@@ -127,14 +133,14 @@ class Trainer:
         sent = actions if self._disturbances is None else self._disturbances.delayed(actions, fresh)
         step = self._observed(self.episodes.step(sent))
         self.replay.add(actions, step)
-        if self.agent.normaliser is not None:
+        if self.agent.normaliser is not None and not self._begun:
             self.agent.normaliser.update(step.observations)
         taken = int((~fresh).sum())
         self.steps += taken
         if self.steps >= settings.start_steps:
             self._owed += taken * settings.updates_per_step
             while self._owed >= 1:
-                self.agent.update(self._batch())
+                self.agent.update(self._batch(), self.steps >= settings.actor_waits)
                 self._owed -= 1
 
     def policy(self) -> Policy:
@@ -179,10 +185,10 @@ class Trainer:
         return EpisodesState(at.theta, at.states, at.goals, at.observations, at.elapsed, at.derived, at.over)
 
     def _actions(self) -> FloatArray:
-        """(L, A): random ones at first, then the actor's with noise."""
+        """(L, A): random ones at first, where there is no policy to begin as, then the actor's with noise."""
         settings, task = self.settings, self.task
         size = (settings.lanes, task.num_actions)
-        if self.steps < settings.start_steps:
+        if self.steps < settings.start_steps and not self._begun:
             return self._noise.uniform(task.action_low, task.action_high, size)
         half = (task.action_high - task.action_low) / 2
         actions = self.agent.act((self._disturbances or self.episodes).observations)

@@ -18,6 +18,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.task import Solved, Task
 from sipe_bayes.inference import ESTIMATORS
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.models.policy import Policy
 from sipe_bayes.posterior import Dirac
 from sipe_bayes.rl.loop_run import LoopRun, Plan, solves
 from sipe_bayes.rl.policy_in_the_loop import CHECKPOINT, LoopResult, train_in_the_loop
@@ -151,6 +152,40 @@ def test_demonstrations_are_learnt_from_and_tell_runs_apart() -> None:
         assert sum(row.tobytes() in known for row in run.trainer._batch().actions.numpy()) >= 2  # of 8
     with pytest.raises(ValueError, match=r"demonstration_share: 0\.25 with demonstrations missing"):
         LoopRun(told(of), "default", plan, 1)
+
+
+def test_an_agent_begins_as_a_given_policy() -> None:
+    """It acts as that policy does, and stays it until the critic has learnt alone for a while."""
+    of, settings = task(), replace(SMALL, normalise=True, exploration=0.0, actor_waits=100)
+    rng = np.random.default_rng(0)
+    layers = tuple(
+        (rng.standard_normal((out, size)).astype(np.float32), rng.standard_normal(out).astype(np.float32))
+        for size, out in ((len(of.channels), 8), (8, 8), (8, of.num_actions))
+    )
+    moments = rng.uniform(0.5, 2, (2, len(of.channels))).astype(np.float32)
+    policy = Policy(of.name, layers, of.action_low, of.action_high, *moments)
+    run = LoopRun(told(of), "default", Plan(200, 2, 1, HORIZON, 1, settings), 1, policy=policy)
+    other = LoopRun(told(of), "default", Plan(200, 2, 1, HORIZON, 1, settings), 1)
+    assert run.fingerprint != other.fingerprint
+    run.iterate(None)  # 100 steps
+    replay = run.trainer.replay
+    rows = np.flatnonzero(replay.transition[:100, 0])
+    np.testing.assert_allclose(
+        replay.actions[rows, 0].numpy(), policy(replay.observations[rows, 0].numpy()), rtol=0, atol=1e-5
+    )
+    assert run.trainer.agent.updates > 0
+    kept = run.trainer.policy()
+    for (weight, bias), (own_weight, own_bias) in zip(policy.layers, kept.layers, strict=True):
+        np.testing.assert_array_equal(own_weight, weight)
+        np.testing.assert_array_equal(own_bias, bias)
+    run.iterate(None)
+    later = run.trainer.policy()
+    assert not np.array_equal(later.layers[0][0], policy.layers[0][0])
+    assert later.mean is not None
+    assert later.scale is not None
+    np.testing.assert_array_equal([later.mean, later.scale], moments)
+    with pytest.raises(ValueError, match=r"policy: expected layers .*normalise False .*take the settings"):
+        LoopRun(told(of), "default", Plan(200, 2, 1, HORIZON, 1, SMALL), 1, policy=policy)
 
 
 def test_budgets_follow_the_training() -> None:

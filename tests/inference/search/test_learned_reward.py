@@ -68,6 +68,19 @@ def test_the_truth_is_rewarded_above_wrong_thetas() -> None:
     assert (rewards[0] > rewards[1:]).all(), rewards
 
 
+def test_a_feature_that_stays_still_in_the_recording_tells_nothing_and_stops_nothing() -> None:
+    """As the object's velocities in a log in which the hand never touches it."""
+    bound = whole_state()
+    reward = LearnedReward(bound, RewardOptions(discriminator_updates=2))
+    reward.recorded[:, 0] = 0.7
+    made = reward.features(simulate(bound, np.random.default_rng(0).uniform(size=(3, 2))))
+    state = reward.train(trained(reward, made, 1), made)
+    rewards = reward(state, made)
+    assert np.isfinite(rewards).all(), rewards
+    made[..., 0] += 5.0
+    np.testing.assert_array_equal(reward(state, made), rewards)
+
+
 def test_starting_states_and_actions_need_not_match() -> None:
     """Six recordings.
 
