@@ -25,7 +25,7 @@ def test_windows_lead_through_impacts(seed: int, mass: float, stiffness: float) 
     estimator = Laplace(bouncing(), likelihood=StateSpace())
     logs = Trajectories.stack([replace(motion, states=None)])
     chain = estimator.bound(logs)
-    end = shot(estimator.problem, chain, np.full(3, 0.5), 2000)
+    end = shot(estimator.problem, chain, np.full(3, 0.5), [chain.reference], 2000)
     assert end is not None
     assert motion.states is not None
     apart = np.abs(end.states[:, 1] - motion.states[:, 1])
@@ -33,5 +33,5 @@ def test_windows_lead_through_impacts(seed: int, mass: float, stiffness: float) 
     assert np.abs(end.theta - theta)[:2].max() < 0.12
     assert apart.max() < 5e-3
     before = chain.rollouts
-    assert shot(estimator.problem, chain, np.full(3, 0.5), 5) is None
+    assert shot(estimator.problem, chain, np.full(3, 0.5), [chain.reference], 5) is None
     assert chain.rollouts <= before + 5
