@@ -8,7 +8,8 @@ something else than short ones.
 
 They may lead from a likelier place to a less likely one: what lines across a contact promise, a simulation of the
 states that they lead to need not keep, and the process noise grows to explain that. Some ways back down lead to a
-likelier place yet; where the search ends below the likeliest one, it ends there instead, once its noise has settled.
+likelier place yet; where the search ends below the likeliest one, it ends there instead, once its noise has settled, if
+a step promises no more than fitting the log's noise would.
 """
 
 from __future__ import annotations
@@ -117,13 +118,13 @@ class WideSearch(ChainSearch[S]):
         enough = max(tuning.settled, tuning.settled_each * float(linear.observed.sum()))
         value, best = evidence(self.problem, here, linear, estimate, settled=False), state.best_evidence
         still = here.steps > 0 and moved < tuning.still and value < best + enough
-        settled = gain < enough and (here.back or still)
+        settled = gain < enough and (given.promised < given.freedom if here.back else still)
         estimates = here.estimates + 1
         ends = settled or estimates >= tuning.most_estimates + here.back * tuning.last_estimates
         if ends and not here.back and recorded is not None and value < best - tuning.as_good:
             # steps have led on to where it is less likely: the noise is yet to settle where it was likeliest
             here = replace(here, theta=recorded.theta, states=recorded.states, noise=recorded.noise, back=True)
-            here = replace(here, phase=Phase.NOISE, estimates=tuning.most_estimates, estimate_theta=recorded.theta)
+            here = replace(here, phase=Phase.NOISE, estimates=tuning.most_estimates, steps=0)
             return state.at(here), solvable(linear, recorded.noise), False
         same = recorded is not None and np.array_equal(recorded.states, here.states)
         if value > best - settled * tuning.as_good or same or here.estimates == 0:
@@ -131,7 +132,7 @@ class WideSearch(ChainSearch[S]):
             optimum = replace(optimum, theta_step=here.theta_step, state_step=here.state_step)
             state = state.with_optimum(optimum)
         noise = replace(here.noise, sd=estimate.sd, process=estimate.process)
-        phase = Phase.NOISE if here.back or gain > given.promised else Phase.SMOOTH
+        phase = Phase.NOISE if here.back or gain > max(given.promised, enough) else Phase.SMOOTH
         here = replace(here, phase=phase, noise=noise, estimates=estimates, steps=0, estimate_theta=theta)
         return state.at(here), estimate, ends
 
