@@ -35,3 +35,19 @@ def test_windows_lead_through_impacts(seed: int, mass: float, stiffness: float) 
     before = chain.rollouts
     assert shot(estimator.problem, chain, np.full(3, 0.5), [chain.reference], 5) is None
     assert chain.rollouts <= before + 5
+
+
+def test_each_window_begins_at_the_states_that_it_follows_best_from() -> None:
+    """Beside states that are a metre off, before or after them, the measured ones lead where they lead alone."""
+    motion = bouncing_log(np.array([0.2, 0.8, 0.5]), 0)
+    estimator = Laplace(bouncing(), likelihood=StateSpace())
+    ends = []
+    for order in ([1], [0, 1], [1, 0]):
+        chain = estimator.bound(Trajectories.stack([replace(motion, states=None)]))
+        lifted = chain.reference.copy()
+        lifted[:, 1] += 1.0
+        end = shot(estimator.problem, chain, np.full(3, 0.5), [(lifted, chain.reference)[k] for k in order], 2000)
+        assert end is not None
+        ends.append(end.theta)
+    assert np.array_equal(ends[0], ends[1])
+    assert np.array_equal(ends[0], ends[2])
