@@ -35,6 +35,8 @@ from sipe_bayes.likelihood.state_space.linearisation import (
     ChainLinearisation,
     ChainNoise,
     eliminate_states,
+    expected_squares,
+    integrate,
     restricted,
 )
 
@@ -74,6 +76,14 @@ class NoisePosterior:
         return (
             restricted(self.linear, self.noise, self.hold)[0] - restricted(self.linear, self.noise, self.hold, True)[0]
         )
+
+    @property
+    def freedom(self) -> float:
+        """How many numbers of the log theta and states can follow: fitting its noise gains half as many nats."""
+        done = integrate(self.linear, self.noise, self.hold, held=True)
+        squares, _ = expected_squares(self.linear, done.solved, done.step, done.covariance)
+        spread = squares - self.linear.observed * self.linear.residual**2
+        return float((spread / self.noise.sd**2).sum())
 
     @cached_property
     def least(self) -> FloatArray:

@@ -5,6 +5,11 @@ length: one of them in a log outweighs all that the other steps say of a paramet
 what it should be. Differences as long as what is still open, with a variance for what no line can follow
 (``likelihood.state_space.differences``), do not see it. A search over a chain of states ends with them where they say
 something else than short ones.
+
+They may lead from a likelier place to a less likely one: what lines across a contact promise, a simulation of the
+states that they lead to need not keep, and the process noise grows to explain that. Some ways back down lead to a
+likelier place yet; where the search ends below the likeliest one, it ends there instead, once its noise has settled, if
+a step promises no more than fitting the log's noise would.
 """
 
 from __future__ import annotations
@@ -38,11 +43,13 @@ class WidePosition(Position):
         theta_step: (N,), of the next differences; short ones where all are zero.
         state_step: (K, D).
         estimate_theta: (N,), where the noise was estimated last.
+        back: whether the search has come back to where it was likeliest, for the noise to settle.
     """
 
     theta_step: FloatArray = field(default_factory=lambda: np.zeros(0))
     state_step: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     estimate_theta: FloatArray = field(default_factory=lambda: np.zeros(0))
+    back: bool = False
 
     @property
     def is_wide(self) -> bool:
@@ -70,10 +77,12 @@ class WideSearch(ChainSearch[S]):
         return self._stepped(state, linear, solvable(linear, state.here.noise))
 
     def wide_noise(self, state: S, linear: ChainLinearisation) -> S:
-        """An estimate of the noise, which may be worth recording, and a step."""
+        """An estimate of the noise, which may be worth recording, and a step unless the noise gains more."""
         state, noise, ends = self.estimated(state, linear)
         if ends:
             return state.next_point(self._begin)
+        if state.here.phase is Phase.NOISE:
+            return self.with_differences(state, linear, noise)
         try:
             return self._stepped(state, linear, noise)
         except BudgetExhausted:
@@ -98,7 +107,7 @@ class WideSearch(ChainSearch[S]):
             and whether the search from this starting point ends.
         """
         here, prior, tuning = state.here, self.problem.quadratic_prior, self.tuning.wide
-        theta, noise = here.theta, solvable(linear, here.noise)
+        theta, noise, recorded = here.theta, solvable(linear, here.noise), state.recorded
         # whether a step not yet taken is to be credited
         given = NoisePosterior(self.chain, linear, noise, prior, theta, here.movement, self.tuning.noise)
         estimate, gain = infer_noise(replace(given, held=given.promised > tuning.tolerance))
@@ -107,15 +116,24 @@ class WideSearch(ChainSearch[S]):
         away = theta - here.estimate_theta
         moved = float(away @ eliminate_states(linear, estimate).precision @ away) / len(theta)
         enough = max(tuning.settled, tuning.settled_each * float(linear.observed.sum()))
-        settled = here.estimates > 0 and gain < enough and moved < tuning.still
-        value = evidence(self.problem, here, linear, estimate, settled=False)
-        if value > state.best_evidence - settled * tuning.as_good or here.estimates == 0:
+        value, best = evidence(self.problem, here, linear, estimate, settled=False), state.best_evidence
+        still = here.steps > 0 and moved < tuning.still and value < best + enough
+        settled = gain < enough and (given.promised < given.freedom if here.back else still)
+        estimates = here.estimates + 1
+        ends = settled or estimates >= tuning.most_estimates + here.back * tuning.last_estimates
+        if ends and not here.back and recorded is not None and value < best - tuning.as_good:
+            # steps have led on to where it is less likely: the noise is yet to settle where it was likeliest
+            here = replace(here, theta=recorded.theta, states=recorded.states, noise=recorded.noise, back=True)
+            here = replace(here, phase=Phase.NOISE, estimates=tuning.most_estimates, steps=0)
+            return state.at(here), solvable(linear, recorded.noise), False
+        same = recorded is not None and np.array_equal(recorded.states, here.states)
+        if value > best - settled * tuning.as_good or same or here.estimates == 0:
             optimum = optimum_at(self.problem, state, linear, estimate, value, settled)
             optimum = replace(optimum, theta_step=here.theta_step, state_step=here.state_step)
             state = state.with_optimum(optimum)
         noise = replace(here.noise, sd=estimate.sd, process=estimate.process)
-        estimates, ends = here.estimates + 1, settled or here.estimates + 1 >= tuning.most_estimates
-        here = replace(here, phase=Phase.SMOOTH, noise=noise, estimates=estimates, steps=0, estimate_theta=theta)
+        phase = Phase.NOISE if here.back or gain > max(given.promised, enough) else Phase.SMOOTH
+        here = replace(here, phase=phase, noise=noise, estimates=estimates, steps=0, estimate_theta=theta)
         return state.at(here), estimate, ends
 
     def with_differences(self, state: S, linear: ChainLinearisation, noise: ChainNoise) -> S:

@@ -10,8 +10,8 @@
    search goes on; from the optimum without them the filter tries to make do without outliers, and where that is
    likelier the search goes on from there, until it comes to nothing likelier.
 5. WIDEN: where differences as long as the posterior is wide (``posterior_linearisation``) say something else of it than
-   short ones did, the search goes on with them; what these end in takes the optimum's place. Then the next starting
-   point.
+   short ones did, or the noise did not settle with these, the search goes on with them; what that ends in takes the
+   optimum's place. Then the next starting point.
 6. Where draws find that the best optimum is not the posterior's (``inference.importance.judged``), windows of the logs
    that grow (``shooting``) lead to further starting points.
 
@@ -136,11 +136,12 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         They begin at the best optimum's theta, then at the starting points.
         """
         chain, tuning = self.chain, self.tuning.shooting
-        begin = max(state.optima, key=lambda one: one.evidence).theta if not state.shots else state.points[0]
+        begin = max(state.optima, key=lambda one: one.evidence).theta
+        states = [chain.reference, *(one.states for one in state.optima)]
         state = replace(state, shots=state.shots + 1)
         judges = 2 * self.problem.options.tuning.importance.judges  # of two optima
         room = tuning.steps * self.wide_step_rollouts + judges * len(chain.trajectories)
-        end = shot(self.problem, chain, begin, chain.budget - chain.rollouts - room)
+        end = shot(self.problem, chain, begin, states, chain.budget - chain.rollouts - room)
         if end is None:
             return replace(state, uncounted=chain.uncounted)
         movement, fixed = chain.movement(end.states), chain.fixed_sd
@@ -294,7 +295,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
 
     def _widened(self, state: StateSpaceState) -> StateSpaceState:
         """From this starting point's optimum on with wide differences; or the next one where it has none."""
-        optimum = next((one for one in state.optima if one.point == state.point), None)
+        optimum = state.recorded
         if optimum is None:
             return state.next_point(self._begin)
         here = replace(state.here, phase=Phase.WIDEN, theta=optimum.theta, states=optimum.states, noise=optimum.noise)
@@ -308,8 +309,8 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
             return self.with_differences(state, linear, noise)
         solved = eliminate_states(linear, noise)
         mean, covariance = self.problem.normal(state.here.theta, solved.precision, solved.gradient)
-        short = next((one for one in state.optima if one.point == state.point), None)
-        if short is not None and short.resembles(mean, covariance, self.tuning.wide.alike):
+        short = state.recorded
+        if short is not None and short.settled and short.resembles(mean, covariance, self.tuning.wide.alike):
             return state.next_point(self._begin)
         return self.wide_noise(state, linear)
 

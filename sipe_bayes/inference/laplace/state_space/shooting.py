@@ -28,23 +28,27 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 
 
-def shot(problem: SearchProblem, chain: Chain, theta: FloatArray, budget: float) -> ChainPoint | None:
-    """Theta and states where the longest windows that follow the logs end, from theta (N,) and the measured states.
+def shot(
+    problem: SearchProblem, chain: Chain, theta: FloatArray, states: list[FloatArray], budget: float
+) -> ChainPoint | None:
+    """Theta and states where the longest windows that follow the logs end, from theta (N,).
+
+    Each window begins at the one of ``states``, (K, S) each, that it follows best from.
 
     None where none follows them, or ``budget``, rollouts for all of it, ends first.
     """
     tuning = problem.options.tuning
-    states, horizon, best, least = chain.reference, tuning.state_space.shooting.first, None, np.inf
+    horizon, best, least = tuning.state_space.shooting.first, None, np.inf
     limit = chain.rollouts + budget
     logs = Trajectories.stack([replace(t, states=None) for t in chain.trajectories])
     for seconds in _lengths(chain, tuning.state_space.shooting.window):
         settings = Segments(seconds, "white", chain.settings.fit, chain.settings.noise_sd)
         windows = bind(settings, chain.simulator, logs)
         windows.budget = limit - chain.rollouts
-        windows.reference = states[_rows(chain, windows)]
-        here = Position.at(windows, theta, tuning.damping, subset=False)
-        here = replace(here, phase=Phase.GROW, horizon=min(horizon, int(windows.steps.max())))
         try:
+            windows.reference = _best_starts(windows, theta, [one[_rows(chain, windows)] for one in states])
+            here = Position.at(windows, theta, tuning.damping, subset=False)
+            here = replace(here, phase=Phase.GROW, horizon=min(horizon, int(windows.steps.max())))
             while here.phase is Phase.GROW:
                 here = grown(windows, windows, problem.quadratic_prior, here, tuning.growing, tuning.damping)
             simulated, misfit = _simulated(chain, windows, here)
@@ -54,8 +58,8 @@ def shot(problem: SearchProblem, chain: Chain, theta: FloatArray, budget: float)
             chain.rollouts += math.ceil(windows.rollouts)
         if misfit > max(tuning.state_space.shooting.follows, least):
             return best  # chaos: longer ones follow no better
-        theta, states, horizon, least = here.theta, simulated, int(windows.steps.max()), min(misfit, least)
-        best = ChainPoint(theta, states)
+        theta, horizon, least = here.theta, int(windows.steps.max()), min(misfit, least)
+        best, states = ChainPoint(theta, simulated), [*states, simulated]
     return best
 
 
@@ -71,6 +75,18 @@ def _lengths(chain: Chain, first: int) -> Iterator[float | None]:
 def _rows(chain: Chain, windows: Windows) -> FloatArray:
     """Number (W,) of the chain's state where each window starts."""
     return np.asarray(np.flatnonzero(chain.first)[windows.log] + windows.start)
+
+
+def _best_starts(windows: Windows, theta: FloatArray, states: list[FloatArray]) -> FloatArray:
+    """Of first states (W, S) of the windows, for each window those from which a simulation follows it best."""
+    squares, scale = [], level(windows).sd
+    for one in states:
+        windows.reference = one
+        predicted, _ = windows.predict(theta[None], windows.no_starts()[None])
+        square = np.where(windows.observed, ((windows.measured - predicted[0]) / scale) ** 2, 0.0).sum((1, 2))
+        squares.append(np.where(np.isfinite(square), square, np.inf))
+    best = np.argmin(squares, axis=0)
+    return np.stack(states)[best, np.arange(len(best))]
 
 
 def _simulated(chain: Chain, windows: Windows, here: Position) -> tuple[FloatArray, float]:

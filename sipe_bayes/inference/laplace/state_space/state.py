@@ -149,9 +149,14 @@ class ChainState(StrategyState[P]):
     uncounted: float = 0.0
 
     @property
+    def recorded(self) -> ChainOptimum | None:
+        """This starting point's optimum; None before there is one."""
+        return next((one for one in self.optima if one.point == self.point), None)
+
+    @property
     def best_evidence(self) -> float:
-        """Of this starting point's optimum; minus infinity before there is one."""
-        return max((one.evidence for one in self.optima if one.point == self.point), default=-np.inf)
+        """Its evidence; minus infinity before there is one."""
+        return -np.inf if self.recorded is None else self.recorded.evidence
 
     def with_optimum(self, optimum: ChainOptimum) -> Self:
         """With an optimum in place of the earlier one of its starting point."""

@@ -22,6 +22,7 @@ from sipe_bayes.likelihood.state_space.process_noise import process_noise_findin
 from tests.problems.hung import hung, hung_log
 from tests.problems.pendulums import log as pendulum_log
 from tests.problems.pendulums import pendulum
+from tests.problems.springs import MADE_WITH, spring, spring_logs
 
 
 def test_noise_that_rounding_cannot_bear_is_raised() -> None:
@@ -90,3 +91,32 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
     assert [item.code for item in findings["right"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_SMALL]
     assert [item.code for item in findings["wrong"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_LARGE]
     assert "of hinge" in findings["wrong"][0].text
+
+
+def test_freedom_is_what_dense_algebra_says() -> None:
+    """The trace of the measurements' hat matrix, all states and theta in one dense system."""
+    simulator = spring()
+    chain = bind(StateSpace(), simulator, Trajectories.stack(spring_logs(steps=20)))
+    theta, tuning = np.array([0.4]), NoiseTuning()
+    linear = linearise(chain, theta, chain.reference)
+    assert linear is not None
+    prior = QuadraticPrior(np.full(1, 0.5), np.full((1, 1), 12.0))
+    given = NoisePosterior(chain, linear, MADE_WITH, prior, theta, chain.movement(chain.reference), tuning)
+    (count, d), n = linear.offset.shape, 1
+    measured = np.zeros((count, d * count + n))
+    rows = [np.sqrt(np.diag(linear.precision.ravel())) @ np.eye(d * count, d * count + n)]
+    for k in range(count):
+        measured[k, d * k : d * k + d] = linear.measurement[k, 0] / MADE_WITH.sd
+        measured[k] *= linear.observed[k, 0]
+    for k in np.flatnonzero(linear.linked):
+        jump = np.zeros((d, d * count + n))
+        jump[:, d * (k + 1) : d * (k + 2)] = np.eye(d)
+        jump[:, d * k : d * (k + 1)] = -linear.transition[k]
+        jump[:, -n:] = -linear.transition_theta[k]
+        rows.append(jump / MADE_WITH.process[:, None])
+    every = np.concatenate([measured, *rows])
+    normal = every.T @ every
+    normal[-n:, -n:] += given.hold.precision
+    expected = np.trace(measured @ np.linalg.solve(normal, measured.T))
+    print(given.freedom, expected)
+    assert given.freedom == pytest.approx(expected, rel=1e-6)

@@ -1,4 +1,4 @@
-"""A search ends with wide differences, and says where its starts exclude one another."""
+"""A search ends with wide differences, where it was likeliest, and says where its starts exclude one another."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.state_space import search
-from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
+from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior
+from sipe_bayes.inference.laplace.state_space.search import SmoothingPosition, StateSpaceSearch, StateSpaceState
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, Phase, contradiction
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space import differences
 from tests.problems.springs import spring, spring_logs
@@ -46,6 +49,42 @@ def test_a_jump_within_a_short_difference_leaves_the_interval_as_it_is(monkeypat
     assert optimum.state_step.any()
     assert same == pytest.approx(sd, rel=0.2)
     assert abs(optimum.mean[0] - plain.mean[0]) < 0.3 * sd
+
+
+@pytest.mark.parametrize("freedom", [None, 0.0])
+def test_a_search_that_ends_below_its_likeliest_place_goes_back(
+    freedom: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There the noise settles, unless a step would gain more than fitting noise: as where there is nothing to fit."""
+    best, _ = fitted()
+    estimator = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
+    chain = estimator.bound(Trajectories.stack(spring_logs()))
+    alternate = np.where(np.arange(len(best.states)) % 2, 1.0, -1.0)[:, None] * np.array([1.0, 0.0])
+    recorded = replace(best, settled=False)
+    method = StateSpaceSearch(estimator.problem, chain)
+    elsewhere = SmoothingPosition(
+        phase=Phase.NOISE,
+        theta=best.theta,
+        states=chain.moved(best.states, 0.5 * alternate),
+        noise=best.noise,
+        movement=best.movement,
+        damping=1e-4,
+        estimates=method.tuning.wide.most_estimates - 1,
+        steps=3,
+        theta_step=np.full(1, 0.01),
+        state_step=np.full((len(best.states), 2), 0.01),
+        estimate_theta=best.theta,
+        refused=np.zeros(len(best.outliers), bool),
+    )
+    state = StateSpaceState(best.theta[None], 0, elsewhere, (recorded,), regressed=np.empty((0, 1)))
+    if freedom is not None:
+        monkeypatch.setattr(NoisePosterior, "freedom", freedom)
+    while not state.done:
+        state = method.step(state)
+    (optimum,) = state.optima
+    print(optimum.evidence, recorded.evidence, optimum.settled)
+    assert np.array_equal(optimum.states, recorded.states)
+    assert optimum.settled == (freedom is None)
 
 
 def test_starts_that_exclude_one_another_contradict() -> None:

@@ -25,7 +25,7 @@ def test_windows_lead_through_impacts(seed: int, mass: float, stiffness: float) 
     estimator = Laplace(bouncing(), likelihood=StateSpace())
     logs = Trajectories.stack([replace(motion, states=None)])
     chain = estimator.bound(logs)
-    end = shot(estimator.problem, chain, np.full(3, 0.5), 2000)
+    end = shot(estimator.problem, chain, np.full(3, 0.5), [chain.reference], 2000)
     assert end is not None
     assert motion.states is not None
     apart = np.abs(end.states[:, 1] - motion.states[:, 1])
@@ -33,5 +33,21 @@ def test_windows_lead_through_impacts(seed: int, mass: float, stiffness: float) 
     assert np.abs(end.theta - theta)[:2].max() < 0.12
     assert apart.max() < 5e-3
     before = chain.rollouts
-    assert shot(estimator.problem, chain, np.full(3, 0.5), 5) is None
+    assert shot(estimator.problem, chain, np.full(3, 0.5), [chain.reference], 5) is None
     assert chain.rollouts <= before + 5
+
+
+def test_each_window_begins_at_the_states_that_it_follows_best_from() -> None:
+    """Beside states that are a metre off, before or after them, the measured ones lead where they lead alone."""
+    motion = bouncing_log(np.array([0.2, 0.8, 0.5]), 0)
+    estimator = Laplace(bouncing(), likelihood=StateSpace())
+    ends = []
+    for order in ([1], [0, 1], [1, 0]):
+        chain = estimator.bound(Trajectories.stack([replace(motion, states=None)]))
+        lifted = chain.reference.copy()
+        lifted[:, 1] += 1.0
+        end = shot(estimator.problem, chain, np.full(3, 0.5), [(lifted, chain.reference)[k] for k in order], 2000)
+        assert end is not None
+        ends.append(end.theta)
+    assert np.array_equal(ends[0], ends[1])
+    assert np.array_equal(ends[0], ends[2])
