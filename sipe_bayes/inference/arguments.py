@@ -19,9 +19,14 @@ def check_simulator(given: object) -> None:
         )
 
 
+def without_likelihood(simulator: object) -> bool:
+    """Whether only simulating can tell what the log says: a function that makes its own noise, or states none."""
+    return isinstance(simulator, CallableSimulator) and simulator.noise_sd is None
+
+
 def check_comparison(simulator: object, likelihood: object, progress: object, name: str, searches: bool) -> None:
     """Raise ValueError for a likelihood that the method called ``name`` does not take, or no function of progress."""
-    if searches and isinstance(simulator, CallableSimulator) and simulator.noise_sd is None:
+    if searches and without_likelihood(simulator):
         raise ValueError(
             f"likelihood: {name} needs one; make CallableSimulator(fn, space, likelihood=sd of the noise), or use npe"
         )

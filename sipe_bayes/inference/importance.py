@@ -54,6 +54,7 @@ class ImportanceTuning(Options):
     share: float = option(0.1, "share of later ones: bounds the weights", above=0, below=1)
     first_wider: float = option(1.5, "width of the first proposal over the normal's", above=0)
     wider: float = option(0.3, "by how much wider than the draws' later ones are, over the root of N", above=0)
+    elsewhere: float = option(3.0, "by which a draw is better than an optimum that is none", "nats", above=0)
     enough: float = option(100.0, "effective draws with which it ends", above=1)
     least: float = option(30.0, "effective draws that may be relied on", above=1)
     judges: int = option(120, "draws that judge a normal: 33 of them are the tail that its k is fitted to", least=40)

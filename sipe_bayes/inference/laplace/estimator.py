@@ -218,10 +218,14 @@ class Laplace(Estimator[LaplaceState]):
         return replace(state, search=search, judgements=tuple(judgements))
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
-        """One more batch of draws, as long as they promise something and the budget lasts."""
+        """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
         kept, tuning, n = distinct(state.search.optima), self.options.tuning.importance, len(self.space)
         normal, target = mixture([merged(kept)], self.space), self._target(windows, kept[0])
         draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
+        if draws.values.max() > target(kept[0].theta[None])[0] + tuning.elsewhere:
+            search = WindowSearch(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
+            if search is not None:
+                return replace(state, search=search, draws=None)
         effective = importance.effective(importance.weights(draws, self.prior))
         hopeless = draws.batches >= tuning.hopeless_after and effective < draws.batches
         done = effective >= tuning.enough or draws.batches >= tuning.most_batches or hopeless

@@ -28,6 +28,8 @@ class PatternTuning(Options):
     )
     open_sd: float = option(0.5, "sd from which a direction counts as open, and is cut", "of the cube", above=0)
     better: float = option(0.5, "a difference that counts", "nats", above=0)
+    deepest: float = option(4.5, "fall of points that the normal is held against: three of its sds", "nats", above=0.5)
+    believed: float = option(2.0, "fall that the normal foretells, over theirs, with which it stands", above=1)
     saddle: float = option(1.0, "how much worse points between two of one optimum may be", "nats", above=0)
     smooth: float = option(3.0, "distance up to which a simulation is looked at for being smooth", "sd", above=0)
     least_rise: float = option(0.6, "a rise, over that of the normal, with which it is", above=0, below=1)
@@ -44,7 +46,8 @@ class Surroundings:
     Args:
         better: (N,), the best point, if better than the optimum.
         covariance: (N, N), the optimum's, at least ``SHORTEST`` and wide enough for every point that fits better, or as
-            well with no worse ones in between, or as well in a simulation that is rough at every scale.
+            well with no worse ones in between, or as well in a simulation that is rough at every scale; and for points
+            that fall by far less than the normal foretells, as a difference across a jump is no slope.
         other: (N,), a point that fits as well, but apart.
         rough: whether the simulation is rough at every scale.
         heavier: whether places that the normal all but excludes fit nearly as well.
@@ -112,29 +115,31 @@ def pattern_search(
     if values[best] < values[0] - tuning.better - luck:
         return Surroundings(trials[best], _holding(wide, trials[best] - theta), None)
     level = values[0] + luck
-    due = np.minimum(_foretold(trials - theta, wide), tuning.excluded)
-    heavier = bool((values - values[0] + tuning.better < tuning.least_rise * (due + tuning.better)).any())
     if rough:
         ways = np.concatenate([k * np.eye(size) for k in tuning.between * _LENGTHS[1:]])
         more = np.clip(theta + np.concatenate([ways, -ways]), 0, 1)
         trials, values = np.concatenate([trials, more]), np.concatenate([values, energies(more)])
-    # the ways to what fits as well, the farthest first
-    good = trials[values < level + tuning.better] - theta
-    distance = np.einsum("bn,bn->b", good, np.linalg.solve(wide, good.T).T)
-    good = good[np.argsort(-distance)][: int((distance > 1).sum())]
+    # where along each way one sd would be, if its end falls as a normal does; those farthest outside first
+    fall = np.maximum(values - level, tuning.better)
+    ways = (trials - theta) / np.sqrt(fall / tuning.better)[:, None]
+    distance = np.einsum("bn,bn->b", ways, np.linalg.solve(wide, ways.T).T)
+    as_good = fall <= tuning.better
+    outside = np.where(as_good, distance > 1, (distance > tuning.believed) & (fall <= tuning.deepest) & (not rough))
+    chosen = np.flatnonzero(outside)[np.argsort(-distance[outside])]
     if rough:
-        for way in good:
+        for way in ways[chosen]:
             wide = _holding(wide, way)
         return Surroundings(None, wide, None, rough)
-    good = good[:size]
-    if not len(good):
-        return Surroundings(None, wide, None, heavier=heavier)
+    chosen = chosen[:size]
     # half-way points say whether it is one optimum
-    one = energies(theta + 0.5 * good) < level + tuning.saddle
-    for way in good[one]:
+    half_way = energies(theta + 0.5 * (trials[chosen] - theta)) if len(chosen) else np.zeros(0)
+    one = half_way < level + np.maximum(tuning.saddle, fall[chosen])
+    for way in ways[chosen[one]]:
         wide = _holding(wide, way)
-    others = good[~one]
-    return Surroundings(None, wide, theta + others[0] if len(others) else None, heavier=heavier)
+    others = trials[chosen[~one & as_good[chosen]]]
+    due = np.minimum(_foretold(trials - theta, wide), tuning.excluded)
+    heavier = bool((values - values[0] + tuning.better < tuning.least_rise * (due + tuning.better)).any())
+    return Surroundings(None, wide, others[0] if len(others) else None, heavier=heavier)
 
 
 def _smooth(ways: FloatArray, values: FloatArray, covariance: FloatArray, tuning: PatternTuning) -> bool:

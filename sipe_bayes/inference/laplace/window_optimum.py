@@ -207,7 +207,7 @@ def judged(
         reason = reason or finding(Code.NOT_LOOKED_AROUND)
     if around is None and ending.bettered is not None:
         covariance = covariance + ending.bettered.covariance
-    guessed = not windows.num_start and ((ending.cut_short and not ending.settled) or unsmooth)
+    guessed = (ending.cut_short and not ending.settled) or (unsmooth and not windows.num_start)
     guessed = guessed or (around is not None and around.rough)
     if guessed:
         left = misfit(windows, ending.residual) / ending.first_misfit

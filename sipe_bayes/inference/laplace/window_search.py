@@ -1,10 +1,10 @@
 """The search over windows, from starting point to recorded optimum, in phases.
 
 Simulations are what a fit costs, so they are spared where they add nothing. Where the log tells the windows' starts,
-theta moves alone first, on every other window, until a step gains little. The Jacobian of the starts is kept as long as
-it foretells the gain of a step to a fifth; an optimum is only accepted where what was foretold since it was taken is
-wrong by less than half a nat. A later starting point is dropped once the search has all but come to an optimum that is
-already known.
+theta moves alone first, on every other window, until a step gains little; not through contact, where starting points
+are at rest on all windows already. The Jacobian of the starts is kept as long as it foretells the gain of a step to a
+fifth; an optimum is only accepted where what was foretold since it was taken is wrong by less than half a nat. A later
+starting point is dropped once the search has all but come to an optimum that is already known.
 
 Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ
 from place to place, and the place would otherwise be an accident of the start.
@@ -22,11 +22,11 @@ optimum, whatever the curvature says; one that fits as well but lies beyond wors
 Where already the shortest way leads to a far worse fit, the optimum is a stroke of luck: then its neighbours say how
 large the noise is and what fits as well, and a finding says so.
 
-Where theta alone is searched and the budget ends before the first optimum, what is kept of it is spent on such a look
-at the best point so far. Of that, of an optimum where no step found the gain that its linearisation foretold, and of
-one that is a stroke of luck, the normal says nothing; its sd is guessed: the way from the starting point (root mean
-square over theta), times the share of the first misfit that is left, as a misfit that is theta's shrinks with the
-distance.
+Where the budget ends before the first optimum, the best point so far is recorded in its place; where theta alone is
+searched, what is kept of the budget is spent on such a look around it. Of that point, and, where theta alone is
+searched, of an optimum where no step found the gain that its linearisation foretold and of one that is a stroke of
+luck, the normal says nothing; its sd is guessed: the way from the starting point (root mean square over theta), times
+the share of the first misfit that is left, as a misfit that is theta's shrinks with the distance.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.contact_starts import starting_points
+from sipe_bayes.inference.laplace.contact_starts import begins_in_contact, starting_points
 from sipe_bayes.inference.laplace.growing_windows import (
     ManyStarts,
     counted,
@@ -140,12 +140,10 @@ class WindowSearch:
         """A step on beginnings of the windows, or of a group of them; see ``growing_windows``."""
         tuning, prior, before = self._tuning, self.problem.quadratic_prior, state.here
         if before.group is None:
-            state = replace(
-                state, here=grown(self.windows, self.windows, prior, before, tuning.growing, tuning.damping)
-            )
+            here = grown(self.windows, self.windows, prior, before, tuning.growing, tuning.damping)
+            state = replace(state, here=here)
             return self._next(state) if state.here.phase is not Phase.GROW and state.known else state
-        count = num_groups(self.windows, tuning.growing)
-        part = group(self.windows, before.group, count)
+        part = group(self.windows, before.group, count := num_groups(self.windows, tuning.growing))
         here = grown(self.windows, part, prior, before, tuning.growing, tuning.damping)
         if here.phase is Phase.GROW:
             return replace(state, here=here)
@@ -170,10 +168,17 @@ class WindowSearch:
         unknown = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
         return replace(onward, optima=tuple(replace(optimum, finding=unknown) for optimum in state.optima))
 
+    def onward(self, state: WindowState, theta: FloatArray) -> WindowState | None:
+        """A search that had ended, from a better place (N,); None where it has had enough, or no budget is left."""
+        if len(state.points) >= self._tuning.windows.most_points or self._leaves_no_room():
+            return None
+        points, here = np.concatenate([state.points, theta[None]]), self._begin(theta)
+        return replace(state, points=points, point=len(state.points), here=here, done=False)
+
     def _scout(self, state: WindowState) -> WindowState:
         """Further starting points, from which the search goes on."""
-        more = scouted(self.problem, self.windows, state.optima)
-        return self._next(replace(state, points=np.concatenate([state.points, more]), scouted=True))
+        points = np.concatenate([state.points, scouted(self.problem, self.windows, state.optima)])
+        return self._next(replace(state, points=points, scouted=True))
 
     def _apart(self, number: int, state: WindowState) -> Position:
         """Where a group of windows is fitted from: the best optimum's theta, and starts of its own."""
@@ -204,7 +209,7 @@ class WindowSearch:
         point = fit.point or point
         least = tuning.subset_gain if foretold(fit, tuning) else tuning.subset_gain_unforetold
         again = not fit.converged and fit.gained > least * linearised.energy
-        again = again and here.iteration + 1 < tuning.most_steps // 4
+        again = again and here.iteration + 1 < tuning.most_steps // 4 and not self._leaves_no_room()
         here = replace(
             here,
             phase=Phase.SUBSET if again else Phase.WHOLE,
@@ -237,9 +242,8 @@ class WindowSearch:
         noise, moments = present_noise(self.windows, lin.residual), self.windows.moments(lin, white=True)
         step, converged = self._stepped(state, lin, moments, noise, stale, drift)
         last = step.after.iteration >= self._tuning.windows.most_steps // 2
-        return self._continued(
-            state, step, Phase.NOISE if converged else Phase.DESCEND if last else Phase.ROUGH, settled=False
-        )
+        phase = Phase.NOISE if converged else Phase.DESCEND if last else Phase.ROUGH
+        return self._continued(state, step, phase, settled=False)
 
     def _descend(self, state: WindowState) -> WindowState:
         """A step with the noise as it was estimated last."""
@@ -290,7 +294,7 @@ class WindowSearch:
         try:
             fit = descend(linearised, here.damping, tolerance, self._tuning.damping, stale)
         except BudgetExhausted:
-            if not self._unrecorded(state):
+            if state.optima:  # else the budget leaves room for one
                 raise
             windows.short = True
             fit, cut_short = Descent(None, linearised.energy, here.damping), True
@@ -319,7 +323,7 @@ class WindowSearch:
         """On to the next step; or, where the search stands still or has to end, an optimum."""
         after = replace(step.after, phase=phase)
         onward = replace(state, here=after)
-        ends = self._unrecorded(state) and (step.cut_short or self._leaves_no_room())
+        ends = not state.optima and (step.cut_short or self._leaves_no_room())
         if settled or ends or after.iteration >= self._tuning.windows.most_steps:
             return self._recorded(onward, state.here, step, settled, ends)
         return self._next(onward) if not after.revisits and onward.known else onward
@@ -351,7 +355,8 @@ class WindowSearch:
             bettered=state.optima[-1] if here.patterns else None,
         )
         optimum = widened(self.problem, windows, ending)
-        further = None if here.centred else middle_of_ridge(self.problem, windows, optimum)
+        centred = here.centred or cut_short
+        further = None if centred else middle_of_ridge(self.problem, windows, optimum)
         if further is not None:
             return replace(state, here=replace(here.afresh(tuning.damping), theta=further, centred=True))
         searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
@@ -372,24 +377,20 @@ class WindowSearch:
 
     def _begin(self, theta: FloatArray, subset: bool = True) -> Position:
         """At a starting point theta (N,); subset: whether every other window may be tried first."""
-        subset = subset and self.windows.starts_measured
+        subset = subset and self.windows.starts_measured and not begins_in_contact(self.windows)
         here = Position.at(self.windows, theta, self._tuning.damping, subset)
         if not grows(self.windows):
             return here
         return first_beginnings(self.windows, here, self._tuning.growing)
 
-    def _unrecorded(self, state: WindowState) -> bool:
-        """Whether theta alone is searched and no optimum is known yet, so that the budget must leave room for one."""
-        return not self.windows.num_start and not state.optima
-
     def _leaves_no_room(self) -> bool:
         """Whether the budget has no room for another step, and where there is still some, for a look around."""
         windows, tuning = self.windows, self._tuning
-        step = windows.num_theta + tuning.windows.trials
-        look = pattern_size(windows.num_theta, tuning.pattern)
+        step = windows.num_theta + windows.num_start + tuning.windows.trials
+        look = 0 if windows.num_start else pattern_size(windows.num_theta, tuning.pattern)
         cost = look * len(windows.trajectories)
         looks = 2 * cost < windows.budget and windows.rollouts + cost <= windows.budget
-        return not windows.has_room(step + look if looks else step)
+        return not windows.has_room(step + looks * look)
 
     @property
     def _tuning(self) -> LaplaceTuning:

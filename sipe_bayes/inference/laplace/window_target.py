@@ -83,7 +83,7 @@ class WindowTarget(Target):
         self.prior, self.windows, self.fit = prior, windows, fit
         self.noise = Noise(fit.optimum.sd, fit.optimum.tau)
         silent = beyond_rounding(windows, self.noise).sd
-        self.silent = bool((silent > self.noise.sd).any())  # residuals of rounding are no evidence
+        self.silent = bool((silent > self.noise.sd).all())  # residuals of rounding are no evidence
         least = np.where(silent > self.noise.sd, silent, windows.rounding)
         self.least_sd = np.where(np.isnan(windows.fixed_sd), least, 0.0)
 
