@@ -219,6 +219,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
+        assert isinstance(state.search, WindowState)
         kept, tuning, n = distinct(state.search.optima), self.options.tuning.importance, len(self.space)
         normal, target = mixture([merged(kept)], self.space), self._target(windows, kept[0])
         draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
