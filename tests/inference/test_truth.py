@@ -12,7 +12,7 @@ from sipe_bayes.inference import get_estimator
 from tests.problems import quick
 from tests.problems.linear_gaussian import carts_problem, function_problem, squared_function, squared_rod
 
-SMALL = {**quick.SMALL, "bayessim": {"components": 2}}
+SMALL = {**quick.SMALL, "bayessim": {"components": 2, "calibration": 0.0}}
 
 
 @pytest.mark.parametrize("name", ["laplace", "mcmc", "npe", "bayessim"])

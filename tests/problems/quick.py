@@ -12,18 +12,20 @@ SEARCH = {"budget": 40, "batch": 8, "pool": 64, "growth": 3.0, "effective_draws"
 
 FORM: Settings = {
     "bayesopt": SEARCH,
-    "bayessim": {"components": 2, "training": Training(epochs=40)},
+    "bayessim": {"components": 2, "training": Training(epochs=40), "calibration": 0.0},
     "maml": {"iterations": 20, "tasks": 3},
     "mcmc": {"budget": 300},
-    "npe": {"max_epochs": 10, "transforms": 1, "hidden": 16},
+    "npe": {"max_epochs": 10, "transforms": 1, "hidden": 16, "calibration": 0.0},
     "regression": {"iterations": 2000},
 }
 """Where only form counts."""
 
 SMALL: Settings = {
     "bayesopt": SEARCH,
+    "bayessim": {"calibration": 0.0},
     "maml": {"iterations": 100},
     "npe": {
+        "calibration": 0.0,
         "embedding": "none",
         "transforms": 2,
         "hidden": 24,

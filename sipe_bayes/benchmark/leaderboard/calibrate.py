@@ -32,7 +32,6 @@ from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import Posterior
 
 NAME = "calibrate"
-_HELD_BACK = 0.2  # of the simulations, as docs/trust.md advises
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class Calibrate:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self._amortised = OwnMethod("npe", seed, calibration=_HELD_BACK)
+        self._amortised = OwnMethod("npe", seed)
 
     def __call__(self, task: Task, problem: Problem, case: Case) -> Estimate:
         """See ``Method``."""

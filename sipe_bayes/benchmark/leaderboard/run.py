@@ -182,16 +182,15 @@ def draws_of(seed: int, problem: Problem, case: Case) -> torch.Generator:
 
 
 class OwnMethod:
-    """One of the library's estimators with the task's budget, prior and likelihood.
+    """One of the library's estimators with its defaults, and the task's budget, prior and likelihood.
 
     Args:
         name: of ``sipe_bayes.inference.registry``, or "prior".
         seed: of the estimator and the draws.
-        **options: of the estimator, in place of its defaults.
     """
 
-    def __init__(self, name: str, seed: int, **options: object) -> None:
-        self.name, self.seed, self.options = name, seed, options
+    def __init__(self, name: str, seed: int) -> None:
+        self.name, self.seed = name, seed
         if name != PRIOR:
             estimator_class(name)  # raises for an unknown one
         self._trained: tuple[str, Estimator] | None = None
@@ -221,7 +220,6 @@ class OwnMethod:
             budget=task.budget,
             seed=self.seed,
             **(settings if method.searches else {}),
-            **self.options,
         )
         if method.amortised and isinstance(problem.simulator, CallableSimulator):
             self._trained = task.name, estimator

@@ -39,9 +39,9 @@ from sipe_bayes.posterior.flow import to_line
 from sipe_bayes.posterior.quantile_mapped import mapped
 
 DRAWS = 500  # of each simulation's posterior
-_KEPT = 4000  # draws of the log's own
+_KEPT = 20000  # draws of the log's own
 _LEVELS = np.arange(1, 100) / 100
-_KNOTS = np.linspace(ndtri(_LEVELS[0]), ndtri(_LEVELS[-1]), 25)  # t that the maps go through; scores jump between more
+_KNOTS = np.linspace(ndtri(_LEVELS[0]), ndtri(_LEVELS[-1]), 25)  # t that G goes through; scores jump between more
 _APART = 1e-9  # of points that a map goes through, in z
 _NEAREST, _SHARE = 100, 0.5  # simulations that count at least, and as a share of all
 _DEFAULT = 0.2  # of the simulations
@@ -76,8 +76,8 @@ class HeldBack:
         quantiles = _quantiles(theta)
         weights, before, after = self._weights(quantiles[len(_LEVELS) // 2]), [], []
         for j, q in enumerate(quantiles.T):
-            t = _through(*self._distribution(j, weights), _KNOTS)
-            before.append(_through(ndtri(_LEVELS), q, _KNOTS))
+            t = _through(_KNOTS, _through(*self._distribution(j, weights), _KNOTS), ndtri(_LEVELS))
+            before.append(q)
             after.append(_through(ndtri(_LEVELS), q, t))
         ends = [torch.from_numpy(_apart(np.stack(points, axis=1))) for points in (before, after)]
         if not posterior.has_density:
@@ -109,7 +109,7 @@ class HeldBackOptions(Options):
     calibration: float | None = option(
         None,
         "share of the simulations that is not trained on and mends the posteriors' widths; default a fifth, where that "
-        "is ten or more",
+        "is a hundred or more",
         least=0,
         below=1,
     )
@@ -121,7 +121,7 @@ def parted(simulations: Simulations, options: Options) -> tuple[Simulations, Sim
         return simulations, simulations[:0]
     share = options.calibration
     if share is None:
-        share = _DEFAULT if _DEFAULT * len(simulations) >= THRESHOLDS.few_valid else 0.0
+        share = _DEFAULT if _DEFAULT * len(simulations) >= _NEAREST else 0.0
     count = int(share * len(simulations))
     if share and count < THRESHOLDS.few_valid:
         raise ValueError(

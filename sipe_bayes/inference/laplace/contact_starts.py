@@ -161,7 +161,8 @@ def _attempt(
                 continue
             robust = _rest(problem, windows, first, limit, point, widest, robust=True)
             if robust is not None:
-                rests = _with(rests, _rest(problem, windows, first, limit, robust.theta, robust.sd))
+                widths = np.minimum(robust.sd, widest)
+                rests = _with(rests, _rest(problem, windows, first, limit, robust.theta, widths))
         for horizon in plan.horizons[1:]:
             before, after = rests[: max(problem.options.restarts, len(rests) // 2)], list[_Rest]()
             for one in before:

@@ -379,9 +379,7 @@ class WindowSearch:
         """At a starting point theta (N,); subset: whether every other window may be tried first."""
         subset = subset and self.windows.starts_measured and not begins_in_contact(self.windows)
         here = Position.at(self.windows, theta, self._tuning.damping, subset)
-        if not grows(self.windows):
-            return here
-        return first_beginnings(self.windows, here, self._tuning.growing)
+        return first_beginnings(self.windows, here, self._tuning.growing) if grows(self.windows) else here
 
     def _leaves_no_room(self) -> bool:
         """Whether the budget has no room for another step, and where there is still some, for a look around."""

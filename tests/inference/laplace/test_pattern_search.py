@@ -33,12 +33,21 @@ def test_a_smooth_optimum_is_looked_at_in_a_third_of_the_points() -> None:
     assert points < 0.4 * full
 
 
-def test_places_that_the_normal_excludes_and_that_fit_are_seen() -> None:
-    """A valley of the normal's width in a trough ten times as wide."""
+def test_a_trough_around_a_narrow_valley_widens_the_normal() -> None:
+    """A valley of the normal's width in a trough ten times as wide: half of its width, at the least."""
     seen, points = looked(lambda z: np.minimum(0.5 * (z**2).sum(1), 1.5 + 0.005 * (z**2).sum(1)))
+    assert (np.sqrt(np.diag(seen.covariance)) > 5 * SD).all()
+    assert (seen.better, seen.other, seen.rough, seen.heavier) == (None, None, False, False)
+    assert points > 0.4 * pattern_size(2, PatternTuning())
+
+
+def test_a_place_apart_that_the_normal_excludes_and_that_fits_is_seen() -> None:
+    """A second valley, two nats worse: no wider normal holds both."""
+    apart = np.array([10.0, 0.0])
+    seen, _ = looked(lambda z: np.minimum(0.5 * (z**2).sum(1), 2 + 0.5 * ((z - apart) ** 2).sum(1)))
     assert seen.heavier
     assert seen.better is None
-    assert points > 0.4 * pattern_size(2, PatternTuning())
+    np.testing.assert_allclose(seen.covariance, COVARIANCE, rtol=1e-6)
 
 
 def test_a_better_place_ends_the_look() -> None:
