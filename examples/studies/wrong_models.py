@@ -22,6 +22,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from _kept import fits, keep
 from discover import DT, MACHINES, commands, plain, values
 
 import sipe_bayes as sipe
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.agreement import disagreement, linear_estimates, parts_of
@@ -96,8 +98,8 @@ def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndar
     return simulator, truth, Trajectories.stack(logs)
 
 
-def fitted(name: str, effect: str, seed: int, unknown: bool) -> dict[str, Any]:
-    """One fit, as a row."""
+def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
+    """One fit, a row for each library: with the effect in it and, where there is one, without."""
     simulator, truth, logs = recorded(name, effect, seed)
     method, began = Laplace(simulator, seed=seed), time.process_time()
     posterior = method.fit(logs)
@@ -107,29 +109,32 @@ def fitted(name: str, effect: str, seed: int, unknown: bool) -> dict[str, Any]:
     starts = method.fitted_starts(theta)
     assert starts is not None
     lin, parts = windows.linearise(theta, starts), parts_of(windows)
-    with mock.patch("sipe_bayes.structure.probes.EXTENSIONS", [e for e in EXTENSIONS if not (unknown and e == effect)]):
-        probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(method.prior), lin)
-    seen = misfit(probed, posterior.stddev.numpy(), seed)
     alone = linear_estimates(windows, theta, starts, noise, lin, parts)
     conflict = disagreement(simulator.space, alone)
-    missing = missing_physics(probed, method.prior, seed)
-    alarm = seen.alarm or conflict is not None
     spread = random_effects(alone, method.prior, seed).new_log
-    assert missing is not None  # with six logs
-    kinds = dict(zip(KINDS, (posterior, spread, missing.further), strict=False))
-    return {
-        "machine": name,
-        "effect": effect,
-        "seed": seed,
-        "unknown": unknown,
-        "alarm": alarm,
-        "truth": truth.tolist(),
-        "ends": {kind: ends(p) for kind, p in kinds.items()},
-        "causes": list(missing.causes),
-        "explained": missing.explained,
-        "fit_s": round(fit_s, 1),
-        "checks_s": round(time.process_time() - began - fit_s, 1),
-    }
+    for unknown in (False, True)[: 1 if effect == "null" else 2]:
+        began = time.process_time()
+        library = [e for e in EXTENSIONS if not (unknown and e == effect)]
+        with mock.patch("sipe_bayes.structure.probes.EXTENSIONS", library):
+            probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(method.prior), lin)
+        seen = misfit(probed, posterior.stddev.numpy(), seed)
+        alarm = seen.alarm or conflict is not None
+        missing = missing_physics(probed, posterior, method.prior, alarm, seed)
+        assert missing is not None  # with six logs
+        kinds = dict(zip(KINDS, (posterior, spread, missing.further), strict=False))
+        yield {
+            "machine": name,
+            "effect": effect,
+            "seed": seed,
+            "unknown": unknown,
+            "alarm": alarm,
+            "truth": truth.tolist(),
+            "ends": {kind: ends(p) for kind, p in kinds.items()},
+            "causes": list(missing.causes),
+            "explained": missing.explained,
+            "fit_s": round(fit_s, 1),
+            "checks_s": round(time.process_time() - began, 1),
+        }
 
 
 def ends(posterior: Posterior) -> list[list[float]]:
@@ -138,21 +143,27 @@ def ends(posterior: Posterior) -> list[list[float]]:
     return quantiles
 
 
-def printed(row: dict[str, Any]) -> list[list[float]]:
-    """What the report shows first: (2, N)."""
-    plain_ends, lacking = row["ends"]["plain"], row["ends"]["lacking"]
-    if not row["alarm"]:
-        return list(plain_ends)
-    return [np.minimum(plain_ends[0], lacking[0]).tolist(), np.maximum(plain_ends[1], lacking[1]).tolist()]
+def printed(row: dict[str, Any]) -> FloatArray:
+    """What the report shows first, the plain intervals within: (2, N)."""
+    plain_ends, lacking = np.array(row["ends"]["plain"]), np.array(row["ends"]["lacking"])
+    return np.stack([np.minimum(plain_ends[0], lacking[0]), np.maximum(plain_ends[1], lacking[1])])
 
 
 def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Coverage, its standard error by fit, and the median width in the range."""
-    out: dict[str, Any] = {"fits": len(rows), "alarms": float(np.mean([row["alarm"] for row in rows]))}
+    """Coverage, its standard error by fit, and the median width in the range; how much wider the printed ones are."""
+    times = np.concatenate(
+        [np.diff(printed(row), axis=0)[0] / np.diff(row["ends"]["plain"], axis=0)[0] for row in rows]
+    )
+    out: dict[str, Any] = {"fits": len(rows), "alarms": round(float(np.mean([row["alarm"] for row in rows])), 4)}
+    out["printed to plain"] = {
+        "median": round(float(np.median(times)), 3),
+        "mean": round(float(times.mean()), 3),
+        "most": round(float(times.max()), 3),
+    }
     for kind in KINDS:
         inside, widths = [], []
         for row in rows:
-            low, high = np.array(row["ends"][kind] if kind != "printed" else printed(row))
+            low, high = printed(row) if kind == "printed" else np.array(row["ends"][kind])
             truth = np.array(row["truth"])
             inside.append(float(((low <= truth) & (truth <= high)).mean()))
             widths += (high - low).tolist()
@@ -166,6 +177,9 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """All wrong models with the library and without the cause in it, right ones, and by effect."""
     wrong = [row for row in rows if row["effect"] != "null"]
     out = {"right models": shares([r for r in rows if r["effect"] == "null"])} if len(wrong) < len(rows) else {}
+    silent = [row for row in wrong if not row["alarm"]]
+    if silent:
+        out["wrong, without an alarm"] = shares(silent)
     for unknown, what in ((False, "in the library"), (True, "unknown")):
         mine = [row for row in wrong if row["unknown"] == unknown]
         if mine:
@@ -186,16 +200,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RUNS)
     given = parser.parse_args()
     rows = fits(given.out)
-    done = {(r["machine"], r["effect"], r["seed"], r["unknown"]) for r in rows}
-    for seed, *rest in product(range(given.seeds), given.machines, given.effects, (False, True)):
-        cell = (rest[0], rest[1], seed, rest[2])
-        if cell in done or (cell[1] == "null" and cell[3]):
+    done = {(r["machine"], r["effect"], r["seed"]) for r in rows if r["unknown"] or r["effect"] == "null"}
+    for seed, name, effect in product(range(given.seeds), given.machines, given.effects):
+        if (name, effect, seed) in done:
             continue
-        row = keep(given.out, fitted(*cell))
-        rows.append(row)
-        truth = np.array(row["truth"])
-        held = {k: int(((np.array(v[0]) <= truth) & (truth <= np.array(v[1]))).sum()) for k, v in row["ends"].items()}
-        print(*cell, held, "of", len(truth), row["causes"], row["explained"], row["checks_s"], flush=True)
+        for row in fitted(name, effect, seed):
+            rows.append(keep(given.out, row))
+            truth = np.array(row["truth"])
+            held = {
+                k: int(((np.array(v[0]) <= truth) & (truth <= np.array(v[1]))).sum()) for k, v in row["ends"].items()
+            }
+            told = row["unknown"], held, "of", len(truth), row["alarm"], row["causes"], row["fit_s"], row["checks_s"]
+            print(name, effect, seed, *told, flush=True)
         write_text(HERE / "results" / "wrong_models.json", json.dumps(tables(rows), indent=1) + "\n")
     print(json.dumps({k: v for k, v in tables(rows).items() if "by effect" not in k}, indent=1))
 

@@ -135,8 +135,11 @@ class _Model:
 
     def further(self, seed: int) -> Posterior | None:
         """Of the user's parameters that a further log would ask for; None where that cannot be said."""
+        if self.probed is None:
+            return None
         prior = self.structures.search.fitting.prior_of(self.structures.simulator(self.one))
-        missing = None if self.probed is None else missing_physics(self.probed, prior, seed, self.problem.tolerances)
+        own = self.structures.posterior_of(self.one)
+        missing = missing_physics(self.probed, own, prior, True, seed, self.problem.tolerances)
         if missing is None:
             return None
         space = self.problem.prior.space

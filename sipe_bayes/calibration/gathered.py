@@ -89,7 +89,7 @@ class Marginals:
         """One for each parameter.
 
         Args:
-            further: of the theta that a further log would have; its intervals hold the plain ones.
+            further: theta with what the model lacks or may lack; its intervals hold the plain ones.
         """
         mode = self.space.values(self.theta)
         beyond = None if further is None else further.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy()

@@ -38,7 +38,7 @@ from sipe_bayes.diagnostics.evaluate import (
     white_noise,
 )
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
-from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
+from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import open_gains, tolerance_findings
@@ -49,7 +49,7 @@ from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
-from sipe_bayes.inference.random_effects import LogEstimate, random_effects
+from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.binding import bind
@@ -100,10 +100,11 @@ def calibrate(
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
-    missing = _missing(probed, alone, problem, method.seed) if doubted else None
+    told = problem.prior, doubted, method.seed
+    missing = missing_physics(probed, posterior, *told, problem.tolerances) if probed else spread_alone(alone, *told)
     predictions = _Predictions.of(problem, theta)
     outside = _outside(problem, method, fit, predictions, unknown)
-    bands = predictions.bands(posterior, missing, method.seed)
+    bands = predictions.bands(posterior, missing if doubted else None, method.seed)
     noticed = (
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
         *problem.findings,
@@ -257,13 +258,6 @@ def _one_by_one(
             return alone, None, []
     alone, skipped = log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell)
     return alone, disagreement(space, alone), [finding(Code.AGREEMENT_UNKNOWN, log=name) for name in skipped]
-
-
-def _missing(probed: ProbedLogs | None, alone: list[LogEstimate], problem: Problem, seed: int) -> MissingPhysics | None:
-    """What a further log would ask for; from the logs' own estimates where nothing could be probed."""
-    if probed is not None:
-        return missing_physics(probed, problem.prior, seed, problem.tolerances)
-    return MissingPhysics(random_effects(alone, problem.prior, seed).new_log, (), False) if alone[1:] else None
 
 
 def _mixing(method: Estimator) -> Mixing | None:

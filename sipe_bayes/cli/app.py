@@ -249,12 +249,12 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
     from rich.table import Table
     from rich.text import Text
 
-    from sipe_bayes.report.verdicts import parameter_verdict
+    from sipe_bayes.report.verdicts import lacking, parameter_verdict
     from sipe_bayes.report.words import significant
 
     wider = any(p.further is not None for p in calibration.parameters)
     table, words = Table(box=None, pad_edge=False), ["unit", "verdict"]
-    numbers = ["value", *["with what it lacks"] * wider, "plain" if wider else "90 % interval"]
+    numbers = ["value", *[f"with what it {lacking(findings)}"] * wider, "plain" if wider else "90 % interval"]
     for heading in ("parameter", *numbers, *words):
         table.add_column(heading, justify="right" if heading in numbers else "left", no_wrap=True)
     shown = calibration.parameters

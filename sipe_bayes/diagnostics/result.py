@@ -55,8 +55,8 @@ class ParameterSummary:
         default: of the model as given, if it has one.
         contraction: 1 - sd / prior sd.
         nuisance: whether it holds for one log alone.
-        further: (2,) 5 and 95 % quantiles of what a further log would ask for, where the logs ask for different values
-            or the model lacks something; None for a single log.
+        further: (2,) 5 and 95 % quantiles with what the model may lack; where the logs ask for different values or the
+            model lacks something, of what a further log would ask for. None where neither can be said.
     """
 
     name: str

@@ -30,7 +30,7 @@ from sipe_bayes.report.drawing import inside_page, png, uncollected
 from sipe_bayes.report.interactive.charts import charts
 from sipe_bayes.report.interactive.clips import Clip
 from sipe_bayes.report.templates import html_templates
-from sipe_bayes.report.verdicts import parameter_verdict, verdicts
+from sipe_bayes.report.verdicts import lacking, parameter_verdict, verdicts
 from sipe_bayes.report.words import error_text, number, significant, times, unit_text
 
 _GAPS = 4  # that a row of the logs lists
@@ -72,7 +72,7 @@ def _parameter_row(summary: ParameterSummary, parameter: Parameter, calibration:
 
 
 def _further(summary: ParameterSummary) -> str:
-    """The interval with what the model lacks, to the digits that its own width leaves."""
+    """The interval with what the model lacks or may lack, to the digits that its own width leaves."""
     if summary.further is None:
         return ""
     low, high = summary.further
@@ -214,6 +214,7 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
         "headline": sentences[0].text,
         "sentences": sentences[1:],
         "warnings": noticed(calibration.findings),
+        "lacks": lacking(Findings(calibration.findings)),
         "parameters": [row for p, row in rows if not p.nuisance],
         "nuisance": [row for p, row in rows if p.nuisance],
         "scores": [

@@ -32,6 +32,8 @@ _PROBLEMS = (
 """Findings for which a parameter's value is not to be trusted, in the order in which its row names them."""
 _ALLOWED_FOR = (Code.LOGS_DISAGREE, Code.LOGS_DISAGREE_UNEXPLAINED, Code.MISFIT, Code.MISFIT_SHIFTS)
 """Those of which the intervals with what the model lacks take account."""
+_SEEN = (*_ALLOWED_FOR, Code.SMALL_MISFIT)
+"""Those that show that it lacks something; without one its intervals allow for what does not show."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
         return Verdict("fair", f"only with {listed(others)}")
     if not parameter.sd > 0:
         return Verdict("fair", "a point without uncertainty")
-    if parameter.further is not None:
+    if parameter.further is not None and _lacks(findings):
         return _with_what_is_lacking(parameter, findings)
     if Code.AT_PHYSICAL_BOUND in codes and not findings.blocking:
         return Verdict("good", f"{TEXTS[Code.AT_PHYSICAL_BOUND].row}, at most the upper end")
@@ -71,6 +73,16 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
         return Verdict("fair", "weakly determined" + partly)
     doubted = "; but see the doubt above" if findings.blocking else ""
     return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
+
+
+def _lacks(findings: Findings) -> bool:
+    """Whether something is seen to be missing."""
+    return bool(findings.of(*_SEEN))
+
+
+def lacking(findings: Findings) -> str:
+    """The verb of what the wider intervals are with: what the model "lacks", or where nothing is seen "may lack"."""
+    return "lacks" if _lacks(findings) else "may lack"
 
 
 def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Verdict:
@@ -138,7 +150,7 @@ def headline(
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
         first = "; ".join(doubts[:_DOUBTS])
         return Verdict("bad", f"No value may be trusted within its interval yet: {first}{others}.")
-    if any(p.further is not None for p in wanted):
+    if any(p.further is not None for p in wanted) and _lacks(findings):
         return _use(wanted, findings, bands)
     good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
     if not good:
@@ -242,13 +254,26 @@ def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:
 
 
 def between_logs(calibration: Calibration) -> Verdict | None:
-    """What the intervals with what the model lacks hold, where there are any."""
+    """What the intervals with what the model lacks, or may lack, hold, where there are any."""
     if all(p.further is None for p in calibration.parameters):
         return None
+    if not _lacks(Findings(calibration.findings)):
+        return _allowed_for(calibration)
     single = len({score.log for score in calibration.train}) == 1
     logs = "pieces of the log" if single else "logs"
     text = f"The intervals with what the model lacks hold what differs between the {logs}"
     if not calibration.causes:
         return Verdict("fair", f"{text}, not what all of them miss alike.")
-    named = [*calibration.causes[:_DOUBTS], *["others"] * (len(calibration.causes) > _DOUBTS)]
-    return Verdict("fair", f"{text} and, to first order, what {listed(named)} would move.")
+    return Verdict("fair", f"{text} and, to first order, what {listed(_named(calibration))} would move.")
+
+
+def _allowed_for(calibration: Calibration) -> Verdict:
+    """How much wider intervals are for what does not show."""
+    pairs = [(p.further, (p.q05, p.q95)) for p in calibration.parameters if p.further is not None]
+    wider = max((high - low) / (b - a) if b > a else 1.0 for (low, high), (a, b) in pairs)
+    text = f"Nothing is seen to be missing; the first intervals, at most {100 * (wider - 1):.0f} % wider than the plain"
+    return Verdict("good", f"{text} ones, allow for what would not show, most of all {listed(_named(calibration))}.")
+
+
+def _named(calibration: Calibration) -> list[str]:
+    return [*calibration.causes[:_DOUBTS], *["others"] * (len(calibration.causes) > _DOUBTS)]

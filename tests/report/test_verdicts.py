@@ -229,3 +229,24 @@ def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> 
     texts = [v.text for v in judged.verdicts(dataclasses.replace(found, findings=(doubt("another"),)))]
     assert any("NOT mixed" in text for text in texts)
     assert "but see the doubt above" in report.render(found, [])
+
+
+def test_where_nothing_is_seen_to_be_missing_values_are_trusted_and_what_would_not_show_is_named(
+    calibration: Calibration,
+) -> None:
+    values = [
+        dataclasses.replace(parameter(0.9), further=(p.q05, p.q95 + 0.2 * (p.q95 - p.q05))) for p in (parameter(0.9),)
+    ]
+    quiet = dataclasses.replace(
+        calibration, parameters=values, causes=("delay", "drag", "a spring"), findings=(), misfit=None
+    )
+    assert judged.parameter_verdict(values[0], Findings()) == judged.Verdict("good", "determined")
+    assert judged.headline(values, Findings()).tone == "good"
+    said = judged.between_logs(quiet)
+    assert said is not None
+    words = "at most 20 % wider than the plain ones, allow for what would not show, most of all delay, drag and others."
+    assert said.text.endswith(words)
+    assert "with what the model may lack" in report.render(quiet, [])
+    seen = dataclasses.replace(quiet, findings=(noticed(Code.SMALL_MISFIT),))
+    assert "with what the model lacks" in report.render(seen, [])
+    assert "hold what differs" in str(judged.between_logs(seen))

@@ -1,9 +1,9 @@
-"""The method ``calibrate``: ``laplace``, and where its residuals are no noise what ``sipe calibrate`` then shows first.
+"""The method ``calibrate``: ``laplace`` with what the model lacks or may lack, which ``sipe calibrate`` shows first.
 
-That is the interval with what the model lacks (``diagnostics.misfit.missing_physics``), which asks for windows: a log
-that was fitted whole from its known start is fitted again in windows of half a second, within the same budget. Only of
-a user's MJCF, which extensions are made for; elsewhere it is ``laplace``. Of a simulator that makes its own noise there
-is no likelihood: there it is what ``laplace`` then names in its place, ``npe``, mended by held-back simulations.
+That is the interval of ``diagnostics.misfit.missing_physics``. Where the residuals are no noise it asks for windows: a
+log that was fitted whole from its known start is fitted again in windows of half a second, within the same budget. Only
+of a user's MJCF, which extensions are made for; elsewhere it is ``laplace``. Of a simulator that makes its own noise
+there is no likelihood: there it is what ``laplace`` then names in its place, ``npe``, mended by held-back simulations.
 
 Held-out logs are predicted with the most probable values of the first fit, as ``sipe calibrate`` does: where physics
 are missing, the model does not predict best with the machine's own values, which that interval is about.
@@ -72,11 +72,13 @@ class Calibrate:
         logs, given = case.trajectories, problem.likelihood
         fit = self._fit(problem, given, logs, task.budget)
         posterior, rollouts, best = fit.posterior, fit.method.rollouts, most_probable(fit.posterior)
-        if isinstance(problem.simulator.environment, MjcfEnvironment) and self._alarm(fit):
-            if given.starts == "recorded":
+        if isinstance(problem.simulator.environment, MjcfEnvironment):
+            probed = fit.probed()
+            doubted = misfit(probed, posterior.stddev.numpy(), self.seed).alarm
+            if doubted and given.starts == "recorded":
                 fit = self._fit(problem, Segments(), replace(logs, states=None), task.budget - rollouts)
-                rollouts += fit.method.rollouts
-            missing = missing_physics(fit.probed(), problem.prior, self.seed)
+                rollouts, probed = rollouts + fit.method.rollouts, fit.probed()
+            missing = missing_physics(probed, fit.posterior, problem.prior, doubted, self.seed)
             posterior = posterior if missing is None else missing.further
         drawn = posterior.values(DRAWS, draws_of(self.seed, problem, case))
         return Estimate(drawn, rollouts, problem.space.values(best))
@@ -91,7 +93,3 @@ class Calibrate:
             **problem.settings,  # type: ignore[arg-type]
         )
         return _Fit(method, method.fit(logs), logs)
-
-    def _alarm(self, fit: _Fit) -> bool:
-        """Whether the residuals are no noise."""
-        return misfit(fit.probed(), fit.posterior.stddev.numpy(), self.seed).alarm

@@ -1,4 +1,4 @@
-r"""Intervals for a model that lacks something: what further logs would ask for, with what the library might explain.
+r"""Intervals for a model that lacks something, or may: what further logs would ask for, what the library might explain.
 
 A wrong model's parameters make up for what it lacks, so that their plain intervals are a fraction of their distance
 from the truth. Two things tell how far they may be off. Logs, or pieces of one, that were moved differently ask for
@@ -12,10 +12,13 @@ maximum (sparse Bayesian learning: M. Tipping, A. Faul, "Fast marginal likelihoo
 models", AISTATS 2003, https://proceedings.mlr.press/r4/tipping03a.html). Their posterior, means and covariance, moves
 and widens what each log asks for.
 
-Where the corrected residuals pass for noise, the interval is the corrected one alone. Else physics are missing that the
-library does not hold, or that are not small: both intervals, plain and corrected, are then mixed in equal parts.
+Where the corrected residuals pass for noise, the logs are corrected. Else physics are missing that the library does not
+hold, or that are not small: what the logs ask for and what they do when corrected are then mixed in equal parts. The
+few columns that were taken may stand in for others. So half of the interval is that of the posterior with a
+discrepancy that the whole library spans (``misfit.library_discrepancy``). It is widened by the gains that no motion
+tells (``misfit.tolerances``).
 
-Both are widened by the gains that no motion tells (``misfit.tolerances``).
+Where nothing is seen to be missing, no further log is asked for: the posterior is widened by that discrepancy alone.
 
 Deviations:
 
@@ -36,6 +39,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
+from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, chosen
 from sipe_bayes.diagnostics.misfit.tolerances import open_gains, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
@@ -61,11 +65,11 @@ _NOTHING = 1e-150  # information of a column that moves nothing: its square is n
 
 @dataclass(frozen=True)
 class MissingPhysics:
-    """What a further log would ask for, with what the model lacks.
+    """Theta with what the model lacks, or may lack.
 
     Args:
-        further: theta of such a log.
-        causes: that the evidence keeps, to first order, in words.
+        further: theta, of a further log where something is missing.
+        causes: that the evidence keeps, to first order, in words; else those that may move theta most.
         explained: whether the residuals pass for noise with them.
     """
 
@@ -76,38 +80,54 @@ class MissingPhysics:
 
 def missing_physics(
     logs: ProbedLogs,
+    posterior: Posterior,
     prior: Posterior,
+    doubted: bool,
     seed: int = 0,
     tolerances: Mapping[str, float] | None = None,
     options: MissingPhysicsOptions = _OPTIONS,
 ) -> MissingPhysics | None:
-    """The interval for a model that lacks something; no simulation beside what ``logs`` took.
+    """The interval for a model that lacks something, or may; no simulation beside what ``logs`` took.
 
     Args:
         logs: linearised at the estimate.
+        posterior: of theta, as fitted.
         prior: of theta.
+        doubted: whether the residuals or the logs' disagreement show that something is missing.
         seed: of the draws.
         tolerances: sd of what each actuator delivers, as a share of what its command says; default exact ones.
         options: of the search for causes.
 
     Returns:
-        None where nothing can be compared: a single log of one window.
+        None where nothing can be said: no extension has an effect, or in doubt there is but a single log of one window.
     """
-    parts = parts_of(logs.windows)
+    parts, hidden = parts_of(logs.windows), library_discrepancy(logs, seed)
+    if not doubted:
+        return None if hidden is None else MissingPhysics(hidden.widened(posterior, seed), hidden.causes, True)
     if len(parts) < 2:
         return None
     opened = open_gains(logs, tolerances or {})
     gains = tuple(f"a gain of {one.actuator} that is {100 * one.sd:.3g} % off" for one in opened)
     causes = _Causes.of(logs, options)
     further = random_effects(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed).new_log
-    if not len(causes.kept):
-        return MissingPhysics(widened(further, opened, seed), gains, False)
-    explained = causes.explain(logs, seed)
-    corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
-    corrected = causes.widened(corrected, np.random.default_rng(seed))
+    explained = False
+    if len(causes.kept):
+        explained = causes.explain(logs, seed)
+        corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
+        corrected = causes.widened(corrected, np.random.default_rng(seed))
+        further = corrected if explained else _mixed(further, corrected)
     named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
-    further = corrected if explained else _mixed(further, corrected)
+    if hidden is not None:
+        further, named = _mixed(further, hidden.widened(posterior, seed)), named or hidden.causes
     return MissingPhysics(widened(further, opened, seed), named + gains, explained)
+
+
+def spread_alone(
+    alone: Sequence[LogEstimate], prior: Posterior, doubted: bool, seed: int = 0
+) -> MissingPhysics | None:
+    """What a further log would ask for where nothing can be probed, from logs alone; None of one, or without a doubt."""
+    asked = doubted and len(alone) > 1
+    return MissingPhysics(random_effects(alone, prior, seed).new_log, (), False) if asked else None
 
 
 def _estimates(

@@ -40,7 +40,7 @@ class MisfitOptions(Options):
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
     alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
-    steps: int = option(1600, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
+    steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
     batch: int = option(20, "draws of the null whose products are formed together", least=1)
 
 

@@ -18,7 +18,7 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.posterior import Particles
 
-_IMITATED = 0.05  # of a column's information, that theta leaves
+IMITATED = 0.05  # of a column's information, that theta leaves
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def open_gains(logs: ProbedLogs, tolerances: Mapping[str, float]) -> list[Tolera
     opened = []
     for k, probe in enumerate(logs.probes):
         size = probe.whole * tolerances.get(probe.site, 0.0)
-        determined = seen.information[k] < np.inf and seen.information[k] > _IMITATED * whole[k]
+        determined = seen.information[k] < np.inf and seen.information[k] > IMITATED * whole[k]
         if size and np.isfinite(size) and not determined:
             opened.append(Tolerance(probe.site, tolerances[probe.site], -seen.answer[:, k] * size))
     return opened

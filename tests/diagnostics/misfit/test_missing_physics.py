@@ -65,7 +65,7 @@ def test_a_column_that_moves_nothing_is_left_out_without_a_warning() -> None:
     assert np.isfinite(alpha).tolist() == [False, True]
 
 
-def of_logs(logs: list[Trajectory]) -> tuple[MissingPhysics, FloatArray, FloatArray]:
+def of_logs(logs: list[Trajectory], doubted: bool) -> tuple[MissingPhysics, FloatArray, FloatArray]:
     """With plain 90 % intervals (2, 2) and these, of rod mass and damping alone."""
     simulator, recorded = pendulum(), Trajectories.stack(logs)
     method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
@@ -73,7 +73,7 @@ def of_logs(logs: list[Trajectory]) -> tuple[MissingPhysics, FloatArray, FloatAr
     theta = posterior.mode.numpy()
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
     probed = ProbedLogs(bind(method.likelihood, simulator, recorded), theta, noise)
-    seen = missing_physics(probed, prior(simulator.space))
+    seen = missing_physics(probed, posterior, prior(simulator.space), doubted)
     assert seen is not None
     return seen, *(p.quantile([0.05, 0.95]).numpy() for p in (posterior, seen.further))
 
@@ -83,7 +83,7 @@ def test_truths_are_held_where_the_model_lacks_dry_friction(logs: int) -> None:
     """The plain intervals, a fifth as wide or less, do not hold the damping; the cause is named, among others."""
     truth = np.array([0.6, 0.08])
     recorded = [log(pendulum(FRICTION), [*truth, 0.04], seed, name=f"log {seed}") for seed in range(2, 2 + logs)]
-    seen, plain, wide = of_logs(recorded)
+    seen, plain, wide = of_logs(recorded, doubted=True)
     theta = pendulum().space.normalise(truth)
     print(theta, plain, wide, seen.causes, seen.explained)
     assert not plain[0, 1] <= theta[1] <= plain[1, 1]
@@ -93,11 +93,14 @@ def test_truths_are_held_where_the_model_lacks_dry_friction(logs: int) -> None:
 
 def test_of_a_right_model_they_are_not_far_wider_and_hold_the_truth() -> None:
     recorded = [log(pendulum(), [0.6, 0.08], seed, name=f"log {seed}") for seed in range(6)]
-    seen, plain, wide = of_logs(recorded)
-    print(plain, wide, seen)
     theta = pendulum().space.normalise(np.array([0.6, 0.08]))
-    assert ((wide[0] <= theta) & (theta <= wide[1])).all()
-    assert (wide[1] - wide[0] < 6 * (plain[1] - plain[0])).all()  # a further log alone knows a sixth of six
+    for doubted, most in ((True, 6), (False, 1.3)):  # a further log alone knows a sixth of six
+        seen, plain, wide = of_logs(recorded, doubted)
+        print(plain, wide, seen)
+        assert ((wide[0] <= theta) & (theta <= wide[1])).all()
+        assert (wide[1] - wide[0] < most * (plain[1] - plain[0])).all()
+        assert len(seen.causes) == 3  # that would move the values most
+        assert seen.explained != doubted
 
 
 def test_a_single_log_stands_in_pieces_of_whole_windows() -> None:
