@@ -91,7 +91,6 @@ def calibrate(
     problem = _from_fitted_states(problem, method)
     fit = _Fit.of(problem, method, theta)
     problem = replace(problem, train=_tamed(problem.train, method))
-    dead = dead_ranges(fit.windows, theta)
     alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
     tell("checking what the model lacks")
     probed, residuals = _residuals(problem, method, fit, unknown)
@@ -114,7 +113,7 @@ def calibrate(
         *uneven_targets(problem.environment),
         *([] if conflict is None else [conflict.finding]),
         *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
-        *marginals.findings(dead, combinations),
+        *marginals.findings(dead_ranges(fit.windows, theta), combinations),
         *predictions.findings(),
         *of_logs(problem.reports),
         *_left_out(problem, method),

@@ -234,9 +234,8 @@ def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> 
 def test_where_nothing_is_seen_to_be_missing_values_are_trusted_and_what_would_not_show_is_named(
     calibration: Calibration,
 ) -> None:
-    values = [
-        dataclasses.replace(parameter(0.9), further=(p.q05, p.q95 + 0.2 * (p.q95 - p.q05))) for p in (parameter(0.9),)
-    ]
+    plain = dataclasses.replace(parameter(0.9), name="p0")
+    values = [dataclasses.replace(plain, further=(plain.q05, plain.q95 + 0.2 * (plain.q95 - plain.q05)))]
     quiet = dataclasses.replace(
         calibration, parameters=values, causes=("delay", "drag", "a spring"), findings=(), misfit=None
     )

@@ -122,10 +122,8 @@ def missing_physics(
     return MissingPhysics(widened(further, opened, seed), named + gains, explained)
 
 
-def spread_alone(
-    alone: Sequence[LogEstimate], prior: Posterior, doubted: bool, seed: int = 0
-) -> MissingPhysics | None:
-    """What a further log would ask for where nothing can be probed, from logs alone; None of one, or without a doubt."""
+def spread_alone(alone: Sequence[LogEstimate], prior: Posterior, doubted: bool, seed: int = 0) -> MissingPhysics | None:
+    """What a further log would ask for where nothing can be probed; None of one log, or without a doubt."""
     asked = doubted and len(alone) > 1
     return MissingPhysics(random_effects(alone, prior, seed).new_log, (), False) if asked else None
 
