@@ -144,8 +144,7 @@ def judged(target: Target, normal: GaussianMixture, seed: int, tuning: Importanc
     """Hold draws from a normal against the log density that it stands for; steps: control steps of the logs."""
     generator = torch.Generator().manual_seed(int(np.random.default_rng([seed, 1]).integers(2**31)))
     points = normal.sample((tuning.judges,), generator=generator)
-    chunks = np.array_split(points.numpy(), max(1, round(tuning.judges * steps / tuning.at_once)))
-    ratios = np.concatenate([target(chunk) for chunk in chunks]) - normal.log_prob(points).numpy()
+    ratios = in_chunks(target, steps, tuning)(points.numpy()) - normal.log_prob(points).numpy()
     valid = np.isfinite(ratios)
     if not valid.any():
         return Judgement(np.inf, 0.0, tuning.judges)
@@ -153,6 +152,16 @@ def judged(target: Target, normal: GaussianMixture, seed: int, tuning: Importanc
     ratios = np.where(valid, ratios, ratios[valid].min() - 50.0)
     relative = np.exp(ratios - ratios.max())
     return Judgement(pareto_shape(ratios), effective(relative / relative.sum()), tuning.judges)
+
+
+def in_chunks(target: Target, steps: int, tuning: ImportanceTuning) -> Target:
+    """The same log density by as many points at a time as memory holds; steps: control steps of the logs."""
+
+    def values(points: FloatArray) -> FloatArray:
+        chunks = np.array_split(points, max(1, round(len(points) * steps / tuning.at_once)))
+        return np.concatenate([target(chunk) for chunk in chunks])
+
+    return values
 
 
 def pareto_shape(log_ratios: FloatArray) -> float:
@@ -172,13 +181,27 @@ def draw(
     draws: Draws, target: Target, normal: GaussianMixture, prior: Posterior, seed: int, tuning: ImportanceTuning
 ) -> Draws:
     """One more batch; ``normal`` is that of Laplace's method, ``target`` gives log densities."""
-    batches, size = draws.batches, batch_size(len(normal.space), tuning)
-    if batches:
+    if draws.batches:
         share, (mean, covariance) = tuning.share, _moments(draws, normal, prior, tuning)
     else:
         share, mean = tuning.first_share, normal.means.numpy()[0]
         covariance = tuning.first_wider**2 * normal.covariances.numpy()[0]
-    proposal = GaussianMixture([0.0], mean[None], covariance[None], normal.space)
+    return drawn_from(draws, target, mean, covariance, share, prior, seed, tuning)
+
+
+def drawn_from(
+    draws: Draws,
+    target: Target,
+    mean: FloatArray,
+    covariance: FloatArray,
+    share: float,
+    prior: Posterior,
+    seed: int,
+    tuning: ImportanceTuning,
+) -> Draws:
+    """One more batch, from N(mean (N,), covariance (N, N)) in the cube and to ``share`` from the prior."""
+    batches, size = draws.batches, batch_size(len(mean), tuning)
+    proposal = GaussianMixture([0.0], mean[None], covariance[None], prior.space)
     rng = np.random.default_rng([seed, batches])
     generator, count = torch.Generator().manual_seed(int(rng.integers(2**31))), int(rng.binomial(size, share))
     drawn = [one.sample((n,), generator=generator) for one, n in ((proposal, size - count), (prior, count))]
@@ -205,15 +228,33 @@ def weights(draws: Draws, prior: Posterior) -> FloatArray:
     return np.asarray(relative / relative.sum())
 
 
+def ended(draws: Draws, prior: Posterior, tuning: ImportanceTuning, given: int = 0) -> bool:
+    """Whether there are draws enough, or no more are worth it.
+
+    given: batches whose proposals do not come from the draws.
+    """
+    count = effective(weights(draws, prior))
+    hopeless = draws.batches >= tuning.hopeless_after + given and count < draws.batches
+    return count >= tuning.enough or draws.batches >= tuning.most_batches or hopeless
+
+
 def effective(weight: FloatArray) -> float:
     """The number of draws of equal weight with the same sum of squares."""
     return float(1 / (weight**2).sum()) if weight.any() else 0.0
 
 
 def kernels(
-    points: FloatArray, weight: FloatArray, space: ParameterSpace, seed: int, tuning: ImportanceTuning
+    points: FloatArray,
+    weight: FloatArray,
+    space: ParameterSpace,
+    seed: int,
+    tuning: ImportanceTuning,
+    blur: FloatArray | float = 0.0,
 ) -> GaussianMixture:
-    """The posterior that draws (M, N) with weights (M,) stand for."""
+    """The posterior that draws (M, N) with weights (M,) stand for.
+
+    blur: covariance (N, N) that each kernel has in addition.
+    """
     n = len(space)
     mean = weight @ points
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
@@ -226,7 +267,7 @@ def kernels(
     which, counts = np.unique(picked, return_counts=True)
     # rounding leaves some kernels' covariance singular
     spread = width**2 * covariance + 1e-9 * np.diag(np.diag(covariance))
-    means, spreads = shrunk[which], np.tile(spread, (len(which), 1, 1))
+    means, spreads = shrunk[which], np.tile(spread + blur, (len(which), 1, 1))
     return GaussianMixture(np.log(counts), means, spreads, space).of_masses()  # at a bound not whole
 
 

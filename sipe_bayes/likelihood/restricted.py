@@ -74,17 +74,20 @@ def eliminate_starts(
     return eliminate(diagonal, below, coupling, force, precision, gradient)
 
 
-def marginal(moments: Moments, noise: Noise, starts: FloatArray, precision: FloatArray) -> tuple[float, FloatArray]:
+def marginal(
+    moments: Moments, noise: Noise, starts: FloatArray, precision: FloatArray
+) -> tuple[float, FloatArray, float]:
     """Log-likelihood of residuals with the windows' starts integrated out, theta as it is.
 
     ``moments`` are of the residuals at ``starts`` (W, D) and their Jacobian by the starts alone, ``precision`` (D,)
-    of the starts' prior. Returns the value up to a constant, and the change (W, D) of the starts that fits best.
+    of the starts' prior. Returns the value up to a constant, the change (W, D) of the starts that fits best, and nats
+    that it promises.
     """
     normal = moments.normal(noise)
     solved = eliminate_starts(normal, 0, precision, -precision * starts)
     pull, square = float((starts**2 @ precision).sum()), float(normal[:, -1, -1].sum())
     total = moments.log_determinant(noise) + solved.log_determinant + square - solved.explained + pull
-    return -0.5 * total, solved.shift
+    return -0.5 * total, solved.shift, 0.5 * solved.explained
 
 
 def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray, Eliminated]:

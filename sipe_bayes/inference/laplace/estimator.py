@@ -18,6 +18,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.pattern_search import SHORTEST
+from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.noise_average import averaged
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
@@ -27,6 +28,7 @@ from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strate
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
+from sipe_bayes.inference.stretches import look_size, proposals, stretches
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -44,6 +46,7 @@ class LaplaceState:
     Args:
         search: the state of its ``Strategy``.
         draws: those that take the normal's place; None before them, and where it stands.
+        given: batches of them whose proposals the draws did not make.
         judgements: of the normals of a chain's optima, best first.
         unjudged: whether the budget left no room to see whether the posterior of windows is a normal.
         done: whether all have ended.
@@ -51,6 +54,7 @@ class LaplaceState:
 
     search: WindowState | StateSpaceState | KnownStartState
     draws: Draws | None = None
+    given: int = 0
     judgements: tuple[Judgement, ...] = ()
     unjudged: bool = False
     done: bool = False
@@ -129,10 +133,10 @@ class Laplace(Estimator[LaplaceState]):
             windows.budget = self.budget
             if not isinstance(windows, Chain) or state.judgements or not state.search.optima:
                 raise
-            judged = self._judged(windows, state, distinct(state.search.optima))
+            judged, target = self._judged(windows, state, distinct(state.search.optima))
             if not judged.judgements:
                 raise
-            return judged
+            return self._looked_beyond(windows, judged, target)
         windows.budget = self.budget
         if search.optima is not state.search.optima:
             state = replace(state, judgements=())
@@ -140,17 +144,20 @@ class Laplace(Estimator[LaplaceState]):
         if not search.done:
             return state
         if len(state.judgements) == len(distinct(search.optima)):
-            return replace(state, done=not self._shots_left(search))
+            if not isinstance(windows, Chain) or self._shots_left(search):
+                return replace(state, done=not self._shots_left(search))
+            return self._looked_beyond(windows, state, None)
         return self._probed(windows, state)
 
     def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
-        """Rollouts that the search of a chain leaves to those who judge its optima; none where they are dear."""
+        """Rollouts that the search of a chain leaves to judges of its optima, and to draws; none where they are dear."""
         if not isinstance(windows, Chain) or not state.search.optima or state.judgements:
             return 0
         linearised = 2 * (windows.num_theta + windows.num_start) + 1
-        each = (self.options.tuning.importance.judges + linearised) * len(windows.trajectories)
-        share = each * len(distinct(state.search.optima))
-        return share if share < self.options.tuning.importance.most_share * self.budget else 0
+        each = self.options.tuning.importance.judges + linearised
+        judges, logs = each * len(distinct(state.search.optima)), len(windows.trajectories)
+        shares = [(judges + draws_size(len(self.space), self.problem)) * logs, judges * logs]
+        return next((one for one in shares if one < self.options.tuning.importance.most_share * self.budget), 0)
 
     def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
         """The search that fits the likelihood."""
@@ -166,27 +173,49 @@ class Laplace(Estimator[LaplaceState]):
             optima, shots_left = distinct(state.search.optima), self._shots_left(state.search)
             if shots_left and self._absorbs(windows, optima[0]):
                 return state
-            state = self._judged(windows, state, optima)
+            state, target = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
-            return replace(state, done=stands or not shots_left)
+            return self._looked_beyond(windows, state, target) if stands or not shots_left else state
         kept = distinct(state.search.optima)
         best = kept[0]
         if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
             return ended
-        if not best.unsmooth and (windows.num_start or len(kept) != 1):
+        if not best.unsmooth and len(kept) != 1:
             return ended
         assert isinstance(state.search, WindowState)
         if np.sqrt(np.diag(best.covariance)).min() < 10 * SHORTEST:
             return ended  # an sd that the look around the optimum may have set
-        if not windows.has_room(importance.probe_size(n)):
+        probes = 0 if windows.num_start else importance.probe_size(n)
+        if not windows.has_room(windows.num_start + probes + _sides(windows) * look_size(n, near=False)):
             return replace(ended, unjudged=True)
-        target = self._target(windows, best)
-        if target.silent:
+        of_windows = self._target(windows, best)
+        if of_windows.silent:
             return ended
-        seen_normal = not best.unsmooth and not best.heavier
-        if seen_normal and importance.is_normal(target, best.theta, best.mean, best.covariance, tuning):
+        normal = not best.unsmooth and not best.heavier
+        if normal and probes:
+            normal = importance.is_normal(of_windows, best.theta, best.mean, best.covariance, tuning)
+        try:
+            found = stretches(of_windows, best.theta, best.mean, best.covariance, self.options.tuning.stretches, False)
+        except BudgetExhausted:
+            windows.short = True
+            return replace(ended, unjudged=True)
+        if normal and not found:
             return replace(ended, search=_looked_around(state.search, best))
-        return replace(state, draws=Draws.none(n), done=not windows.has_room(importance.batch_size(n, tuning)))
+        first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(found, best.covariance)]
+        return self._first_drawn(windows, state, of_windows, first)
+
+    def _first_drawn(
+        self, windows: Windows, state: LaplaceState, target: WindowTarget, first: list[tuple[FloatArray, FloatArray]]
+    ) -> LaplaceState:
+        """The state with draws from normals that are known beforehand, as far as the budget lasts."""
+        draws, tuning = Draws.none(len(self.space)), self.options.tuning.importance
+        size = _sides(windows) * importance.batch_size(len(self.space), tuning)
+        for mean, covariance in first:
+            if not windows.has_room(size):
+                break
+            share = tuning.share if draws.batches else tuning.first_share
+            draws = importance.drawn_from(draws, target, mean, covariance, share, self.prior, self.seed, tuning)
+        return replace(state, draws=draws, given=draws.batches, done=not windows.has_room(size))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where windows of the logs lead."""
@@ -198,10 +227,15 @@ class Laplace(Estimator[LaplaceState]):
         share = self.options.tuning.state_space.shooting.absorbed
         return optimum.rough and optimum.absorbed > share * chain.observed.sum()
 
-    def _judged(self, chain: Chain, state: LaplaceState, kept: list[Optimum]) -> LaplaceState:
-        """With the normals of a chain's optima averaged over the noise and judged; fewer where the budget ends."""
+    def _judged(
+        self, chain: Chain, state: LaplaceState, kept: list[Optimum]
+    ) -> tuple[LaplaceState, ChainTarget | None]:
+        """With the normals of a chain's optima averaged over the noise and judged; fewer where the budget ends.
+
+        And what the best one's were held against.
+        """
         assert not isinstance(state.search, WindowState)
-        judgements, search = [], state.search
+        judgements, search, targets = [], state.search, []
         tuning, steps = self.options.tuning.importance, len(chain.log)
         for optimum in kept:
             assert isinstance(optimum, ChainOptimum)
@@ -209,13 +243,27 @@ class Laplace(Estimator[LaplaceState]):
                 fit = ChainFit.at(chain, optimum)
                 search = search.with_optimum(replace(optimum, averaged=averaged(self.problem, chain, fit)))
                 held = mixture([replace(optimum, averaged=None)], self.space)
-                judgements.append(
-                    importance.judged(ChainTarget(self.prior, chain, fit), held, self.seed, tuning, steps)
-                )
+                target = ChainTarget(self.prior, chain, fit)
+                judgements.append(importance.judged(target, held, self.seed, tuning, steps))
+                targets.append(target)
             except BudgetExhausted:
                 chain.short = True  # a larger budget goes on from here
                 break
-        return replace(state, search=search, judgements=tuple(judgements))
+        return replace(state, search=search, judgements=tuple(judgements)), targets[0] if targets else None
+
+    def _looked_beyond(self, chain: Chain, state: LaplaceState, target: ChainTarget | None) -> LaplaceState:
+        """The end of a fit of a chain: with draws where the normal of its only optimum is not the posterior."""
+        kept, ended = distinct(state.search.optima), replace(state, done=True)
+        if len(kept) > 1 or not state.judgements:
+            return ended
+        assert isinstance(kept[0], ChainOptimum)
+        try:
+            target = target or ChainTarget(self.prior, chain, ChainFit.at(chain, kept[0]))
+        except BudgetExhausted:
+            chain.short = True
+            return replace(ended, unjudged=True)
+        look = looked_beyond(self.problem, target, state.judgements[0].normal)
+        return replace(ended, draws=look.draws, unjudged=look.short and look.draws is None)
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
@@ -227,10 +275,8 @@ class Laplace(Estimator[LaplaceState]):
             search = WindowSearch(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
             if search is not None:
                 return replace(state, search=search, draws=None)
-        effective = importance.effective(importance.weights(draws, self.prior))
-        hopeless = draws.batches >= tuning.hopeless_after and effective < draws.batches
-        done = effective >= tuning.enough or draws.batches >= tuning.most_batches or hopeless
-        done = done or not windows.has_room(importance.batch_size(n, tuning))
+        done = importance.ended(draws, self.prior, tuning, state.given)
+        done = done or not windows.has_room(_sides(windows) * importance.batch_size(n, tuning))
         return replace(state, draws=draws, done=done)
 
     def _target(self, windows: Windows, optimum: Optimum) -> WindowTarget:
@@ -257,15 +303,21 @@ class Laplace(Estimator[LaplaceState]):
         enough = effective >= tuning.least
         if enough and isinstance(kept[0], WindowOptimum):
             kept = [replace(kept[0], finding=None) if kept[0].unsmooth else kept[0]]  # draws ask for no slope
-        self._report(kept, state)
+        self._report(kept, state, enough)
         if state.draws is not None:
             self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
-            if state.done and not enough:
+            if state.done and not enough and Code.NOT_THE_NORMAL not in {one.code for one in self.findings}:
                 self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
-        return importance.kernels(draws.points, weight, self.space, self.seed, tuning) if enough else normals
+        if not enough:
+            return normals
+        wider = blur(kept[0].covariance, kept[0].spread) if isinstance(kept[0], ChainOptimum) else 0.0
+        return importance.kernels(draws.points, weight, self.space, self.seed, tuning, wider)
 
-    def _report(self, kept: list[Optimum], state: LaplaceState) -> None:
-        """Diagnostics of the best optimum, and what is to be said against any that is kept."""
+    def _report(self, kept: list[Optimum], state: LaplaceState, drawn: bool) -> None:
+        """Diagnostics of the best optimum, and what is to be said against any that is kept.
+
+        drawn: whether draws have taken the normal's place.
+        """
         best = kept[0]
         self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
         if isinstance(best, ChainOptimum):
@@ -274,7 +326,7 @@ class Laplace(Estimator[LaplaceState]):
                 self.find(Code.PROCESS_NOISE_UNSETTLED)
             self.diagnostics["pareto_k"] = [one.pareto_k for one in state.judgements]
             for one in state.judgements:
-                if not one.normal:
+                if not one.normal and not drawn:
                     self.find(Code.NOT_THE_NORMAL, k=one.pareto_k, effective=one.effective, draws=one.draws)
             if state.done and len(state.judgements) < len(kept):
                 self.find(Code.NOT_JUDGED)
@@ -330,6 +382,11 @@ class Laplace(Estimator[LaplaceState]):
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
         return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open
+
+
+def _sides(windows: Windows) -> int:
+    """Simulations of the logs that a value of ``WindowTarget`` takes, at most."""
+    return 2 if windows.num_start else 1
 
 
 def _looked_around(search: WindowState, optimum: WindowOptimum) -> WindowState:

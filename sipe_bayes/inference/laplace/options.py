@@ -10,6 +10,7 @@ from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.pattern_search import PatternTuning
 from sipe_bayes.inference.laplace.state_space.options import ChainTuning
+from sipe_bayes.inference.stretches import StretchTuning
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class LaplaceTuning(Options):
     contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
     scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
+    stretches: StretchTuning = option(StretchTuning(), "how far a posterior is looked at beyond its normal")
     pattern: PatternTuning = option(PatternTuning(), "how the surroundings of an optimum are looked at")
     state_space: ChainTuning = option(ChainTuning(), "how the searches over a chain of states go")
 

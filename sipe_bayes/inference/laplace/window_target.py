@@ -1,4 +1,4 @@
-"""log p(theta | y) of windows with their starts and the noise integrated out: one simulation of the logs a value.
+"""log p(theta | y) of windows with their starts and the noise integrated out: a simulation of the logs a value, or two.
 
 For ``mcmc`` and ``importance``. With r the residual at the predicted starts x(theta), V(noise) its covariance and J_x
 the starts' Jacobian,
@@ -7,10 +7,12 @@ the starts' Jacobian,
     A = J_x' V^-1 J_x + P_x,   b = J_x' V^-1 r - P_x x.
 
 The starts are integrated out exactly where the prediction is linear in them over their (narrow) conditional posterior:
-x(theta) = x_hat - S (theta - theta_hat) and J_x are those of the ``laplace`` optimum. The noise is integrated out by
-Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations for Posterior Moments and Marginal Densities",
-J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at the optimum hardly depends on
-theta; exact for white noise of one channel whose starts are known.
+x(theta) = x_hat - S (theta - theta_hat) and J_x are those of the ``laplace`` optimum. Far off, or beyond an edge where
+theta stops to matter, no starts lie along that slope: where the step that remains promises a nat, the starts are also
+simulated as they are at the optimum, and the value is theirs unless following promises less by ten. The noise is
+integrated out by Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations for Posterior Moments and
+Marginal Densities", J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at the optimum
+hardly depends on theta; exact for white noise of one channel whose starts are known.
 """
 
 from __future__ import annotations
@@ -29,6 +31,9 @@ from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
+
+FORETOLD = 1.0  # nats, by which a step of starts or states that follow theta promises more than at the optimum
+FOLLOWED = 10.0  # nats, by which those that follow have to promise less than those that do not
 
 
 @dataclass(frozen=True)
@@ -95,16 +100,27 @@ class WindowTarget(Target):
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """See ``Target``."""
-        starts, out = self.starts(theta), np.full(len(theta), -np.inf)
-        residuals, valid = self.windows.residuals(theta, starts)
-        for k in np.flatnonzero(valid):
-            out[k] = self._integrated(residuals[k], self.fit.jacobian, starts[k])[0]
+        out, promised = self._values(theta, self.starts(theta))
+        far = np.flatnonzero(promised > FORETOLD)
+        if len(far) and self.windows.num_start:
+            held, left = self._values(theta[far], np.tile(self.fit.optimum.starts, (len(far), 1, 1)))
+            out[far] = np.where(left < promised[far] + FOLLOWED, held, out[far])
         return out
 
-    def _integrated(self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray) -> tuple[float, FloatArray]:
-        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), and the best change of the starts (W, D).
+    def _values(self, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log-likelihoods (B,) of theta (B, N) at starts (B, W, D), and nats that a step of these promises."""
+        out, promised = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
+        residuals, valid = self.windows.residuals(theta, starts)
+        for k in np.flatnonzero(valid):
+            out[k], _, promised[k] = self._integrated(residuals[k], self.fit.jacobian, starts[k])
+        return out, promised
 
-        Up to a constant, with the noise that fits best there. jacobian (W, L, C, D): by the starts.
+    def _integrated(
+        self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray
+    ) -> tuple[float, FloatArray, float]:
+        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), up to a constant, with the noise that fits best.
+
+        And the best change (W, D) of the starts, with what it promises. jacobian (W, L, C, D): by the starts.
         """
         windows, nothing = self.windows, np.zeros(0)
         moments = Moments(residual, jacobian, 0, windows.sequences, windows.settings.noise == "white")
@@ -126,6 +142,6 @@ class WindowTarget(Target):
         starts, value = self.starts(point[None])[0], -np.inf
         for _ in range(2):  # a step, then the value
             lin = self.windows.linearise(point, starts, with_theta=False)
-            value, move = self._integrated(lin.residual, lin.jacobian, starts)
+            value, move, _ = self._integrated(lin.residual, lin.jacobian, starts)
             starts = starts + move
         return value + float(self.prior.log_prob(torch.from_numpy(point)))

@@ -1,21 +1,26 @@
-"""log p(theta | y) with all states of a ``StateSpace`` marginalised, for ``mcmc``: one simulation of the logs a value.
+"""log p(theta | y) with all states of a ``StateSpace`` marginalised: one simulation of the logs a value, or two.
 
 The states follow theta as the smoother found, x(theta) = x_hat - slope (theta - theta_hat), and are simulated there;
 what remains of the likelihood is quadratic in them with the Jacobians of the ``laplace`` optimum, so its
 block-tridiagonal matrix is factorised once. Exact where measurement and transition are linear in the states. The noise
 is that of the optimum.
+
+Far off, or beyond an edge where theta stops to matter, no states lie along that slope. Where the step that remains
+promises more than at the optimum, the states are also simulated where they are there, and the value is theirs unless
+following promises less by ten nats.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
-from sipe_bayes.inference.laplace.window_target import Target
+from sipe_bayes.inference.laplace.window_target import FOLLOWED, FORETOLD, Target
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare, linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, eliminate_states, log_likelihood, pull
@@ -65,7 +70,25 @@ class ChainTarget(Target):
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """See ``Target``; by comparisons that share the optimum's Jacobians."""
-        every, out = compare(self.chain, theta, self.states(theta), self.fit), np.full(len(theta), -np.inf)
+        out, promised = self._compared(theta, self.states(theta))
+        far = np.flatnonzero(promised > self.promised + FORETOLD)
+        if len(far):
+            held, left = self._compared(theta[far], np.tile(self.optimum.states, (len(far), 1, 1)))
+            out[far] = np.where(left < promised[far] + FOLLOWED, held, out[far])
+        return out
+
+    @cached_property
+    def promised(self) -> float:
+        """Nats that a step of the states promises at the optimum; takes no simulation."""
+        return 0.5 * self.solved.explained
+
+    def _compared(self, theta: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log-likelihoods (B,) of theta (B, N) from states (B, K, S), and nats that a step of these promises.
+
+        Minus infinity, and infinity, where it diverges.
+        """
+        every = compare(self.chain, theta, states, self.fit)
+        out, promised = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
         valid = {k: one for k, one in enumerate(every) if one is not None}
         if valid:
             forces = np.stack([pull(one, self.noise).ravel() for one in valid.values()], axis=1)
@@ -73,7 +96,8 @@ class ChainTarget(Target):
             solved = [replace(self.solved, explained=float(g)) for g in gains]
             pairs = zip(valid.values(), solved, strict=True)
             out[list(valid)] = [log_likelihood(one, self.noise, s) for one, s in pairs]
-        return out
+            promised[list(valid)] = 0.5 * gains
+        return out, promised
 
     @property
     def check_cost(self) -> int:

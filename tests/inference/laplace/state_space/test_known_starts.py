@@ -40,7 +40,10 @@ def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
         print(
             seed, theta.round(3), posterior.mean.numpy().round(3), posterior.stddev.numpy().round(4), estimator.warnings
         )
-        assert float(posterior.stddev[2]) == pytest.approx(1 / np.sqrt(12), rel=0.02)
+        # of some 100 effective draws a uniform sd is known to 4.5 %
+        assert float(posterior.stddev[2]) == pytest.approx(
+            1 / np.sqrt(12), rel=0.02 if estimator.state.draws is None else 0.14
+        )
     square = float(np.mean(np.square(scores)))
     print("covered", covered, "of 20, median error", np.median(errors), "mean squared z", square)
     assert covered >= 14

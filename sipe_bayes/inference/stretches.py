@@ -1,0 +1,125 @@
+"""Where a posterior reaches further than its normal: sides on which a parameter changes little or nothing.
+
+A friction below that of the floor does nothing, since MuJoCo takes the larger of the two; a stop that is not reached
+may lie anywhere beyond. An optimum at such an edge has a normal whose width is that of the steep side, and draws from
+it never come to where the posterior goes on. So points further off are looked at, along each parameter alone, along its
+direction with the others following, and along the normal's principal axes: where the log posterior has fallen by less
+than it should, and what lies there would count, twice as far again, up to the bound.
+
+Each stretch that is found is the middle of a normal to draw from: as long as it, and across it as wide as the first
+normal is for a given place along it. Where several parameters alone have one, one more has them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
+
+Target = Callable[[FloatArray], FloatArray]
+"""Log densities (B,) of points (B, N)."""
+
+
+@dataclass(frozen=True)
+class StretchTuning(Options):
+    """How far a posterior is looked at beyond its normal, and what counts."""
+
+    near: float = option(2.0, "the nearer points", "sd", above=0)
+    far: float = option(8.0, "the further ones; where the density holds on, twice as far again", "sd", above=0)
+    slack: float = option(0.5, "by which falls of the log posterior may differ for rounding's sake", "nats", least=0)
+    least_fall: float = option(0.6, "a fall, over that of the normal, which is none too small", above=0, below=1)
+    unseen: float = option(0.01, "of the normal's mass, which a stretch has to have to count", above=0, below=1)
+    most: int = option(6, "stretches drawn from", least=1)
+
+    def least_worth(self, length: FloatArray) -> FloatArray:
+        """Falls (...), in nats, below which what lies along lengths (...), in sds, counts."""
+        return np.asarray(np.log(np.maximum(length, 1.0) / (np.sqrt(2 * np.pi) * self.unseen)))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One of them.
+
+    Args:
+        start: (N,), the middle of the normal, or the optimum where that lies outside the cube.
+        end: (N,), the furthest point along it at which the density was too large.
+        fall: nats by which the log density is lower there than at the start.
+        distance: sds of the normal from start to end.
+        parameter: which parameter alone changes along it; None where several do.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    fall: float
+    distance: float
+    parameter: int | None
+
+
+def look_size(size: int, near: bool = True) -> int:
+    """Points that ``stretches`` looks at in ``size`` dimensions where there is none."""
+    return 1 + (8 if near else 4) * size
+
+
+def stretches(
+    target: Target,
+    theta: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    tuning: StretchTuning,
+    near: bool = True,
+) -> list[Stretch]:
+    """Those beyond N(mean, covariance) of a log density with its optimum in the cube at theta (N,); most mass first.
+
+    near: whether the nearer points are looked at too.
+    """
+    start = mean if ((mean >= 0) & (mean <= 1)).all() else theta
+    precision, n = np.linalg.inv(covariance), len(theta)
+    ways = np.concatenate([np.diag(np.diag(precision) ** -0.5), (covariance / np.sqrt(np.diag(covariance))).T])
+    ways = np.concatenate([ways, -ways])  # one sd each
+    room = np.where(ways > 0, 1 - start, start) / np.maximum(np.abs(ways), 1e-300)
+    most = room.min(1)
+    level = float(target(start[None])[0])
+    found: dict[int, Stretch] = {}
+    centre = start - mean
+    open_ways, length = np.flatnonzero(most > 0.5 * tuning.near), tuning.near if near else tuning.far
+    while len(open_ways):
+        reached = np.minimum(length, most[open_ways])
+        points = np.clip(start + reached[:, None] * ways[open_ways], 0.0, 1.0)
+        falls, gaps = level - target(points), points - mean
+        foretold = 0.5 * (np.einsum("bi,ij,bj->b", gaps, precision, gaps) - centre @ precision @ centre)
+        small = falls + tuning.slack < tuning.least_fall * (foretold + tuning.slack)
+        small &= falls < tuning.least_worth(most[open_ways])
+        for k in np.flatnonzero(small & (falls < tuning.least_worth(reached))):
+            way = int(open_ways[k])
+            parameter = way % (2 * n) if way % (2 * n) < n else None
+            found[way] = Stretch(start, points[k], float(falls[k]), float(reached[k]), parameter)
+        if length > tuning.near:  # the far points are looked at along all ways
+            open_ways = open_ways[small]
+        open_ways = open_ways[most[open_ways] > length]
+        length = tuning.far if length == tuning.near else 2 * length
+    ordered = sorted(found.values(), key=lambda one: one.fall - np.log(one.distance))
+    return ordered[: tuning.most]
+
+
+def proposals(found: list[Stretch], covariance: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Means (N,) and covariances (N, N) of normals to draw from: one for each stretch, and one for all."""
+    alone = [one for one in found if one.parameter is not None]
+    groups = [[one] for one in found] + ([alone] if len({one.parameter for one in alone}) > 1 else [])
+    return [_proposal(group, covariance) for group in groups]
+
+
+def _proposal(group: list[Stretch], covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Over the stretches at once: their middle, and the normal's width in what is left of the directions."""
+    sd, start = np.sqrt(np.diag(covariance)), group[0].start
+    along = np.array([one.end - one.start for one in group]) / sd
+    inner = np.linalg.inv(covariance / np.outer(sd, sd))
+    # the directions across, in the parameters' sds
+    across = np.linalg.svd(along)[2][np.linalg.matrix_rank(along) :].T
+    spread = across @ np.linalg.inv(across.T @ inner @ across) @ across.T if across.size else 0.0 * inner
+    spread = spread + along.T @ along / 6
+    spread = spread + 1e-9 * np.diag(np.diag(spread))
+    return start + 0.5 * along.sum(0) * sd, spread * np.outer(sd, sd)
