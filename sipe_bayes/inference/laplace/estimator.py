@@ -115,8 +115,7 @@ class Laplace(Estimator[LaplaceState]):
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
         """A step of the search, or, where it has ended, one more batch of draws."""
         windows = self.bound(trajectories)
-        if state.draws is not None:
-            assert isinstance(windows, Windows)
+        if state.draws is not None and isinstance(windows, Windows):
             assert isinstance(state.search, WindowState)
             windows.mask(state.search.wild)
             return self._drawn(windows, state, state.draws)
@@ -136,10 +135,10 @@ class Laplace(Estimator[LaplaceState]):
             judged, target = self._judged(windows, state, distinct(state.search.optima))
             if not judged.judgements:
                 raise
-            return self._looked_beyond(windows, judged, target)
+            return replace(self._looked_beyond(windows, judged, target), done=False)  # the next step ends it
         windows.budget = self.budget
         if search.optima is not state.search.optima:
-            state = replace(state, judgements=())
+            state = replace(state, judgements=(), draws=None, unjudged=False)
         state = replace(state, search=search)
         if not search.done:
             return state
@@ -150,7 +149,7 @@ class Laplace(Estimator[LaplaceState]):
         return self._probed(windows, state)
 
     def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
-        """Rollouts that the search of a chain leaves to judges of its optima, and to draws; none where they are dear."""
+        """Rollouts that the search of a chain leaves to judges of its optima and draws; none where they are dear."""
         if not isinstance(windows, Chain) or not state.search.optima or state.judgements:
             return 0
         linearised = 2 * (windows.num_theta + windows.num_start) + 1
@@ -306,7 +305,8 @@ class Laplace(Estimator[LaplaceState]):
         self._report(kept, state, enough)
         if state.draws is not None:
             self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
-            if state.done and not enough and Code.NOT_THE_NORMAL not in {one.code for one in self.findings}:
+            ended = state.done or state.judgements
+            if ended and not enough and Code.NOT_THE_NORMAL not in {one.code for one in self.findings}:
                 self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
         if not enough:
             return normals
