@@ -1,4 +1,4 @@
-r"""How far the values may be off where the whole library might be at work, each piece a little: no cause is chosen.
+r"""How far the values may be off where the library might be at work: one piece of it, or all of it, each a little.
 
 An effect that is too small to be told from noise may still be large enough to move the values by more than their
 intervals; and where an effect is seen, the library may not hold it, only what moves theta alike. Both are asked of the
@@ -6,24 +6,29 @@ discrepancy between machine and model (M. Kennedy, A. O'Hagan, "Bayesian calibra
 https://doi.org/10.1111/1467-9868.00294), here spanned by the probes of all extensions. In the linear model of
 ``misfit.probed_logs``,
 
-.. math:: r = J_\theta \delta + E b + J_x x + \varepsilon, \qquad b_k \sim \mathcal N(0, t^2 / (c_k i_k)),
+.. math:: r = J_\theta \delta + E b + J_x x + \varepsilon,
 
-with i_k the information of b_k once theta and the windows' starts are free, and c_k the number of extensions times that
-of the columns that belong to k's: t^2 is about what the discrepancy adds to the residual's chi-square, shared out
-evenly between extensions. t is zero with probability one half, else uniform in its logarithm. With theta flat and
-integrated out, S the information of b and q its score,
+with S the information of b once theta and the windows' starts are free and q its score, three states of affairs are
+averaged over by their evidence: nothing is missing (b = 0); one column k is at work, each extension as probable as
+another, :math:`b_k \sim \mathcal N(0, t^2 / S_{kk})`, halved where its size may not be negative; or all are,
+:math:`b_k \sim \mathcal N(0, t^2 / (c_k S_{kk}))` with c_k the number of extensions times that of the columns that
+belong to k's. In both t^2 is about what the discrepancy adds to chi-square; t is half-Cauchy (A. Gelman, "Prior
+distributions for variance parameters in hierarchical models", 2006, https://doi.org/10.1214/06-BA117A), on a grid. With
+theta flat and integrated out,
 
 .. math::
 
-    p(r \mid t) \propto |I + D S D|^{-1/2} e^{q' D (I + D S D)^{-1} D q / 2}, \qquad
-    D = \operatorname{diag}(t / \sqrt{c_k i_k}),
+    p(r \mid t, k) &\propto (1 + t^2)^{-1/2} e^{z^2 t^2 / (2 (1 + t^2))} [2 \Phi(z t / \sqrt{1 + t^2})],
+    \qquad z = q_k / \sqrt{S_{kk}}, \\
+    p(r \mid t) &\propto |I + D S D|^{-1/2} e^{q' D (I + D S D)^{-1} D q / 2}, \qquad
+    D = \operatorname{diag}(t / \sqrt{c_k S_{kk}}),
 
-so that t's posterior is a sum over a grid, b is normal given t, and a b moves theta by its linear answer. The interval
-widens as the evidence for a discrepancy grows, and is hardly widened where the residuals show none.
+b is then (half) normal, and moves theta by its linear answer. The interval widens as the evidence for a discrepancy
+grows, no alarm decides, and it is hardly widened where the residuals show none.
 
 Deviations:
 
-- Sizes of either sign, also of extensions that have but one: the columns stand for what no extension is, too.
+- All at work have sizes of either sign, also extensions that have but one: they stand for what no extension is, too.
 - Columns that theta imitates almost wholly are left out: of those no residual tells the size (``misfit.tolerances``
   has those that matter). So are gains of single logs.
 """
@@ -31,30 +36,42 @@ Deviations:
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.special
 import torch
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import IMITATED
 from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior.truncated_normal import interval_quantile
 
 _NOTHING = 1e-100  # information of a column that moves nothing
+_FAR = 40.0  # sds beyond which a normal has no mass
 
 
 @dataclass(frozen=True)
 class DiscrepancyOptions(Options):
     """What is believed of the discrepancy beforehand, and how many draws are made."""
 
-    absent: float = option(0.5, "prior probability that there is none", least=0, most=1)
-    smallest: float = option(0.3, "root of what it adds to chi-square", "sds", above=0)
-    largest: float = option(3000.0, "the same, at most", "sds", above=0)
+    absent: float = option(0.4, "prior probability that nothing is missing; one or all, half the rest each", least=0)
+    scale: float = option(3.0, "of the half-Cauchy on the root of what it adds to chi-square", "sds", above=0)
+    smallest: float = option(0.3, "of the grid of that root", "sds", above=0)
+    largest: float = option(3000.0, "of the grid of that root", "sds", above=0)
     sizes: int = option(25, "between these two, evenly in their logarithm", least=2)
     draws: int = option(4000, "of theta: quantiles to one or two percent of an sd", least=1)
     causes: int = option(3, "extensions that are named: those that move theta most", least=1)
+
+    @property
+    def grid(self) -> tuple[FloatArray, FloatArray]:
+        """The sizes t (T,) and their prior probabilities."""
+        t = np.geomspace(self.smallest, self.largest, self.sizes)
+        density = t / (1 + (t / self.scale) ** 2)  # by logarithm
+        return t, density / density.sum()
 
 
 _OPTIONS = DiscrepancyOptions()
@@ -95,82 +112,108 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
     whole, cross = seen.arrow.precision[n:, n:], seen.arrow.precision[n:, :n]
     information = whole - cross @ seen.answer
     size, most = np.diag(information), np.diag(whole)
-    usable = [
-        not p.by_log and m > _NOTHING and s > IMITATED * m for p, s, m in zip(logs.probes, size, most, strict=True)
-    ]
-    kept = np.flatnonzero(usable)
+    able = [not p.by_log and m > _NOTHING and s > IMITATED * m for p, s, m in zip(logs.probes, size, most, strict=True)]
+    kept = np.flatnonzero(able)
     if not len(kept):
         return None
     names = [logs.probes[k].name for k in kept]
-    scale = shared_out(names, size[kept])
-    size_posterior = SizePosterior.of(
-        information[np.ix_(kept, kept)] * np.outer(scale, scale), seen.score[kept] * scale, options
-    )
-    drawn = size_posterior.draws(options.draws, np.random.default_rng(seed)) * scale
+    columns = Columns(names, information[np.ix_(kept, kept)], seen.score[kept], logs.one_sided[kept])
+    drawn, present = columns.draws(options, np.random.default_rng(seed))
     moved = -seen.answer[:, kept]
-    return Discrepancy(drawn @ moved.T, size_posterior.present, _largest(names, drawn, moved, seen.variance, options))
-
-
-def shared_out(names: list[str], information: FloatArray) -> FloatArray:
-    """Prior sds (K,) of columns at t = 1: the same of every extension, whatever number of columns (K,) it has."""
-    columns = Counter(names)
-    return np.asarray(1 / np.sqrt(information * len(columns) * np.array([columns[name] for name in names])))
+    return Discrepancy(drawn @ moved.T, present, _largest(names, drawn, moved, seen.variance, options))
 
 
 def _largest(
-    names: list[str],
-    drawn: FloatArray,
-    moved: FloatArray,
-    variance: FloatArray,
-    options: DiscrepancyOptions,
+    names: Sequence[str], drawn: FloatArray, moved: FloatArray, variance: FloatArray, options: DiscrepancyOptions
 ) -> tuple[str, ...]:
     """Of the extensions, those that move theta most: draws (M, K), answers (N, K)."""
     share = {}
     for name in dict.fromkeys(names):
         mine = np.array([other == name for other in names])
-        share[name] = float((((drawn[:, mine] @ moved[:, mine].T) ** 2).mean(0) / np.maximum(variance, 1e-300)).sum())
+        square = ((drawn[:, mine] @ moved[:, mine].T) ** 2).mean(0)
+        share[name] = float((square / np.maximum(variance, 1e-300)).sum())
     return tuple(sorted(share, key=lambda name: -share[name])[: options.causes])
 
 
 @dataclass(frozen=True)
-class SizePosterior:
-    """Of K coefficients with standard normal priors times an unknown t, on a grid of t with zero among it.
+class Columns:
+    """K columns of a discrepancy, all else integrated out.
 
     Args:
-        sizes: (T,) of t.
-        weights: (T,) their probabilities.
-        values: (K,) eigenvalues of the coefficients' information.
-        axes: (K, K) its axes.
-        score: (K,) along them.
+        names: (K,) of the extensions that they belong to.
+        information: (K, K).
+        score: (K,).
+        one_sided: (K,) those whose size may not be negative.
     """
 
-    sizes: FloatArray
-    weights: FloatArray
-    values: FloatArray
-    axes: FloatArray
+    names: Sequence[str]
+    information: FloatArray
     score: FloatArray
-
-    @classmethod
-    def of(cls, information: FloatArray, score: FloatArray, options: DiscrepancyOptions = _OPTIONS) -> SizePosterior:
-        """From their information (K, K) and score (K,)."""
-        values, axes = np.linalg.eigh(information)
-        values, along = np.maximum(values, 0.0), axes.T @ score
-        sizes = np.concatenate([[0.0], np.geomspace(options.smallest, options.largest, options.sizes)])
-        grown = sizes[:, None] ** 2 / (1 + sizes[:, None] ** 2 * values)
-        evidence = -0.5 * np.log1p(sizes[:, None] ** 2 * values).sum(1) + 0.5 * (grown * along**2).sum(1)
-        believed = np.full(len(sizes), (1 - options.absent) / options.sizes)
-        believed[0] = options.absent
-        weights = believed * np.exp(evidence - evidence.max())
-        return cls(sizes, weights / weights.sum(), values, axes, along)
+    one_sided: BoolArray
 
     @property
-    def present(self) -> float:
-        """Probability that t is not zero."""
-        return float(1 - self.weights[0])
+    def parts(self) -> FloatArray:
+        """Each column's share (K,) of its extension's, where all extensions have the same; they add up to one."""
+        count = Counter(self.names)
+        return np.array([1 / (len(count) * count[name]) for name in self.names])
+
+    def draws(self, options: DiscrepancyOptions, random: np.random.Generator) -> tuple[FloatArray, float]:
+        """Of their sizes (M, K), and the probability that there is any."""
+        one, every = _OneAtWork(self, options), _AllAtWork(self, options)
+        states = np.array([0.0, one.log_evidence, every.log_evidence])
+        believed = np.array([options.absent, *[(1 - options.absent) / 2] * 2])
+        weights = believed * np.exp(states - states.max())
+        weights /= weights.sum()
+        counts = random.multinomial(options.draws, weights)
+        none = np.zeros((counts[0], len(self.score)))
+        drawn = np.concatenate([none, one.draws(counts[1], random), every.draws(counts[2], random)])
+        return drawn, float(1 - weights[0])
+
+
+class _OneAtWork:
+    """One column, of any size."""
+
+    def __init__(self, columns: Columns, options: DiscrepancyOptions) -> None:
+        t, believed = options.grid
+        self.precision, self.one_sided = np.diag(columns.information), columns.one_sided
+        self.z, self.shrunk = columns.score / np.sqrt(self.precision), t**2 / (1 + t**2)
+        square = self.shrunk[:, None] * self.z**2
+        evidence = -0.5 * np.log1p(t**2)[:, None] + 0.5 * square
+        half = np.log(2) + scipy.special.log_ndtr(np.sqrt(self.shrunk)[:, None] * self.z)
+        evidence = evidence + np.where(self.one_sided, half, 0.0) + np.log(believed)[:, None] + np.log(columns.parts)
+        self.log_evidence = float(scipy.special.logsumexp(evidence))
+        self.weights = np.exp(evidence - self.log_evidence)
 
     def draws(self, count: int, random: np.random.Generator) -> FloatArray:
-        """Of the coefficients (count, K)."""
-        t = random.choice(self.sizes, count, p=self.weights)[:, None]
-        variance = t**2 / (1 + t**2 * self.values)
-        along = variance * self.score + np.sqrt(variance) * random.standard_normal((count, len(self.values)))
-        return np.asarray(along @ self.axes.T)
+        """Of the sizes (count, K)."""
+        weights = self.weights.ravel() / self.weights.sum()
+        t, k = np.divmod(random.choice(len(weights), count, p=weights), len(self.z))
+        sd = np.sqrt(self.shrunk[t])
+        mean = sd**2 * self.z[k]
+        low = np.where(self.one_sided[k], -mean / sd, -_FAR)
+        own = mean + sd * interval_quantile(low, np.maximum(low, 0.0) + _FAR, random.uniform(size=count))
+        sizes = np.zeros((count, len(self.z)))
+        sizes[np.arange(count), k] = own / np.sqrt(self.precision[k])
+        return sizes
+
+
+class _AllAtWork:
+    """All columns at once, each a little."""
+
+    def __init__(self, columns: Columns, options: DiscrepancyOptions) -> None:
+        self.t, believed = options.grid
+        self.scale = np.sqrt(columns.parts / np.diag(columns.information))
+        values, self.axes = np.linalg.eigh(columns.information * np.outer(self.scale, self.scale))
+        self.values, self.along = np.maximum(values, 0.0), self.axes.T @ (self.scale * columns.score)
+        square = self.t[:, None] ** 2
+        grown = square / (1 + square * self.values)
+        evidence = 0.5 * (grown * self.along**2 - np.log1p(square * self.values)).sum(1) + np.log(believed)
+        self.log_evidence = float(scipy.special.logsumexp(evidence))
+        self.weights = np.exp(evidence - self.log_evidence)
+
+    def draws(self, count: int, random: np.random.Generator) -> FloatArray:
+        """Of the sizes (count, K)."""
+        square = random.choice(self.t, count, p=self.weights / self.weights.sum())[:, None] ** 2
+        variance = square / (1 + square * self.values)
+        along = variance * self.along + np.sqrt(variance) * random.standard_normal((count, len(self.values)))
+        return np.asarray(along @ self.axes.T * self.scale)

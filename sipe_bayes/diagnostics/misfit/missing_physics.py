@@ -15,7 +15,7 @@ and widens what each log asks for.
 Where the corrected residuals pass for noise, the logs are corrected. Else physics are missing that the library does not
 hold, or that are not small: what the logs ask for and what they do when corrected are then mixed in equal parts. The
 few columns that were taken may stand in for others. So half of the interval is that of the posterior with a
-discrepancy that the whole library spans (``misfit.library_discrepancy``). It is widened by the gains that no motion
+discrepancy that the library spans (``misfit.library_discrepancy``). It is widened by the gains that no motion
 tells (``misfit.tolerances``).
 
 Where nothing is seen to be missing, no further log is asked for: the posterior is widened by that discrepancy alone.
