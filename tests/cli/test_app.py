@@ -65,10 +65,10 @@ def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
     assert found["warnings"] == []
     wanted = {"name", "unit", "targets", "mean", "sd", "q05", "q50", "q95", "contraction", "flags"}
     assert [wanted - set(p) for p in found["parameters"]] == [set(), set()]
-    for p in found["parameters"]:  # nothing is missing: hardly wider
+    for p in found["parameters"]:  # nothing is missing: a fifth wider on average
         low, high = p["further"]
         assert low <= p["q05"] < p["q95"] <= high
-        assert high - low < 1.3 * (p["q95"] - p["q05"])
+        assert high - low < 1.6 * (p["q95"] - p["q05"])
     for use, name in (("holdout", "rest"), ("train", "log")):
         assert [set(s) for s in found[use]] == [{"log", "channel", "unit", "rmse", "rmse_default"}]
         assert (found[use][0]["log"], found[use][0]["channel"], found[use][0]["unit"]) == (name, "angle", "rad")
