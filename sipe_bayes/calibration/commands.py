@@ -17,7 +17,7 @@ import numpy as np
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.config_tables import Command
-from sipe_bayes.calibration.init.machine import Drive, drive_of
+from sipe_bayes.calibration.init.machine import Drive, drive_of, full_of
 from sipe_bayes.calibration.init.names import Kind, read_name
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.units import DIMENSIONS, UNITS, find_unit, unit_words
@@ -62,7 +62,7 @@ def check_commands(config: Config) -> tuple[Finding, ...]:
                 f"{config.path}: key `commands[{i}].unit`: actuator {command.actuator!r} is given {own}, got "
                 f"{unit.word!r} ({unit.dimension}); use one of {words}, or '1' with the `factor` that makes it one"
             )
-        doubts += list(_doubts(config, command, drive_of(model, index)))
+        doubts += list(_doubts(config, command, drive_of(model, index), full_of(model, index)))
     return tuple(doubts)
 
 
@@ -140,8 +140,8 @@ def _described(config: Config, command: Command) -> tuple[str, ...]:
     return tuple(UNITS[word].dimension for word in words if word in UNITS)
 
 
-def _doubts(config: Config, command: Command, drive: Drive) -> Iterator[Finding]:
-    """Where a column's name, or what else it is, speaks against its being this command."""
+def _doubts(config: Config, command: Command, drive: Drive, full: float | None) -> Iterator[Finding]:
+    """Where a column's name, its unit, or what else it is, speaks against its being this command."""
     label = read_name(command.column)
     measured = [m.target for m in config.measurements if command.column in m.sources and "sensor:" not in m.target]
     is_driven = drive in (Drive.FORCE, Drive.VOLTAGE)
@@ -149,6 +149,10 @@ def _doubts(config: Config, command: Command, drive: Drive) -> Iterator[Finding]
         yield _doubt(command, drive, f"measures {measured[0]}")
     elif len(command.column) > 1 and label.kind in _OTHERWISE.get(drive, ()):
         yield _doubt(command, drive, f"is called like a {label.kind.name.lower()}")
+    if command.unit == "%" and command.factor == 1 and command.supply is None and full not in (None, 1.0):
+        yield _doubt(
+            command, drive, f"has 100 % for one unit of control (`factor = {full:g}`: for the whole ctrlrange)"
+        )
 
 
 def _doubt(command: Command, drive: Drive, why: str) -> Finding:

@@ -263,10 +263,8 @@ def _matched(logs: tuple[LogEntry, ...], info: ValidationInfo) -> tuple[LogEntry
         if files == [log.file]:
             entries.append(log)
             continue
-        own = log.name != log.file.stem
-        names = [f"{log.name}-{k}" for k in range(len(files))] if own else names_of(files)
-        pairs = zip(files, names, strict=True)
-        entries += [log.model_copy(update={"file": file, "name": name}) for file, name in pairs]
+        names = names_of(files) if log.name == log.file.stem else [f"{log.name}-{k}" for k in range(len(files))]
+        entries += [log.model_copy(update={"file": f, "name": name}) for f, name in zip(files, names, strict=True)]
     return tuple(entries)
 
 
@@ -391,6 +389,8 @@ class Structure(Table):
     """joints, actuators, bodies and channels where extensions may be placed; default all"""
     budget: Budget | None = None
     """rollouts of all its fits; default 20,000"""
+    probability: Annotated[float, Strict(), Field(gt=0, le=1)] = 1.0
+    """of this model's structure among those that it tried, as `sipe discover` writes it into `discovered.toml`"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

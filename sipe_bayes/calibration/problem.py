@@ -19,6 +19,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import read_json, reading
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
@@ -128,7 +129,6 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
                     "which trains; hold out another log"
                 )
     prior, remarks = _prior(config, environment.space, train_reports)
-    remarks = (*doubts, *remarks)
     return Problem(
         config,
         environment,
@@ -138,8 +138,14 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
         Trajectories.stack(train),
         Trajectories.stack(held) if held else None,
         (*train_reports, *held_reports),
-        remarks,
+        (*doubts, *remarks, *_of_structure(config.structure.probability)),
     )
+
+
+def _of_structure(probability: float) -> list[Finding]:
+    """That a search was not sure of the model's structure."""
+    sure = probability >= THRESHOLDS.sure_of_structure
+    return [] if sure else [finding(Code.STRUCTURE_UNCERTAIN, probability=probability)]
 
 
 def _read(

@@ -190,6 +190,10 @@ ADVICE: dict[Code, str] = {
     Code.LOG_CLIPPED: "A saturated sensor lies. Cut those parts out by `span`, or send less.",
     Code.PRIOR_OF_MIXTURE: "Give the logs of both runs to one fit instead, if the modes lie far apart.",
     Code.PRIOR_COUNTED_TWICE: "Take those logs out of this run, or drop `prior.from`.",
+    Code.STRUCTURE_UNCERTAIN: (
+        "Compare the values with those of `sipe discover`'s report; where they differ, take its wider intervals, or "
+        "record logs that tell the structures apart."
+    ),
     Code.COMMAND_DOUBTED: "Name the column that drives the actuator; if this one does, nothing is to be done.",
     Code.NOT_EXPORTED: "The posterior is not touched; only the written model leaves it out.",
     Code.BIAS_NOT_EXPORTED: "A simulated sensor has no such error: correct the measurement where you use it.",

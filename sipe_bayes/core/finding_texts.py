@@ -326,6 +326,10 @@ class Code(Enum):
     PRIOR_COUNTED_TWICE = caution(
         "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow"
     )
+    STRUCTURE_UNCERTAIN = caution(
+        "the structure of this model has a probability of {probability:.2g} among those that `sipe discover` tried, "
+        "and the intervals hold where it is right: the values of its report are averaged over all of them"
+    )
     COMMAND_DOUBTED = caution(
         "column {column!r} {reason}, and is given as the command of {actuator!r}, which takes {drive}"
     )

@@ -57,6 +57,12 @@ class Thresholds(Options):
         0.25, "a parameter with a smaller loading is no member of a ridge", "of the largest loading"
     )
 
+    sure_of_structure: float = option(
+        0.9,
+        "a structure that is less probable leaves out of a 90 % interval more than that interval does",
+        "probability",
+    )
+
     # logs and what the model lacks
     logs_disagree: float = option(
         0.01, "false alarms of logs that agree; rare, since each pair of logs is a chance", "p-value"

@@ -71,7 +71,7 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     partly = f"; {TEXTS[Code.DEAD_RANGE].row}" if Code.DEAD_RANGE in codes else ""
     if parameter.contraction < THRESHOLDS.well_determined:
         return Verdict("fair", "weakly determined" + partly)
-    doubted = "; but see the doubt above" if findings.blocking else ""
+    doubted = "; doubted above" if findings.blocking else ""
     return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
 
 
@@ -91,7 +91,7 @@ def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Ve
     prior = _FIVE_TO_95 * parameter.sd / max(1 - parameter.contraction, 1e-12)
     if not (high - low) < (1 - THRESHOLDS.not_determined) * prior:
         return Verdict("bad", "not determined")
-    doubted = "; but see the doubt above" if _doubts(findings, [parameter]) else ""
+    doubted = "; doubted above" if _doubts(findings, [parameter]) else ""
     return Verdict("fair", "within the wider interval" + doubted)
 
 

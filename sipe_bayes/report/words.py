@@ -7,8 +7,10 @@ import re
 from collections.abc import Sequence
 
 from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.core.units import UNITS
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_LAST_WORD = re.compile(r"^(.*\w)[\s_.\-]*[\s_.\-\[(]([^\s_\[\]()]+)[\])]?$")
 
 
 def significant(value: float, sd: float, scale: float | None = None) -> str:
@@ -67,13 +69,16 @@ def unit_text(unit: str) -> str:
 
 
 def with_unit(name: str, unit: str, separator: str = " ") -> str:
-    """``name [unit]``, the name alone where there is no unit.
+    """``name [unit]``, the name alone where there is no unit: ``with_unit("pan_deg", "rad") == "pan [rad]"``.
 
     Args:
-        name: of a quantity.
+        name: of a quantity; another unit of the same dimension at its end, as of a log's column, is left out.
         unit: its unit; empty for none.
         separator: what stands before the bracket.
     """
+    last = _LAST_WORD.match(name)
+    if last and last[2] != unit and last[2] in UNITS and unit in UNITS:
+        name = last[1] if UNITS[last[2]].dimension == UNITS[unit].dimension else name
     text = unit_text(unit)
     return f"{name}{separator}[{text}]" if text else name
 

@@ -121,6 +121,9 @@ def test_nothing_is_commanded_in_kg(actuator: str, tmp_path: Path) -> None:
         ('<velocity name="driven" joint="hinge"/>', "speed", "rad/s", False),
         *[(MOTOR, column, "N m", False) for column in ("torque", "u", "x", "ctrl[0]", "motor", "goal", "tau_hinge")],
         (EMF.format(gain=0.05), "volts", "V", False),
+        ('<motor name="driven" joint="hinge" ctrllimited="true" ctrlrange="-80 80"/>', "duty", "%", True),
+        ('<motor name="driven" joint="hinge" ctrllimited="true" ctrlrange="-1 1"/>', "duty", "%", False),
+        (MOTOR, "duty", "%", False),
     ],
 )
 def test_a_column_of_another_name_is_doubted(

@@ -87,9 +87,17 @@ def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Disco
     assert [p["name"] for p in data["parameters"]] == ["rod_mass", "damping", "hinge.dry_friction"]
     assert not Path(data["model"]).is_absolute()
     assert data["search"]["start"] == pytest.approx(dict(found.best))
+    assert data["structure"]["probability"] == pytest.approx(found.kept[0].probability, rel=0.01)
     again = run(Path(found.out) / "discovered.toml", out=config.parent / "again", num_threads=1)
     best = json.loads((Path(found.out) / "structures.json").read_text())["best"]
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-3)
+
+
+@pytest.mark.parametrize(("probability", "told"), [(0.62, True), (0.95, False)])
+def test_how_probable_the_structure_was_is_not_forgotten(probability: float, told: bool, tmp_path: Path) -> None:
+    config = write_lacking(tmp_path, structure=f"[structure]\nprobability = {probability}\n")
+    said = [text for text in sipe.prepare(config, 1).warnings if "the structure of this model" in text]
+    assert [f"a probability of {probability:.2g}" in text for text in said] == [True] * told
 
 
 def test_what_mjcf_has_no_element_for_travels_with_the_model_and_is_said(tmp_path: Path) -> None:

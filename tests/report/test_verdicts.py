@@ -213,7 +213,7 @@ def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
     assert judged.headline([wide], lacks).text == "It does not tell how well it predicts; damping not at all."
     doubted = Findings([*lacks, doubt("the chains have not mixed", Code.NOT_MIXED)])
     assert "yet: the chains have not mixed" in judged.headline([narrow, wide], doubted, held).text
-    assert "doubt above" in judged.parameter_verdict(narrow, doubted).text
+    assert "doubted above" in judged.parameter_verdict(narrow, doubted).text
 
 
 def doubt(text: str, code: Code = Code.SEARCH_SPREAD) -> Finding:
@@ -228,7 +228,7 @@ def test_doubts_come_first_and_mixing_is_said_once(calibration: Calibration) -> 
     assert not any("NOT mixed" in text for text in texts)
     texts = [v.text for v in judged.verdicts(dataclasses.replace(found, findings=(doubt("another"),)))]
     assert any("NOT mixed" in text for text in texts)
-    assert "but see the doubt above" in report.render(found, [])
+    assert "doubted above" in report.render(found, [])
 
 
 def test_where_nothing_is_seen_to_be_missing_values_are_trusted_and_what_would_not_show_is_named(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_tables import Command, Measurement
-from sipe_bayes.calibration.init.decisions import decide
+from sipe_bayes.calibration.init.decisions import AGAINST, decide, fitted_miss
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
 from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.machine import Machine
@@ -37,6 +38,7 @@ from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 
 _LOGS = 3  # that are simulated
 _BETTER = np.log(1.5)  # of the logarithm of misses together, from which another reading is named
+_ROUNDS = 12  # of the fits with either reading: a model that is far off speaks for wrong units
 
 
 def oddities(path: Path) -> list[str]:
@@ -60,12 +62,16 @@ def oddities(path: Path) -> list[str]:
     logs = loaded(part, sources, folder)
     trial, layout = trial_of(part, model, machine, logs, folder, FEW)
     better = decide(part, machine, trial, layout)
-    now, then = np.log(trial.misses([trial.given, layout.assumption(trial, part, better.readings)], trial.theta)).sum(
-        axis=1
-    )
     gain, out = _swapped(part, trial)
-    if float(now - then) > max(gain, _BETTER):
-        out = _other_readings(part, better, float(now - then))
+    changed = [
+        (a, b) for a, b in zip(part.readings, better.readings, strict=True) if (a.unit, a.sign) != (b.unit, b.sign)
+    ]
+    if changed:
+        then = layout.assumption(trial, part, better.readings)
+        (now, _), (other, _) = (fitted_miss(trial, assumption, _ROUNDS) for assumption in (trial.given, then))
+        named = all(a.sign == b.sign and read_name(a.match.column).unit == a.unit for a, b in changed)
+        if now - other > max(gain, AGAINST if named else _BETTER):
+            out = _other_readings(changed, np.exp((now - other) / len(part.measurements)))
     if not out:
         trial, _ = trial_of(part, model, machine, logs, folder, MANY)
         left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=6)
@@ -102,18 +108,16 @@ def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
     )
 
 
-def _other_readings(draft: Draft, better: Draft, gain: float) -> list[str]:
-    """Units and signs with which the logs are followed better; gain: the logarithm of by how much."""
+def _other_readings(changed: Sequence[tuple[Reading, Reading]], times: float) -> list[str]:
+    """Units and signs with which the logs are followed so many times better, whatever the unknowns."""
     out = []
-    for now, then in zip(draft.readings, better.readings, strict=True):
-        table = "commands" if now.commanded else "measurements"
-        where = f"{table}, column {now.match.column!r}"
-        channels = len(draft.measurements)
-        times = f"simulated windows miss {np.exp(gain / channels):.2g} times as much with what stands there"
+    for now, then in changed:
+        where = f"{'commands' if now.commanded else 'measurements'}, column {now.match.column!r}"
+        more = f"fits the log: simulated windows miss {times:.2g} times as much with what stands there"
         if now.unit != then.unit:
-            out.append(f"{where}: unit {now.unit!r} is odd, {then.unit!r} fits the log: {times}")
+            out.append(f"{where}: unit {now.unit!r} is odd, {then.unit!r} {more}")
         if now.sign != then.sign:
-            out.append(f"{where}: sign {now.sign} is odd, {then.sign} fits the log: {times}")
+            out.append(f"{where}: sign {now.sign} is odd, {then.sign} {more}")
     return out
 
 

@@ -16,6 +16,7 @@ from sipe_bayes.calibration.init.trials import Assumption, Trial
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 
+AGAINST = np.log(2.0)  # of the logarithm of misses, from which a simulation is believed against a name
 _MOST = 300  # combinations that are all simulated; beyond, one question after the other
 _CLEAR = np.log(1.5)  # of the logarithm of misses, from which a nominal simulation decides
 _DECIDED = np.log(1.12)  # and one whose unknowns are fitted
@@ -23,11 +24,9 @@ _USELESS = 0.9  # of a straight line's miss, from which no simulation tells anyt
 _POOR = 0.7  # of a straight line's miss, beyond which the nominal model is not believed
 _FAR = np.log(4.0)  # of the best of other units, up to which they are fitted too
 _SAME = np.log(1.02)
-_AGAINST = np.log(2.0)  # from which a simulation is believed against a name
 _UNLIKELY = 0.01  # by which what is not likely has to be better
 _FITTED = 4  # combinations that are fitted where the nominal model does not decide
 _FIRST_DELAYS = (0, 1, 2, 4)
-
 
 Answer = Scale | int
 
@@ -314,17 +313,24 @@ def _fitted(case: Case, asked: Sequence[Question], ranking: Ranking, rivals: lis
     for i in rivals:
         readings = _answered(case.draft.readings, asked, ranking.answers[i])
         assumption = case.assumption(readings)
-        left = fit(case.trial, assumption, _FIRST_DELAYS, rounds=3)
-        # from measured starts: where starts may move as well, motions that are read as tiny fit anything
-        misses = case.trial.misses([replace(assumption, delay=left.best)], left.theta)
-        odd = _odd_sizes(case, readings) + _unlikely(asked, ranking.answers[i])
-        scores.append(float(np.log(misses).sum()) + odd)
-        thetas.append(left.theta)
+        miss, theta = fitted_miss(case.trial, assumption, rounds=3)
+        scores.append(miss + _odd_sizes(case, readings) + _unlikely(asked, ranking.answers[i]))
+        thetas.append(theta)
     rest = [i for i in range(len(ranking.answers)) if i not in rivals]
     shift = max(scores) - float(ranking.scores[rivals].max())
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
     ranked = Ranking(answers, np.array(scores + (ranking.scores[rest] + shift).tolist()))
     return ranked, thetas[int(np.argmin(scores))]
+
+
+def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:
+    """The logarithm of what all channels together miss from measured starts, the unknowns fitted, and these (N,).
+
+    Starts stay: where they may move as well, motions that are read as tiny fit anything.
+    """
+    left = fit(trial, assumption, _FIRST_DELAYS, rounds)
+    misses = trial.misses([replace(assumption, delay=left.best)], left.theta)
+    return float(np.log(misses).sum()), left.theta
 
 
 def _with_evidence(
@@ -383,7 +389,7 @@ def _against_names(case: Case, readings: list[Reading], base: FloatArray) -> lis
         gaps = np.log(case.misses(sets) / base).sum(axis=1)
         best = int(np.argmin(gaps))
         note = f"{reading.unit}, as its name says"
-        if gaps[best] < -_AGAINST:
+        if gaps[best] < -AGAINST:
             text = f"its name says {reading.unit}, but simulations follow it far better in {others[best]}"
             out[k] = replace(
                 reading, doubts=(*reading.doubts, text), instead=(*reading.instead, f'unit = "{others[best]}"')

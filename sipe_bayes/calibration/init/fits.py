@@ -19,6 +19,7 @@ _STEP = 0.02  # of the cube, of finite differences
 _START_STEP = 1e-4  # rad or m, rad/s or m/s
 _PRIOR = 0.4  # sd in the cube of what a model does not know
 _LOOSE = 1e-6  # what starts that nothing tells are held by
+_ROUNDING = 1e-13  # of a matrix's trace
 _LOST = 1e6  # of a simulation that has diverged
 _LEAST = 2e-3  # of the motion: noise is taken for no smaller
 _SETTLED = 0.02  # of the logarithm of what is left, of all channels together
@@ -82,7 +83,9 @@ class _Slopes:
     def inner(self) -> FloatArray:
         """(W, F, F) of the starts."""
         free = self.by_start
-        return np.einsum("wrf,wrg->wfg", free, free) + _LOOSE * np.eye(free.shape[2])
+        full = np.einsum("wrf,wrg->wfg", free, free)
+        held = _LOOSE + _ROUNDING * np.trace(full, axis1=1, axis2=2)  # of windows that diverged, more than rounding
+        return full + held[:, None, None] * np.eye(free.shape[2])
 
     def start_of(self, values: FloatArray) -> FloatArray:
         """What starts (..., W, F) take of differences (..., W, R)."""

@@ -38,12 +38,16 @@ class Joint:
 
 @dataclass(frozen=True)
 class Actuator:
-    """An actuator with one control, what it is given, and the joint that it moves."""
+    """An actuator with one control, what it is given, and the joint that it moves; full: what a whole duty stands for.
+
+    That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
+    """
 
     name: str
     drive: Drive
     joint: Joint | None
     rank: int
+    full: float | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class Machine:
         ]
         by_id = dict(zip(named, joints, strict=True))
         actuators = [
-            Actuator(model.actuator(i).name, drive_of(model, i), by_id.get(_joint_of(model, i)), k)
+            Actuator(model.actuator(i).name, drive_of(model, i), by_id.get(_joint_of(model, i)), k, full_of(model, i))
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
         free = [i for i in range(model.njnt) if int(model.jnt_type[i]) not in scalar]
@@ -95,6 +99,13 @@ def drive_of(model: mujoco.MjModel, index: int) -> Drive:
     if not of_velocity:
         return Drive.FORCE
     return Drive.VELOCITY if np.isclose(gain, -of_velocity) else Drive.VOLTAGE
+
+
+def full_of(model: mujoco.MjModel, index: int) -> float | None:
+    """The end of a ctrlrange that begins at zero or as far below it; None where an actuator has no such range."""
+    low, high = model.actuator_ctrlrange[index].tolist()
+    even = bool(model.actuator_ctrllimited[index]) and high > 0 and low in (0.0, -high)
+    return float(high) if even else None
 
 
 def _joint_of(model: mujoco.MjModel, index: int) -> int:

@@ -161,7 +161,8 @@ def _command(machine: Machine, match: Match, matches: Matches, table: Table) -> 
         Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(match.label.kind, "V"),
         Drive.OTHER: "1",
     }[actuator.drive]
-    if match.label.kind == Kind.DUTY:
+    share = match.label.unit == "%" and actuator.drive in (Drive.FORCE, Drive.VOLTAGE, Drive.OTHER)
+    if share or match.label.kind == Kind.DUTY:
         return _duty(match, actuator, table)
     named = match.label.unit
     fits = named in (unit_words(find_unit(default).dimension)) or (
@@ -194,8 +195,11 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
         volts = "mV" if float(np.nanmedian(table[voltages[0]])) > _MILLIVOLTS else "V"
         note = f"what arrives is it times {voltages[0]!r}"
         return replace(reading, supply=(voltages[0], volts), notes=(*reading.notes, note))
+    if actuator.full is not None:
+        note = f"all of it is taken for {actuator.full:g}, where the model's ctrlrange ends"
+        return replace(reading, factor=float(f"{factor * actuator.full:.6g}"), notes=(*reading.notes, note))
     if actuator.drive != Drive.VOLTAGE:
-        return reading
+        return replace(reading, notes=(*reading.notes, "all of it is one unit of control: the model has no ctrlrange"))
     doubt = f"a share of which voltage? no column tells; multiply `factor` by the supply's volts for {actuator.name}"
     return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
 

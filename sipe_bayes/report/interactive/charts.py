@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import Signal
 from sipe_bayes.report.colours import DEFAULT, MEASURED, POSTERIOR
-from sipe_bayes.report.words import unit_text
+from sipe_bayes.report.words import with_unit
 
 _ASSETS = Path(__file__).parent / "assets"
 _NUMBERS = 1_500_000  # that a page holds; about 2 MB
@@ -95,7 +95,7 @@ def _log(signals: Sequence[Signal], every: int, codes: list[NDArray[np.uint16]])
         "count": len(time),
         "windows": starts[starts < len(time)].tolist(),
         "channels": [
-            {"name": s.channel, "unit": unit_text(s.unit)}
+            {"name": s.channel, "label": with_unit(s.channel, s.unit), "error": with_unit("error", s.unit)}
             | {key: _coded(getattr(s, key)[::every], codes) for key in _SERIES}
             for s in signals
         ],

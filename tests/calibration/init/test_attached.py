@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pandas as pd
+import pytest
 
 from sipe_bayes.calibration.init.propose import propose
 
@@ -38,6 +39,20 @@ def _arm_log(folder: Path, unit: str) -> None:
     pd.DataFrame(rows, columns=["t", f"shoulder_{unit}", f"elbow_{unit}", "shoulder_rad", "elbow_rad"]).to_csv(
         folder / "log.csv", index=False
     )
+
+
+@pytest.mark.parametrize(("end", "factor"), [(40.0, 40.0), (1.0, 1.0), (None, 1.0)])
+def test_a_share_is_one_of_the_ctrlrange(end: float | None, factor: float, tmp_path: Path) -> None:
+    _arm_log(tmp_path, "duty")
+    limits = "" if end is None else f'ctrllimited="true" ctrlrange="-{end} {end}" '
+    (tmp_path / "arm.xml").write_text(ARM.replace("<motor ", f"<motor {limits}"))
+    table = pd.read_csv(tmp_path / "log.csv")
+    table[["shoulder_cmd_pct", "elbow_cmd_pct"]] = 100 * table[["shoulder_duty", "elbow_duty"]]
+    table.drop(columns=["shoulder_duty", "elbow_duty"]).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "arm.xml", [tmp_path / "log.csv"], tmp_path)
+    assert [(r.unit, r.factor) for r in draft.commands] == [("%", factor)] * 2
+    assert all("all of it is" in note for r in draft.commands for note in r.notes if "ctrlrange" in note)
+    assert all(any("ctrlrange" in note for note in r.notes) for r in draft.commands)
 
 
 def test_what_is_attached_is_offered(tmp_path: Path) -> None:

@@ -89,10 +89,9 @@
     ];
     const bands = [{ series: [5, 4], fill: page.colours.mode + "40" }];
     const error = [{ ...line("measured", { width: 1 }), label: `measured − ${page.labels.mode}` }];
-    const unit = channel.unit ? ` [${channel.unit}]` : "";
     drawn = [
-      draw(part("above"), 320, above, bands, columns.slice(0, 6), channel.name + unit),
-      draw(part("below"), 190, error, [], [columns[0], columns[6]], "error" + unit),
+      draw(part("above"), 320, above, bands, columns.slice(0, 6), channel.label),
+      draw(part("below"), 190, error, [], [columns[0], columns[6]], channel.error),
     ];
     part("above").setAttribute("aria-label", `${channel.name} of ${log.name}, measured and simulated over time`);
     part("below").setAttribute("aria-label", `${channel.name} of ${log.name}, measured less ${page.labels.mode}`);
