@@ -21,11 +21,12 @@ _MOST = 300  # combinations that are all simulated; beyond, one question after t
 _CLEAR = np.log(1.5)  # of the logarithm of misses, from which a nominal simulation decides
 _DECIDED = np.log(1.12)  # and one whose unknowns are fitted
 _USELESS = 0.9  # of a straight line's miss, from which no simulation tells anything
-_POOR = 0.7  # of a straight line's miss, beyond which the nominal model is not believed
-_FAR = np.log(4.0)  # of the best of other units, up to which they are fitted too
+_POOR = 0.7  # of a straight line's miss, beyond which the nominal model tells nothing
+_BELIEVED = 0.3  # up to which it decides
+_FAR = np.log(4.0)  # behind the best, up to which combinations are fitted
 _SAME = np.log(1.02)
 _UNLIKELY = 0.01  # by which what is not likely has to be better
-_FITTED = 4  # combinations that are fitted where the nominal model does not decide
+_FITTED = 4  # units, and combinations of signs with each, that are fitted where the nominal model does not decide
 _FIRST_DELAYS = (0, 1, 2, 4)
 
 Answer = Scale | int
@@ -170,7 +171,7 @@ class Ranking:
 
 
 def _unlikely(asked: Sequence[Question], answers: Sequence[Answer]) -> float:
-    """A little against turned signs and against units that are not the likeliest: they have to be better by it."""
+    """A little against turned signs and units that are not the likeliest: they have to be better by it."""
     return sum(_UNLIKELY for q, a in zip(asked, answers, strict=True) if a != q.answers[0])
 
 
@@ -194,10 +195,8 @@ def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draf
     readings = _against_names(case, readings, base)
     doubts = [*draft.doubts, *_mirrored(asked, ranking, readings)]
     if float(np.log(base).mean()) > np.log(_USELESS):
-        doubts.append(
-            "no simulation follows these logs better than a straight line does, so units and signs stand on names "
-            "alone; look at the model and at what drives it"
-        )
+        text = "no simulation follows these logs better than a straight line does, so units and signs stand on names"
+        doubts.append(f"{text} alone; look at the model and at what drives it")
     measured = len(draft.measurements)
     return replace(
         draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]), doubts=tuple(doubts)
@@ -290,18 +289,19 @@ def _odd_sizes(case: Case, readings: Sequence[Reading]) -> float:
 
 
 def _rivals(ranking: Ranking, channels: int) -> list[int]:
-    """Combinations that miss hardly more than the best, and are no mirror images; the best ones where all miss much."""
+    """Combinations to be fitted: none where the model as given decides, else of each unit those that miss little more.
+
+    A model that is far off follows a log no better with its signs right, and near to rest most machines are linear.
+    """
     order = [int(i) for i in np.argsort(ranking.scores, kind="stable")]
-    behind = ranking.scores - ranking.scores[order[0]]
-    if float(ranking.scores[order[0]]) > channels * np.log(_POOR):
-        return order[:_FITTED]
-    near = [i for i in order if behind[i] < _CLEAR]
-    if all(behind[i] <= _SAME for i in near):
+    behind, best = ranking.scores - ranking.scores[order[0]], float(ranking.scores[order[0]])
+    if best <= channels * np.log(_BELIEVED) and (behind[behind < _CLEAR] <= _SAME).all():
         return []
-    units: dict[tuple[Scale, ...], int] = {}  # near to rest most machines are linear: every unit gets its chance
+    units: dict[tuple[Scale, ...], list[int]] = {}
     for i in order:
-        units.setdefault(tuple(a for a in ranking.answers[i] if isinstance(a, Scale)), i)
-    return list(dict.fromkeys([*near[:_FITTED], *(i for i in units.values() if behind[i] < _FAR)]))
+        if behind[i] < _FAR or best > channels * np.log(_POOR):
+            units.setdefault(tuple(a for a in ranking.answers[i] if isinstance(a, Scale)), []).append(i)
+    return [i for same in list(units.values())[:_FITTED] for i in same[:_FITTED]]
 
 
 def _fitted(case: Case, asked: Sequence[Question], ranking: Ranking, rivals: list[int]) -> tuple[Ranking, FloatArray]:
@@ -317,10 +317,9 @@ def _fitted(case: Case, asked: Sequence[Question], ranking: Ranking, rivals: lis
         scores.append(miss + _odd_sizes(case, readings) + _unlikely(asked, ranking.answers[i]))
         thetas.append(theta)
     rest = [i for i in range(len(ranking.answers)) if i not in rivals]
-    shift = max(scores) - float(ranking.scores[rivals].max())
+    shifted = ranking.scores[rest] + max(scores) - float(ranking.scores[rivals].max())
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
-    ranked = Ranking(answers, np.array(scores + (ranking.scores[rest] + shift).tolist()))
-    return ranked, thetas[int(np.argmin(scores))]
+    return Ranking(answers, np.array([*scores, *shifted.tolist()])), thetas[int(np.argmin(scores))]
 
 
 def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:
