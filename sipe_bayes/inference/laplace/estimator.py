@@ -30,7 +30,7 @@ from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
 from sipe_bayes.inference.stretches import look_size, proposals, stretches
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
+from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
@@ -48,6 +48,7 @@ class LaplaceState:
         draws: those that take the normal's place; None before them, and where it stands.
         given: batches of them whose proposals the draws did not make.
         judgements: of the normals of a chain's optima, best first.
+        looked: whether what lies beyond the normal of a chain's optimum has been looked at.
         unjudged: whether the budget left no room to see whether the posterior of windows is a normal.
         done: whether all have ended.
     """
@@ -56,6 +57,7 @@ class LaplaceState:
     draws: Draws | None = None
     given: int = 0
     judgements: tuple[Judgement, ...] = ()
+    looked: bool = False
     unjudged: bool = False
     done: bool = False
 
@@ -88,7 +90,9 @@ class Laplace(Estimator[LaplaceState]):
 
     def budget_for(self, trajectories: Trajectories) -> int:
         """So many that each starting point may be followed to the end: it grows with logs and unknowns."""
-        return max(self.default_budget, _STEPS * (len(self.space) + self._num_start + _TRIALS) * len(trajectories))
+        each = _STEPS * (len(self.space) + self._num_start + _TRIALS)
+        each += draws_size(len(self.space), self.problem) if isinstance(self.likelihood, StateSpace) else 0
+        return max(self.default_budget, each * len(trajectories))
 
     @property
     def _num_start(self) -> int:
@@ -130,27 +134,27 @@ class Laplace(Estimator[LaplaceState]):
                 search = strategy.step(state.search)
         except BudgetExhausted:
             windows.budget = self.budget
-            if not isinstance(windows, Chain) or state.judgements or not state.search.optima:
+            if not isinstance(windows, Chain) or state.looked or not state.search.optima:
                 raise
-            judged, target = self._judged(windows, state, distinct(state.search.optima))
+            kept = distinct(state.search.optima)
+            judged, target = (state, None) if state.judgements else self._judged(windows, state, kept)
             if not judged.judgements:
                 raise
             return replace(self._looked_beyond(windows, judged, target), done=False)  # the next step ends it
         windows.budget = self.budget
         if search.optima is not state.search.optima:
-            state = replace(state, judgements=(), draws=None, unjudged=False)
+            state = replace(state, judgements=(), draws=None, looked=False, unjudged=False)
         state = replace(state, search=search)
         if not search.done:
             return state
         if len(state.judgements) == len(distinct(search.optima)):
-            if not isinstance(windows, Chain) or self._shots_left(search):
-                return replace(state, done=not self._shots_left(search))
-            return self._looked_beyond(windows, state, None)
+            assert isinstance(windows, Chain)
+            return state if self._shots_left(search) else self._looked_beyond(windows, state, None)
         return self._probed(windows, state)
 
     def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
         """Rollouts that the search of a chain leaves to judges of its optima and draws; none where they are dear."""
-        if not isinstance(windows, Chain) or not state.search.optima or state.judgements:
+        if not isinstance(windows, Chain) or not state.search.optima or state.looked:
             return 0
         linearised = 2 * (windows.num_theta + windows.num_start) + 1
         each = self.options.tuning.importance.judges + linearised
@@ -175,11 +179,10 @@ class Laplace(Estimator[LaplaceState]):
             state, target = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
             return self._looked_beyond(windows, state, target) if stands or not shots_left else state
-        kept = distinct(state.search.optima)
-        best = kept[0]
+        best, *others = distinct(state.search.optima)
         if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
             return ended
-        if not best.unsmooth and len(kept) != 1:
+        if others and not best.unsmooth:
             return ended
         assert isinstance(state.search, WindowState)
         if np.sqrt(np.diag(best.covariance)).min() < 10 * SHORTEST:
@@ -201,19 +204,12 @@ class Laplace(Estimator[LaplaceState]):
         if normal and not found:
             return replace(ended, search=_looked_around(state.search, best))
         first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(found, best.covariance)]
-        return self._first_drawn(windows, state, of_windows, first)
-
-    def _first_drawn(
-        self, windows: Windows, state: LaplaceState, target: WindowTarget, first: list[tuple[FloatArray, FloatArray]]
-    ) -> LaplaceState:
-        """The state with draws from normals that are known beforehand, as far as the budget lasts."""
-        draws, tuning = Draws.none(len(self.space)), self.options.tuning.importance
-        size = _sides(windows) * importance.batch_size(len(self.space), tuning)
+        draws, size = Draws.none(n), _sides(windows) * importance.batch_size(n, tuning)
         for mean, covariance in first:
             if not windows.has_room(size):
                 break
             share = tuning.share if draws.batches else tuning.first_share
-            draws = importance.drawn_from(draws, target, mean, covariance, share, self.prior, self.seed, tuning)
+            draws = importance.drawn_from(draws, of_windows, mean, covariance, share, self.prior, self.seed, tuning)
         return replace(state, draws=draws, given=draws.batches, done=not windows.has_room(size))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
@@ -252,7 +248,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def _looked_beyond(self, chain: Chain, state: LaplaceState, target: ChainTarget | None) -> LaplaceState:
         """The end of a fit of a chain: with draws where the normal of its only optimum is not the posterior."""
-        kept, ended = distinct(state.search.optima), replace(state, done=True)
+        kept, ended = distinct(state.search.optima), replace(state, done=True, looked=True)
         if len(kept) > 1 or not state.judgements:
             return ended
         assert isinstance(kept[0], ChainOptimum)
@@ -305,8 +301,11 @@ class Laplace(Estimator[LaplaceState]):
         self._report(kept, state, enough)
         if state.draws is not None:
             self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
-            ended = state.done or state.judgements
-            if ended and not enough and Code.NOT_THE_NORMAL not in {one.code for one in self.findings}:
+            if (
+                (state.done or state.looked)
+                and not enough
+                and Code.NOT_THE_NORMAL not in {one.code for one in self.findings}
+            ):
                 self.find(Code.TOO_FEW_DRAWS, draws=len(weight), effective=effective)
         if not enough:
             return normals
