@@ -10,8 +10,10 @@ are within three.
     python examples/studies/contact.py --select 'Hopper/0.01' --seeds 0 16         # two minutes of a core each
     python examples/studies/contact.py --select 'pushed/*' 'biped/0.05'
 
-Fits are kept in runs/contact and an interrupted study goes on; each run writes the summary of all there are. Coverage
-is of determined parameters, whose sd is less than half of the prior's; its standard error is clustered by log.
+Fits are kept in runs/contact and an interrupted study goes on; each run writes the summary of all there are into
+results/contact.json, and leaves cells there of which it has none as they were, each with the state of the code that
+made it. Coverage is of determined parameters, whose sd is less than half of the prior's; its standard error is
+clustered by log.
 """
 
 from __future__ import annotations
@@ -127,6 +129,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     spread = np.sqrt(logs / (logs - 1) * ((held - share * count) ** 2).sum()) / count.sum() if logs > 1 else None
     silent = ~blocked
     return {
+        "source": rows[0]["source"],
         "logs": logs,
         "seeds": [r["seed"] for r in rows],
         "mean_error": round(float(np.mean([r["error"] for r in rows])), 5),
@@ -168,12 +171,14 @@ def main() -> None:
     by_cell: dict[str, list[dict[str, Any]]] = {}
     for row in fits(file):
         by_cell.setdefault(f"{row['model']}, {row['level']:.0%}, {row['steps']} steps", []).append(row)
+    results = HERE / "results" / "contact.json"
+    earlier = json.loads(results.read_text(encoding="utf-8"))["cells"] if results.is_file() else {}
     table = {
         "command": "python examples/studies/contact.py --select CELL --seeds FIRST END, for the logs of each cell",
         "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
-        "cells": {cell: summary(rows) for cell, rows in sorted(by_cell.items())},
+        "cells": dict(sorted((earlier | {cell: summary(rows) for cell, rows in by_cell.items()}).items())),
     }
-    write_text(HERE / "results" / "contact.json", json.dumps(table, indent=2) + "\n")
+    write_text(results, json.dumps(table, indent=2) + "\n")
 
 
 if __name__ == "__main__":

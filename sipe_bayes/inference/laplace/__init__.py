@@ -33,8 +33,8 @@ mean lies beyond it, and the truncated density is right up to the bound.
    (``scouting``).
 6. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
-7. Probe whether a single optimum's normal is the posterior (``inference.importance``); where it is not, importance
-   draws and kernels on them take its place.
+7. Probe whether a single optimum's normal is the posterior (``inference.importance``), and whether that goes on beyond
+   it (``inference.stretches``); where the normal does not stand, importance draws and kernels on them take its place.
 
 **Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::
 
@@ -76,9 +76,9 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
   noise (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts
   the misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what
   predicts best.
-- Whether the posterior is normal is not asked where states are inferred, where there are several optima, where
-  residuals are as small as the simulation's rounding or intervals as small as the search resolves, where the intervals
-  are guessed; where starts are estimated it is only asked whether it is wider. Where the budget has no room for it
-  (2 N + 1 rollouts to ask, and some hundreds for draws where it is none), a finding says so; not where starts are
-  estimated, which a larger budget asks then.
+- Whether the posterior is normal is not asked where there are several optima, where residuals are as small as the
+  simulation's rounding or intervals as small as the search resolves, where the intervals are guessed; where starts are
+  estimated it is only asked whether it is wider, and where states are inferred by draws from the normal. Where the
+  budget has no room for it (6 N + 2 rollouts to ask of windows, 8 N + 1 of chains, twice as many where starts or states
+  are estimated, and some hundreds for draws where it is none), a finding says so.
 """
