@@ -109,12 +109,16 @@ def simulated(model: mujoco.MjModel, commands: np.ndarray, dt: float, delay: int
     return positions, velocities
 
 
-def make_log(folder: Path, kind: Kind, variant: int, seed: int) -> Truth:
-    """Write ``model.xml`` and ``log.csv``; the variant, from 0 to 4, sets rate, units, noise, clock and delay."""
+def make_log(folder: Path, kind: Kind, variant: int, seed: int, spring: float = 0.0) -> Truth:
+    """Write ``model.xml`` and ``log.csv``; the variant, from 0 to 4, sets rate, units, noise, clock and delay.
+
+    spring: at the first joint, N m/rad or N/m, which the model does not have.
+    """
     rng, steps = np.random.default_rng(seed), 1100
     dt, delay = (0.004, 0.004, 0.012, 0.004, 0.008)[variant], (0, 2, 1, 3, 1)[variant]
     commands = _excitation(steps, dt, kind.sizes, rng)
     model = _real(kind.xml, rng)
+    model.jnt_stiffness[0] = spring
     positions, velocities = simulated(model, commands, dt, delay)
     angle, length = ("rad", "deg", "rad", "deg", "deg")[variant], ("m", "mm", "m", "mm", "cm")[variant]
     speeds = {True: ("rad/s", "rad/s", "rpm", "deg/s", "rad/s"), False: ("m/s", "m/s", "mm/s", "m/s", "m/s")}

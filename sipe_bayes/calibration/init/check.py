@@ -22,7 +22,7 @@ from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.signals import turn_of
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Assumption, Trial
-from sipe_bayes.calibration.init.unknowns import delay_of
+from sipe_bayes.calibration.init.unknowns import Sizes, delay_of, springs
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,
@@ -73,6 +73,8 @@ def oddities(path: Path) -> list[str]:
         if now - other > max(gain, AGAINST if named else _BETTER):
             out = _other_readings(changed, np.exp((now - other) / len(part.measurements)))
     if not out:
+        beside = springs(model, machine, draft.readings, Sizes.of(model, machine, None, None))
+        part = replace(part, unknowns=(*part.unknowns, *beside))
         trial, _ = trial_of(part, model, machine, logs, folder, MANY)
         left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=6)
         late, note = delay_of([c.actuator for c in config.commands], left, logs[0].dt)

@@ -107,27 +107,48 @@ def fit(trial: Trial, assumption: Assumption, delays: Sequence[int], rounds: int
         rounds: of steps.
     """
     zero = np.zeros((trial.flight(assumption).count, 2 * trial.simulator.model.nv))
-    points = {d: _Point(trial.theta, zero) for d in sorted({*delays, assumption.delay})}
-    tentative, best = dict(points), assumption.delay
-    widest, last = max(points), np.inf
+    begun = {d: _Point(trial.theta, zero) for d in sorted({*delays, assumption.delay})}
+    points, slopes, best = _descended(trial, assumption, begun, assumption.delay, rounds)
+    if best != assumption.delay and best != max(begun):  # that no delay is as good, from where the late one ended
+        there, near = points[best], {assumption.delay, best - 1, best, best + 1}
+        again = {d: _Point(there.theta, there.starts) for d in sorted(near)}
+        others, other_slopes, other = _descended(trial, assumption, again, best, rounds)
+        if others[other].cost < there.cost:
+            slopes, best = other_slopes, other
+        points |= {d: point for d, point in others.items() if d not in points or point.cost < points[d].cost}
+        points = {d: points[d] for d in sorted(points)}
+    return _outcome(trial, slopes, points, best)
+
+
+def _descended(
+    trial: Trial, assumption: Assumption, begun: dict[int, _Point], best: int, rounds: int
+) -> tuple[dict[int, _Point], _Slopes, int]:
+    """The best point of each delay that was followed to the end, the last slopes, and the best delay, where they are.
+
+    It ends where all of them have come to rest: a delay that has not loses against one that has.
+    """
+    points, tentative = dict(begun), dict(begun)
+    widest, last = max(points), dict.fromkeys(points, np.inf)
     for turn in range(rounds):
         slopes = _slopes(trial, assumption, tentative, best)
-        costs = _costs(slopes, trial)
-        for (d, point), cost in zip(list(tentative.items()), costs, strict=True):
+        for (d, point), cost in zip(list(tentative.items()), _costs(slopes, trial), strict=True):
             known = points.get(d, point)
             if cost > known.cost:  # the last step went too far
                 tentative[d] = _Point(0.5 * (known.theta + point.theta), 0.5 * (known.starts + point.starts))
             else:
                 points[d] = replace(point, cost=cost)
         best = min(tentative, key=lambda d: points[d].cost)
-        if turn == rounds - 1 or last - points[best].cost < _SETTLED:
+        still = any(tentative[d].theta is not points[d].theta for d in tentative)
+        if turn == rounds - 1 or not (
+            still or any(last.get(d, np.inf) - points[d].cost >= _SETTLED for d in tentative)
+        ):
             break
-        last = points[best].cost
+        last = {d: points[d].cost for d in tentative}
         tentative = _stepped(slopes, tentative, points)
         if turn:
             near = [d for d in range(best - 2, best + 3) if 0 <= d <= widest]
             tentative = {d: tentative.get(d, tentative[best]) for d in sorted({0, *near})}
-    return _outcome(trial, slopes, {d: points[d] for d in sorted(tentative) if d in points}, best)
+    return {d: points[d] for d in sorted(tentative) if d in points}, slopes, best
 
 
 def _slopes(trial: Trial, assumption: Assumption, points: dict[int, _Point], best: int) -> _Slopes:

@@ -19,7 +19,16 @@ from sipe_bayes.calibration.init.matching import Matches, match_columns
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
-from sipe_bayes.calibration.init.unknowns import RELATIVE, Sizes, candidates, delay_of, scale_is_open, told_apart
+from sipe_bayes.calibration.init.unknowns import (
+    RELATIVE,
+    Sizes,
+    candidates,
+    delay_of,
+    scale_is_open,
+    springs,
+    sprung,
+    told_apart,
+)
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,
@@ -260,7 +269,8 @@ def _unknowns(
         controls.append(trial.simulator.environment.control(trial.simulator.model, states[-1], log.actions[starts]))
     sizes = Sizes.of(model, machine, np.concatenate(states), np.concatenate(controls))
     unknowns = candidates(model, machine, draft.readings, sizes)
-    trial, _ = trial_of(replace(draft, unknowns=tuple(unknowns)), model, machine, logs, folder, MANY)
+    beside = springs(model, machine, draft.readings, sizes)
+    trial, _ = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, MANY)
     names = list(trial.simulator.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
     if trial.simulator.environment.rotations:
@@ -270,7 +280,8 @@ def _unknowns(
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
     shown = told_apart(unknowns, left, scale_is_open(model, machine, draft.readings))
-    return [*late, *shown], samples, [note] if note and not late else []
+    notes = [note] if note and not late else []
+    return [*late, *shown], samples, [*notes, *sprung(unknowns, beside, left)]
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:

@@ -19,6 +19,9 @@ from sipe_bayes.envs.targets import bind
 
 RELATIVE = "no force is known, so that all others are relative to it; weigh it"
 """Why a mass is left out."""
+_SPRING = "a spring that the model does not have"
+_STIFF, _PER_METRE = 4.0, 10.0  # of the usual force, the force of a spring that is turned by 1 rad, or is 0.1 m long
+_NOTABLE = 0.03  # of its range, from which a spring is told
 _MOST = 20  # parameters that are asked for: what shows and is left out is in all others
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
@@ -90,6 +93,20 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     return gains + masses + of_joints + attached + _contacts(model, machine)
+
+
+def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
+    """Springs that the model lacks at measured joints: not asked for, but left out of a fit they look like delays."""
+    measured = {r.match.target for r in readings if not r.commanded}
+    joints = [j for j in machine.joints if f"joint:{j.name}.position" in measured]
+    soft = [j for j in joints if not float(np.ravel(model.joint(j.name).stiffness)[0])]
+    return [
+        Unknown(
+            f"{_word(joint.name)}_spring", (f"joint:{joint.name}.stiffness",), 0.0,
+            _STIFF * sizes.force[joint.name] * (1.0 if joint.hinge else _PER_METRE), False, _SPRING,
+        )
+        for joint in soft
+    ]  # fmt: skip
 
 
 def _driven(machine: Machine, readings: Sequence[Reading]) -> list[tuple[Actuator, Reading]]:
@@ -265,6 +282,17 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit, open_scale: bool = False) 
         if not reason:
             kept.append(k)
         out.append(replace(unknown, left_out=reason))
+    return out
+
+
+def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> list[str]:
+    """What is to be said of springs that stand behind the unknowns of a fit, where one shows clearly."""
+    out = []
+    for k, spring in enumerate(beside, len(unknowns)):
+        shown = fit.jacobian[:, k] * fit.theta[k] / np.sqrt(max(1.0, len(fit.jacobian) / 400.0))
+        if float(np.linalg.norm(shown)) > _CLEAR and fit.theta[k] > _NOTABLE:
+            value, target = spring.low + fit.theta[k] * (spring.high - spring.low), spring.targets[0]
+            out.append(f"a spring of about {value:.2g} in SI seems to act where the model has none: {target}")
     return out
 
 

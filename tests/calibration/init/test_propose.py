@@ -60,6 +60,16 @@ def test_units_signs_and_delays_of_twenty_logs(tmp_path: Path) -> None:
     assert len(mistakes) <= 1, mistakes
 
 
+@pytest.mark.parametrize(("kind", "variant", "spring"), [("servo", 3, 2.0), ("servo", 3, 0.0), ("arm", 1, 4.0)])
+def test_a_spring_that_the_model_lacks_hides_no_delay(kind: str, variant: int, spring: float, tmp_path: Path) -> None:
+    truth = make_log(tmp_path, KINDS[kind], variant, 100 + variant, spring)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    assert round(draft.delay) == truth.delay > 1
+    assert [f"joint:{KINDS[kind].joints[0]}" in note for note in draft.notes if "a spring" in note] == [True] * (
+        spring > 0
+    )
+
+
 def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
     """A sensor at a fifth of the other's rate, frames that were dropped, and a gap; in a text file with remarks."""
     truth = make_log(tmp_path, KINDS["arm"], 1, 3)
