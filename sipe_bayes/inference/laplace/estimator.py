@@ -286,10 +286,10 @@ class Laplace(Estimator[LaplaceState]):
         """
         kept = distinct(state.search.optima)
         if not kept:
-            step = self._strategy(self.bound(trajectories)).step_rollouts
+            step, usual = self._strategy(self.bound(trajectories)).step_rollouts, self.budget_for(trajectories)
             raise BudgetTooSmall(
-                f"budget: {self.budget} rollouts were not enough for one optimum; "
-                f"one step takes {step} rollouts, so raise the budget"
+                f"budget: {self.budget} rollouts were not enough for one optimum; one step takes {step} rollouts, so "
+                f"raise the budget (default for this log: {usual})"
             )
         draws, tuning = state.draws or Draws.none(len(self.space)), self.options.tuning.importance
         normals = mixture(kept, self.space)
