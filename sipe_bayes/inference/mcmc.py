@@ -268,7 +268,8 @@ class MCMC(Estimator[MCMCState]):
 
         windows = self.bound(trajectories)
         walkers, dimensions = state.walkers.shape
-        room = (self.budget - windows.rollouts) // (walkers * len(trajectories))
+        most = 2 if isinstance(windows, Chain) or windows.num_start else 1  # simulations of a value
+        room = (self.budget - windows.rollouts) // (most * walkers * len(trajectories))
         steps = min(self.options.tuning.block, room)
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")

@@ -2,9 +2,9 @@
 
 A friction below that of the floor does nothing, since MuJoCo takes the larger of the two; a stop that is not reached
 may lie anywhere beyond. An optimum at such an edge has a normal whose width is that of the steep side, and draws from
-it never come to where the posterior goes on. So points further off are looked at, along each parameter alone, along its
-direction with the others following, and along the normal's principal axes: where the log posterior has fallen by less
-than it should, and what lies there would count, twice as far again, up to the bound.
+it never come to where the posterior goes on. So points further off are looked at, along each parameter alone and along
+its direction with the others following: where the log posterior has fallen by less than it should, and what lies there
+would count, twice as far again, up to the bound.
 
 Each stretch that is found is the middle of a normal to draw from: as long as it, and across it as wide as the first
 normal is for a given place along it. Where several parameters alone have one, one more has them all.
@@ -12,16 +12,13 @@ normal is for a given place along it. Where several parameters alone have one, o
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
-
-Target = Callable[[FloatArray], FloatArray]
-"""Log densities (B,) of points (B, N)."""
+from sipe_bayes.inference.importance import Target
 
 
 @dataclass(frozen=True)
@@ -77,12 +74,16 @@ def stretches(
     near: whether the nearer points are looked at too.
     """
     start = mean if ((mean >= 0) & (mean <= 1)).all() else theta
+    level = float(target(start[None])[0])
+    if not np.isfinite(level):
+        start, level = theta, float(target(theta[None])[0])
     precision, n = np.linalg.inv(covariance), len(theta)
-    ways = np.concatenate([np.diag(np.diag(precision) ** -0.5), (covariance / np.sqrt(np.diag(covariance))).T])
+    ways = np.diag(np.diag(precision) ** -0.5)
+    if n > 1:  # else both are one
+        ways = np.concatenate([ways, (covariance / np.sqrt(np.diag(covariance))).T])
     ways = np.concatenate([ways, -ways])  # one sd each
     room = np.where(ways > 0, 1 - start, start) / np.maximum(np.abs(ways), 1e-300)
     most = room.min(1)
-    level = float(target(start[None])[0])
     found: dict[int, Stretch] = {}
     centre = start - mean
     open_ways, length = np.flatnonzero(most > 0.5 * tuning.near), tuning.near if near else tuning.far
@@ -95,7 +96,7 @@ def stretches(
         small &= falls < tuning.least_worth(most[open_ways])
         for k in np.flatnonzero(small & (falls < tuning.least_worth(reached))):
             way = int(open_ways[k])
-            parameter = way % (2 * n) if way % (2 * n) < n else None
+            parameter = way % (len(ways) // 2) if way % (len(ways) // 2) < n else None
             found[way] = Stretch(start, points[k], float(falls[k]), float(reached[k]), parameter)
         if length > tuning.near:  # the far points are looked at along all ways
             open_ways = open_ways[small]

@@ -184,6 +184,7 @@ class LoopRun:
             "estimator": estimator.settings(),
             "reference": self.truth.tolist(),
             **asdict(plan),
+            "settings": plan.settings.described(),
             **({} if demonstrations is None else {"demonstrations": checksum(demonstrations)}),
             **({} if policy is None else {"policy": policy.checksum}),
         }

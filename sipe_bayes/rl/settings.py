@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 from sipe_bayes.core.options import Options, option
 
+_LATER = ("cloning", "end_hopeless", "actor_waits")
+
 
 @dataclass(frozen=True)
 class Settings(Options):
@@ -64,6 +66,10 @@ class Settings(Options):
     def demonstrated(self) -> int:
         """Transitions of a batch that come from the demonstrations, its last ones."""
         return round(self.demonstration_share * self.batch)
+
+    def described(self) -> dict[str, object]:
+        """As a run's fingerprint has them: what came later is left out where it is off, so that earlier runs go on."""
+        return {name: value for name, value in self.plain().items() if value or name not in _LATER}
 
     def deviations(self) -> dict[str, object]:
         """The settings that are not at their defaults, as JSON reads them back."""

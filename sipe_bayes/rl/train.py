@@ -47,7 +47,6 @@ Report = Callable[[str, int, int], None]
 
 CHECKPOINT = "checkpoint/state.safetensors"
 COUNTS = "counts.json"
-_LATER = ("cloning", "end_hopeless", "actor_waits")  # settings without which earlier runs go on
 REPORTED = 100  # control steps between two reports
 
 
@@ -198,7 +197,7 @@ def _fingerprint(
         "task": trainer.task.name,
         "model": trainer.simulator.checksum(),
         "seed": seed,
-        "settings": {k: v for k, v in trainer.settings.plain().items() if v or k not in _LATER},
+        "settings": trainer.settings.described(),
         "drawn": randomization is not None and randomization.fingerprint,
         "demonstrations": checksum(demonstrations),
         "evaluate_every": pace.evaluate_every,

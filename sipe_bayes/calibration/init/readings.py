@@ -199,7 +199,8 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
         note = f"all of it is taken for {actuator.full:g}, where the model's ctrlrange ends"
         return replace(reading, factor=float(f"{factor * actuator.full:.6g}"), notes=(*reading.notes, note))
     if actuator.drive != Drive.VOLTAGE:
-        return replace(reading, notes=(*reading.notes, "all of it is one unit of control: the model has no ctrlrange"))
+        note = "all of it is one unit of control: the model has no ctrlrange from zero or the same to both sides"
+        return replace(reading, notes=(*reading.notes, note))
     doubt = f"a share of which voltage? no column tells; multiply `factor` by the supply's volts for {actuator.name}"
     return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
 

@@ -83,12 +83,10 @@ class Discrepancy:
 
     Args:
         shift: (M, N) draws of how far theta then is off.
-        present: probability that there is a discrepancy.
         causes: extensions that move theta most, in words.
     """
 
     shift: FloatArray
-    present: float
     causes: tuple[str, ...]
 
     def widened(self, posterior: Posterior, seed: int) -> Particles:
@@ -118,9 +116,9 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
         return None
     names = [logs.probes[k].name for k in kept]
     columns = Columns(names, information[np.ix_(kept, kept)], seen.score[kept], logs.one_sided[kept])
-    drawn, present = columns.draws(options, np.random.default_rng(seed))
+    drawn, _ = columns.draws(options, np.random.default_rng(seed))
     moved = -seen.answer[:, kept]
-    return Discrepancy(drawn @ moved.T, present, _largest(names, drawn, moved, seen.variance, options))
+    return Discrepancy(drawn @ moved.T, _largest(names, drawn, moved, seen.variance, options))
 
 
 def _largest(

@@ -39,7 +39,7 @@ from sipe_bayes.posterior.flow import to_line
 from sipe_bayes.posterior.quantile_mapped import mapped
 
 DRAWS = 500  # of each simulation's posterior
-_KEPT = 20000  # draws of the log's own
+_KEPT = 4000  # draws of the log's own
 _LEVELS = np.arange(1, 100) / 100
 _KNOTS = np.linspace(ndtri(_LEVELS[0]), ndtri(_LEVELS[-1]), 25)  # t that G goes through; scores jump between more
 _APART = 1e-9  # of points that a map goes through, in z
@@ -108,20 +108,24 @@ class HeldBackOptions(Options):
 
     calibration: float | None = option(
         None,
-        "share of the simulations that is not trained on and mends the posteriors' widths; default a fifth, where that "
-        "is a hundred or more",
+        "share of the simulations that is not trained on and mends the posteriors' widths; default a fifth of a "
+        "single round's, where that is a hundred or more",
         least=0,
         below=1,
     )
+
+    def held_back(self, count: int) -> float:
+        """The share of so many simulations."""
+        if self.calibration is not None:
+            return self.calibration
+        return _DEFAULT if _DEFAULT * count >= _NEAREST else 0.0
 
 
 def parted(simulations: Simulations, options: Options) -> tuple[Simulations, Simulations]:
     """Those to train on and those that are held back; raises ValueError where the latter are too few."""
     if not isinstance(options, HeldBackOptions):
         return simulations, simulations[:0]
-    share = options.calibration
-    if share is None:
-        share = _DEFAULT if _DEFAULT * len(simulations) >= _NEAREST else 0.0
+    share = options.held_back(len(simulations))
     count = int(share * len(simulations))
     if share and count < THRESHOLDS.few_valid:
         raise ValueError(

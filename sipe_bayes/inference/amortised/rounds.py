@@ -89,6 +89,10 @@ class RoundsOptions(HeldBackOptions, PriorSamplingOptions):
     )
     members: int = option(1, "of an ensemble, each trained on all simulations, whose posteriors are averaged", least=1)
 
+    def held_back(self, count: int) -> float:
+        """See ``HeldBackOptions``; none of several rounds unless asked for: the last is the one that matters."""
+        return 0.0 if self.calibration is None and self.rounds > 1 else super().held_back(count)
+
 
 class Rounds(PriorSampling[RoundsState[L], Members[L]], Generic[L]):
     """Base of NPE and BayesSim.

@@ -189,7 +189,8 @@ def _screened(
         BudgetExhausted: where the budget ends.
     """
     tuning, count = problem.options.tuning.contact, problem.options.candidates
-    draws = problem.prior.sample((max(count, tuning.candidates),), generator=generator).numpy()
+    count = max(count, tuning.candidates) if count else 0
+    draws = problem.prior.sample((count,), generator=generator).numpy()
     points = np.concatenate([problem.space.default_theta[None], draws])
     view, share = _beginning(windows, horizon, limit)
     residual, valid = view.residuals(points, np.tile(view.no_starts(), (len(points), 1, 1)))

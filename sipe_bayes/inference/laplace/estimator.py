@@ -154,7 +154,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
         """Rollouts that the search of a chain leaves to judges of its optima and draws; none where they are dear."""
-        if not isinstance(windows, Chain) or not state.search.optima or state.looked:
+        if not isinstance(windows, Chain) or not state.search.optima:
             return 0
         linearised = 2 * (windows.num_theta + windows.num_start) + 1
         each = self.options.tuning.importance.judges + linearised
@@ -204,13 +204,14 @@ class Laplace(Estimator[LaplaceState]):
         if normal and not found:
             return replace(ended, search=_looked_around(state.search, best))
         first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(found, best.covariance)]
-        draws, size = Draws.none(n), _sides(windows) * importance.batch_size(n, tuning)
+        draws, size = Draws.none(n), self._draw_size(windows)
         for mean, covariance in first:
             if not windows.has_room(size):
                 break
             share = tuning.share if draws.batches else tuning.first_share
             draws = importance.drawn_from(draws, of_windows, mean, covariance, share, self.prior, self.seed, tuning)
-        return replace(state, draws=draws, given=draws.batches, done=not windows.has_room(size))
+        state = replace(state, draws=draws, given=draws.batches, unjudged=draws.batches < len(first))
+        return replace(state, done=not windows.has_room(size))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where windows of the logs lead."""
@@ -258,12 +259,12 @@ class Laplace(Estimator[LaplaceState]):
             chain.short = True
             return replace(ended, unjudged=True)
         look = looked_beyond(self.problem, target, state.judgements[0].normal)
-        return replace(ended, draws=look.draws, unjudged=look.short and look.draws is None)
+        return replace(ended, draws=look.draws, unjudged=not look.judged)
 
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
         assert isinstance(state.search, WindowState)
-        kept, tuning, n = distinct(state.search.optima), self.options.tuning.importance, len(self.space)
+        kept, tuning = distinct(state.search.optima), self.options.tuning.importance
         normal, target = mixture([merged(kept)], self.space), self._target(windows, kept[0])
         draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
         if draws.values.max() > target(kept[0].theta[None])[0] + tuning.elsewhere:
@@ -271,8 +272,13 @@ class Laplace(Estimator[LaplaceState]):
             if search is not None:
                 return replace(state, search=search, draws=None)
         done = importance.ended(draws, self.prior, tuning, state.given)
-        done = done or not windows.has_room(_sides(windows) * importance.batch_size(n, tuning))
+        done = done or not windows.has_room(self._draw_size(windows))
         return replace(state, draws=draws, done=done)
+
+    def _draw_size(self, windows: Windows) -> int:
+        """Simulations of the logs that one more batch of draws takes, with the optimum's linearisation and value."""
+        values = importance.batch_size(len(self.space), self.options.tuning.importance) + 1
+        return _sides(windows) * values + windows.num_start + 1
 
     def _target(self, windows: Windows, optimum: Optimum) -> WindowTarget:
         assert isinstance(optimum, WindowOptimum)

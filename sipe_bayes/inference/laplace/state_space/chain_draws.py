@@ -17,7 +17,7 @@ from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.state_space.target import ChainTarget
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
+from sipe_bayes.inference.stretches import look_size, proposals, stretches
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.posterior import GaussianMixture
 
@@ -27,14 +27,12 @@ class Look:
     """What lies beyond an optimum's normal.
 
     Args:
-        stretches: on which the posterior goes on.
         draws: None where the normal stands.
-        short: whether the budget ended before that was known, or before there were draws enough.
+        judged: whether the budget sufficed to know that, and for draws along every stretch.
     """
 
-    stretches: tuple[Stretch, ...]
     draws: Draws | None
-    short: bool
+    judged: bool
 
 
 def draws_size(size: int, problem: SearchProblem) -> int:
@@ -47,24 +45,25 @@ def looked_beyond(problem: SearchProblem, target: ChainTarget, stands: bool) -> 
     """The posterior around an optimum, whose normal ``stands`` by draws from it, or does not."""
     tuning, optimum, chain = problem.options.tuning.importance, target.optimum, target.chain
     values = importance.in_chunks(target, len(chain.log), tuning)
-    mean, covariance, found = optimum.mean, optimum.covariance, []
-    draws = Draws.none(len(mean))
+    mean, covariance = optimum.mean, optimum.covariance
+    draws, given = Draws.none(len(mean)), 1
     try:
         found = stretches(values, optimum.theta, mean, covariance, problem.options.tuning.stretches)
         if stands and not found:
-            return Look((), None, short=False)
+            return Look(None, judged=True)
         normal = GaussianMixture([0.0], mean[None], covariance[None], problem.space)
         first = [(mean, tuning.first_wider**2 * covariance), *proposals(found, covariance)]
+        given = len(first)
         for middle, spread in first:
             draws = importance.drawn_from(
                 draws, values, middle, spread, tuning.share, problem.prior, problem.seed, tuning
             )
-        while not importance.ended(draws, problem.prior, tuning, len(first)):
+        while not importance.ended(draws, problem.prior, tuning, given):
             draws = importance.draw(draws, values, normal, problem.prior, problem.seed, tuning)
     except BudgetExhausted:
         chain.short = True  # a larger budget goes on from here
-        return Look(tuple(found), draws if draws.batches or not stands else None, short=True)
-    return Look(tuple(found), draws, short=False)
+        return Look(draws if draws.batches or not stands else None, judged=draws.batches >= given)
+    return Look(draws, judged=True)
 
 
 def blur(held: FloatArray, averaged: FloatArray) -> FloatArray:
