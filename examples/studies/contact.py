@@ -11,9 +11,9 @@ are within three.
     python examples/studies/contact.py --select 'pushed/*' 'biped/0.05'
 
 Fits are kept in runs/contact and an interrupted study goes on; each run writes the summary of all there are into
-results/contact.json, and leaves cells there of which it has none as they were, each with the state of the code that
-made it. Coverage is of determined parameters, whose sd is less than half of the prior's; its standard error is
-clustered by log.
+results/contact.json, and leaves cells there of which it has none as they were, with the state of the code that made
+them where it is known. Coverage is of determined parameters, whose sd is less than half of the prior's; its standard
+error is clustered by log.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class Target(ABC):
 
 
 class WindowTarget(Target):
-    """Of windows: one simulation of the logs a value."""
+    """Of windows: one simulation of the logs a value, or two."""
 
     def __init__(self, prior: Posterior, windows: Windows, fit: WindowFit) -> None:
         self.prior, self.windows, self.fit = prior, windows, fit
