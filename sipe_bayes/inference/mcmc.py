@@ -41,7 +41,7 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, distinct
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
-from sipe_bayes.inference.laplace.window_target import Target, WindowFit, WindowTarget
+from sipe_bayes.inference.laplace.window_target import Target, WindowFit, WindowTarget, value_cost
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
@@ -268,8 +268,7 @@ class MCMC(Estimator[MCMCState]):
 
         windows = self.bound(trajectories)
         walkers, dimensions = state.walkers.shape
-        most = 2 if isinstance(windows, Chain) or windows.num_start else 1  # simulations of a value
-        room = (self.budget - windows.rollouts) // (most * walkers * len(trajectories))
+        room = (self.budget - windows.rollouts) // (value_cost(windows) * walkers * len(trajectories))
         steps = min(self.options.tuning.block, room)
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")

@@ -27,7 +27,7 @@ from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarge
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, merged, mixture
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
-from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget
+from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget, value_cost
 from sipe_bayes.inference.stretches import look_size, proposals, stretches
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
@@ -188,7 +188,7 @@ class Laplace(Estimator[LaplaceState]):
         if np.sqrt(np.diag(best.covariance)).min() < 10 * SHORTEST:
             return ended  # an sd that the look around the optimum may have set
         probes = 0 if windows.num_start else importance.probe_size(n)
-        if not windows.has_room(windows.num_start + probes + _sides(windows) * look_size(n, near=False)):
+        if not windows.has_room(windows.num_start + probes + value_cost(windows) * look_size(n, near=False)):
             return replace(ended, unjudged=True)
         of_windows = self._target(windows, best)
         if of_windows.silent:
@@ -278,7 +278,7 @@ class Laplace(Estimator[LaplaceState]):
     def _draw_size(self, windows: Windows) -> int:
         """Simulations of the logs that one more batch of draws takes, with the optimum's linearisation and value."""
         values = importance.batch_size(len(self.space), self.options.tuning.importance) + 1
-        return _sides(windows) * values + windows.num_start + 1
+        return value_cost(windows) * values + windows.num_start + 1
 
     def _target(self, windows: Windows, optimum: Optimum) -> WindowTarget:
         assert isinstance(optimum, WindowOptimum)
@@ -387,11 +387,6 @@ class Laplace(Estimator[LaplaceState]):
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
         return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open
-
-
-def _sides(windows: Windows) -> int:
-    """Simulations of the logs that a value of ``WindowTarget`` takes, at most."""
-    return 2 if windows.num_start else 1
 
 
 def _looked_around(search: WindowState, optimum: WindowOptimum) -> WindowState:

@@ -29,11 +29,17 @@ from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, marginal
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
 FORETOLD = 1.0  # nats, by which a step of starts or states that follow theta promises more than at the optimum
 FOLLOWED = 10.0  # nats, by which those that follow have to promise less than those that do not
+
+
+def value_cost(windows: Windows | Chain) -> int:
+    """Simulations of the logs that a value of a ``Target`` takes, at most."""
+    return 2 if isinstance(windows, Chain) or windows.num_start else 1
 
 
 @dataclass(frozen=True)
