@@ -99,8 +99,8 @@ def calibrate(
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     doubted = conflict is not None or (lacks is not None and lacks.alarm)
-    told = problem.prior, doubted, method.seed
-    missing = missing_physics(probed, posterior, *told, problem.tolerances) if probed else spread_alone(alone, *told)
+    given = problem.prior, doubted, method.seed
+    missing = missing_physics(probed, posterior, *given, problem.tolerances) if probed else spread_alone(alone, *given)
     predictions = _Predictions.of(problem, theta)
     outside = _outside(problem, method, fit, predictions, unknown)
     bands = predictions.bands(posterior, missing if doubted else None, method.seed)

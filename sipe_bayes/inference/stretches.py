@@ -84,7 +84,7 @@ def stretches(
     ways = np.concatenate([ways, -ways])  # one sd each
     room = np.where(ways > 0, 1 - start, start) / np.maximum(np.abs(ways), 1e-300)
     most = room.min(1)
-    found: dict[int, Stretch] = {}
+    by_way: dict[int, Stretch] = {}
     centre = start - mean
     open_ways, length = np.flatnonzero(most > 0.5 * tuning.near), tuning.near if near else tuning.far
     while len(open_ways):
@@ -97,19 +97,19 @@ def stretches(
         for k in np.flatnonzero(small & (falls < tuning.least_worth(reached))):
             way = int(open_ways[k])
             parameter = way % (len(ways) // 2) if way % (len(ways) // 2) < n else None
-            found[way] = Stretch(start, points[k], float(falls[k]), float(reached[k]), parameter)
+            by_way[way] = Stretch(start, points[k], float(falls[k]), float(reached[k]), parameter)
         if length > tuning.near:  # the far points are looked at along all ways
             open_ways = open_ways[small]
         open_ways = open_ways[most[open_ways] > length]
         length = tuning.far if length == tuning.near else 2 * length
-    ordered = sorted(found.values(), key=lambda one: one.fall - np.log(one.distance))
+    ordered = sorted(by_way.values(), key=lambda one: one.fall - np.log(one.distance))
     return ordered[: tuning.most]
 
 
-def proposals(found: list[Stretch], covariance: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def proposals(beyond: list[Stretch], covariance: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """Means (N,) and covariances (N, N) of normals to draw from: one for each stretch, and one for all."""
-    alone = [one for one in found if one.parameter is not None]
-    groups = [[one] for one in found] + ([alone] if len({one.parameter for one in alone}) > 1 else [])
+    alone = [one for one in beyond if one.parameter is not None]
+    groups = [[one] for one in beyond] + ([alone] if len({one.parameter for one in alone}) > 1 else [])
     return [_proposal(group, covariance) for group in groups]
 
 

@@ -197,13 +197,13 @@ class Laplace(Estimator[LaplaceState]):
         if normal and probes:
             normal = importance.is_normal(of_windows, best.theta, best.mean, best.covariance, tuning)
         try:
-            found = stretches(of_windows, best.theta, best.mean, best.covariance, self.options.tuning.stretches, False)
+            beyond = stretches(of_windows, best.theta, best.mean, best.covariance, self.options.tuning.stretches, False)
         except BudgetExhausted:
             windows.short = True
             return replace(ended, unjudged=True)
-        if normal and not found:
+        if normal and not beyond:
             return replace(ended, search=_looked_around(state.search, best))
-        first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(found, best.covariance)]
+        first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(beyond, best.covariance)]
         draws, size = Draws.none(n), self._draw_size(windows)
         for mean, covariance in first:
             if not windows.has_room(size):

@@ -48,11 +48,11 @@ def looked_beyond(problem: SearchProblem, target: ChainTarget, stands: bool) -> 
     mean, covariance = optimum.mean, optimum.covariance
     draws, given = Draws.none(len(mean)), 1
     try:
-        found = stretches(values, optimum.theta, mean, covariance, problem.options.tuning.stretches)
-        if stands and not found:
+        beyond = stretches(values, optimum.theta, mean, covariance, problem.options.tuning.stretches)
+        if stands and not beyond:
             return Look(None, judged=True)
         normal = GaussianMixture([0.0], mean[None], covariance[None], problem.space)
-        first = [(mean, tuning.first_wider**2 * covariance), *proposals(found, covariance)]
+        first = [(mean, tuning.first_wider**2 * covariance), *proposals(beyond, covariance)]
         given = len(first)
         for middle, spread in first:
             draws = importance.drawn_from(
