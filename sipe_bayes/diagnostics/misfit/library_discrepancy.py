@@ -106,8 +106,8 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
     Returns:
         None where no extension does what theta cannot.
     """
-    seen, n = logs.seen(), logs.windows.num_theta
-    whole, cross = seen.arrow.precision[n:, n:], seen.arrow.precision[n:, :n]
+    seen, n = logs.seen, logs.windows.num_theta
+    whole, cross = logs.arrow.precision[n:, n:], logs.arrow.precision[n:, :n]
     information = whole - cross @ seen.answer
     size, most = np.diag(information), np.diag(whole)
     able = [not p.by_log and m > _NOTHING and s > IMITATED * m for p, s, m in zip(logs.probes, size, most, strict=True)]

@@ -40,7 +40,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
-from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, chosen
+from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import open_gains, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
@@ -165,20 +165,18 @@ class _Causes:
     def of(cls, logs: ProbedLogs, options: MissingPhysicsOptions) -> _Causes:
         """In turns with the noise."""
         windows, n = logs.windows, logs.windows.num_theta
-        moments = logs.moments()
         pull, noise = -windows.start_precision * logs.starts, logs.noise
         span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
         for _ in range(options.rounds):
-            arrow = eliminate_starts(moments.normal(noise), logs.count, windows.start_precision, pull)
+            normal = logs.rows.normal(logs.residual, noise)
+            arrow = eliminate_starts(normal, logs.count, windows.start_precision, pull)
             precision, gradient = arrow.precision + FLAT_PRECISION * np.eye(logs.count), arrow.gradient
             alpha = sparse(precision, gradient, n, usable, logs.one_sided, options)
             kept = np.flatnonzero(np.isfinite(alpha))
             columns = np.concatenate([np.arange(n), n + kept])
             beliefs = np.diag(np.concatenate([np.zeros(n), alpha[kept]]))
             covariance = np.linalg.inv(precision[np.ix_(columns, columns)] + beliefs)
-            starts = logs.count + np.arange(2 * windows.num_start + 1)
-            part = chosen(moments, np.concatenate([columns, starts]), len(columns))
             pulls = Pulls(
                 beliefs + FLAT_PRECISION * np.eye(len(columns)),
                 np.zeros(len(columns)),
@@ -186,7 +184,9 @@ class _Causes:
                 pull,
                 np.ones(len(columns), bool),
             )
-            noise = estimate_noise(part, noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales)
+            noise = estimate_noise(
+                logs.moments(columns), noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales
+            )
             noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
         response = -np.linalg.solve(precision[:n, :n], precision[:n, n + kept])
         return cls(kept, covariance @ gradient[columns], covariance[n:, n:], np.asarray(response), noise)
@@ -200,8 +200,8 @@ class _Causes:
     def explain(self, logs: ProbedLogs, seed: int) -> bool:
         """Whether what they leave passes for noise, by the null of the check of the residuals."""
         pull = -logs.windows.start_precision * logs.starts
-        moments = logs.moments()
-        arrow = eliminate_starts(moments.normal(self.noise), logs.count, logs.windows.start_precision, pull)
+        normal = logs.rows.normal(logs.residual, self.noise)
+        arrow = eliminate_starts(normal, logs.count, logs.windows.start_precision, pull)
         step = np.concatenate([self.step[: logs.windows.num_theta], self.sizes(logs)])
         seen = logs.whiteness(logs.left(logs.residual, step, arrow.blocks(step)), self.noise)
         null = logs.null(seed, MISFIT.simulated)[:, len(logs.probes) :]

@@ -67,7 +67,7 @@ class _Named:
     def misfit(self, seed: int, simulated: int) -> Misfit:
         """The oddest statistic against draws of the null, ``simulated`` at most."""
         logs = self.logs
-        seen = logs.seen()
+        seen = logs.seen
         for count in (*range(2 * MISFIT.batch, simulated, MISFIT.batch), simulated):
             null = logs.null(seed, count)
             middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
@@ -91,7 +91,7 @@ class _Named:
         n, names = logs.windows.num_theta, logs.windows.simulator.space.names
         amplitude = seen.score[probe] / seen.information[probe]
         step = seen.step + amplitude * np.concatenate([-seen.answer[:, probe], np.eye(len(self.logs.probes))[probe]])
-        explained = logs.left(logs.residual, step, seen.arrow.blocks(step))
+        explained = logs.left(logs.residual, step, logs.arrow.blocks(step))
         whitened = zip(self.logs.white(seen.left, self.logs.noise), logs.white(explained, logs.noise), strict=True)
         gains = [plain**2 - probed**2 for plain, probed in whitened]
         before, after = ((x**2).sum((0, 1)) for x in (seen.left, explained))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,6 +22,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.whitened_rows import Products, WhitenedRows
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.structure.probes import probes
 
@@ -59,7 +59,6 @@ class Solved:
         information: (K,) of each probe, all else projected out.
         answer: (N, K) of theta to the probes.
         variance: (N,) of theta.
-        arrow: the windows' starts eliminated.
     """
 
     statistics: FloatArray
@@ -69,7 +68,6 @@ class Solved:
     information: FloatArray
     answer: FloatArray
     variance: FloatArray
-    arrow: Eliminated
 
 
 @dataclass
@@ -125,23 +123,29 @@ class ProbedLogs:
         self.coloured = bool((noise.tau > 0).any())
         self.inner = prior.precision + FLAT_PRECISION * np.eye(n)
         self.free, self.pull = np.ones(n, bool), prior.pull(theta)
-        arrow = self._arrow(self.moments().normal(noise))
-        total = arrow.gradient[:n] + self.pull
+        self.rows = WhitenedRows(self.jacobian, windows.num_start, windows.sequences)
+        total = self.arrow.gradient[:n] + self.pull
         self._nulls: dict[int, _Null] = {}
         self.free = ~(((theta <= _PRESSED) & (total < 0)) | ((theta >= 1 - _PRESSED) & (total > 0)))
 
+    @functools.cached_property
+    def arrow(self) -> Eliminated:
+        """Normal equations of theta and probes (N + K) at the fit's noise, the windows' starts eliminated."""
+        normal, starts = self.rows.normal(self.residual, self.noise), self.windows.no_starts()
+        return eliminate_starts(normal, self.count, self.windows.start_precision, starts)
+
+    @functools.cached_property
     def seen(self) -> Solved:
         """Of the logs themselves."""
-        return self.solved(self.residual, self.moments().normal(self.noise), self.noise, self.pull)
+        return self.solved(self.residual, self.noise, self.pull)
 
     def null(self, seed: int, simulated: int) -> FloatArray:
         """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated; made once."""
         made = self._nulls.setdefault(seed, _Null(np.random.default_rng(seed)))
         while len(made.rows) < simulated:
             draws = self.drawn(made.rng, MISFIT.batch)
-            for s, (plain, normal) in enumerate(self.together(draws)):
-                noise = self.estimated(plain)
-                made.rows.append(self.solved(draws[..., s], normal(noise), noise).statistics)
+            for s, moments in enumerate(self.together(draws)):
+                made.rows.append(self.solved(draws[..., s], self.estimated(moments)).statistics)
         return np.stack(made.rows[:simulated])
 
     def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
@@ -157,29 +161,19 @@ class ProbedLogs:
             out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
         return out
 
-    def moments(self) -> Moments:
-        """Products of the logs' own residual with theta, probes and starts."""
-        return Moments(self.residual, self.jacobian, self.count, self.windows.sequences)
+    def moments(self, columns: IntArray) -> Moments:
+        """Products of the logs' own residual with some columns of theta and probes, and the starts."""
+        starts = np.arange(self.count, self.jacobian.shape[-1])
+        jacobian = self.jacobian[..., np.concatenate([columns, starts])]
+        return Moments(self.residual, jacobian, len(columns), self.windows.sequences)
 
-    def together(self, residuals: FloatArray) -> list[tuple[Moments, Callable[[Noise], FloatArray]]]:
-        """For each of residuals (W, L, C, S) the products without the probes, and those with them, whitened by a noise.
-
-        The latter are (W, K', K') as ``Moments.normal`` gives them.
-        """
-        n, count, many = self.windows.num_theta, self.count, residuals.shape[-1]
-        parts = (self.jacobian[..., :count], residuals, self.jacobian[..., count:])
-        rows = np.concatenate(parts, axis=-1)
-        whole = Moments(np.zeros(rows.shape[:3]), rows, count + many, self.windows.sequences)
-        starts = count + many + np.arange(2 * self.windows.num_start)
-
-        def columns(s: int, first: int) -> IntArray:
-            return np.concatenate([np.arange(first), starts, [count + s]])
-
-        def whitened(s: int, noise: Noise) -> FloatArray:
-            mine = columns(s, count)
-            return whole.normal(noise).take(mine, axis=-1).take(mine, axis=-2)
-
-        return [(chosen(whole, columns(s, n), n), functools.partial(whitened, s)) for s in range(many)]
+    def together(self, residuals: FloatArray) -> list[Moments]:
+        """For each of residuals (W, L, C, S) its products with theta and the starts."""
+        n, many = self.windows.num_theta, residuals.shape[-1]
+        rows = np.concatenate([self.jacobian[..., :n], residuals, self.jacobian[..., self.count :]], axis=-1)
+        whole = Moments(np.zeros(rows.shape[:3]), rows, n + many, self.windows.sequences)
+        starts = n + many + np.arange(2 * self.windows.num_start)
+        return [_chosen(whole, np.concatenate([np.arange(n), starts, [n + s]]), n) for s in range(many)]
 
     def estimated(self, moments: Moments) -> Noise:
         """The noise that a fit would have found in a draw of it."""
@@ -188,37 +182,32 @@ class ProbedLogs:
         span = float(windows.dt.min()), windows.trajectories.longest
         return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span, windows.scales)
 
-    def _arrow(self, normal: FloatArray) -> Eliminated:
-        windows = self.windows
-        return eliminate_starts(normal, self.count, windows.start_precision, windows.no_starts())
-
-    def solved(self, residual: FloatArray, normal: FloatArray, noise: Noise, pull: FloatArray | None = None) -> Solved:
+    def solved(self, residual: FloatArray, noise: Noise, pull: FloatArray | None = None) -> Solved:
         """Statistics of a residual, with what they are made of.
 
         Args:
             residual: (W, L, C).
-            normal: (W, K', K') its products with theta, probes and starts, whitened by the noise.
             noise: (C,) of the channels.
             pull: (N,) of the prior; default none.
         """
-        n = self.windows.num_theta
+        windows, n = self.windows, self.windows.num_theta
+        made = self.rows.products(residual, noise, n)
         # information of theta and probes with the starts eliminated; inverted among the parameters that are free
-        arrow = self._arrow(normal)
-        inner, inverse = arrow.precision + FLAT_PRECISION * np.eye(self.count), np.zeros((n, n))
-        inner[:n, :n] = arrow.precision[:n, :n] + self.inner
-        among = np.ix_(self.free, self.free)
-        inverse[among] = np.linalg.inv(inner[:n, :n][among])
-        base, cross = inverse @ (arrow.gradient[:n] + (0.0 if pull is None else pull)), inverse @ inner[:n, n:]
+        arrow = eliminate_starts(made.normal, n, windows.start_precision, windows.no_starts())
+        probed = _eliminated(arrow, made, n)
+        inverse, among = np.zeros((n, n)), np.ix_(self.free, self.free)
+        inverse[among] = np.linalg.inv((arrow.precision + self.inner)[among])
+        base, cross = inverse @ (arrow.gradient + (0.0 if pull is None else pull)), inverse @ probed.cross
         # score and information of each probe with theta projected out; one that theta can imitate is not usable
-        gradient = arrow.gradient[n:] - inner[n:, :n] @ base
-        information = np.diag(inner)[n:] - np.einsum("ik,ik->k", inner[:n, n:], cross)
-        usable = information > 1e-6 * np.diag(inner)[n:] + 2 * FLAT_PRECISION
+        gradient, whole = probed.gradient - probed.cross.T @ base, probed.information + FLAT_PRECISION
+        information = whole - np.einsum("ik,ik->k", probed.cross, cross)
+        usable = information > 1e-6 * whole + 2 * FLAT_PRECISION
         information = np.where(usable & ~(self.one_sided & (gradient < 0)), information, np.inf)
         # what theta and starts leave, whitened by channel
-        base = np.concatenate([base, np.zeros(self.count - n)])
-        left = self.left(residual, base, arrow.blocks(base))
+        step = np.concatenate([base, np.zeros(self.count - n)])
+        left = self.left(residual, step, arrow.blocks(base))
         statistics = np.concatenate([np.cbrt(gradient**2 / information), self.whiteness(left, noise)])
-        return Solved(statistics, left, base, gradient, information, cross, np.diag(inverse), arrow)
+        return Solved(statistics, left, step, gradient, information, cross, np.diag(inverse))
 
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares."""
@@ -240,7 +229,28 @@ class ProbedLogs:
         return [whiten(channel.reshape(-1), s, float(sd), float(tau)) for channel, s, sd, tau in rows]
 
 
-def chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
+@dataclass(frozen=True)
+class _Eliminated:
+    """K probes with the windows' starts eliminated: gradient (K,), information of each (K,), and with theta (N, K)."""
+
+    gradient: FloatArray
+    information: FloatArray
+    cross: FloatArray
+
+
+def _eliminated(arrow: Eliminated, made: Products, n: int) -> _Eliminated:
+    """Of the probes' products, what eliminating the starts of theta's normal equations leaves."""
+    d, k = arrow.shift.shape[1], len(made.squares)
+    plain = made.cross.sum(0)
+    coupling = made.cross[:, n : n + d].copy()
+    coupling[:-1] += made.cross[1:, n + d : n + 2 * d]
+    flat = coupling.reshape(-1, k)
+    explained = (flat * arrow.solve(flat)).sum(0) if d else np.zeros(k)
+    cross = plain[:n] - arrow.slope.reshape(-1, n).T @ flat
+    return _Eliminated(plain[-1] - arrow.shift.ravel() @ flat, made.squares - explained, cross)
+
+
+def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
     """Moments of some columns [theta | x_w | x_{w-1} | r] of others; the first ``num_theta`` are theta's."""
     part, width = copy.copy(moments), moments.num_theta + 2 * moments.num_start + 1
     products = moments.products.reshape(-1, moments.windows, width, width)

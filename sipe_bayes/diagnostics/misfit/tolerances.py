@@ -43,8 +43,8 @@ def open_gains(logs: ProbedLogs, tolerances: Mapping[str, float]) -> list[Tolera
         logs: linearised at the estimate.
         tolerances: sd of what each actuator delivers, as a share of what its command says.
     """
-    seen, n = logs.seen(), logs.windows.num_theta
-    whole = np.diag(seen.arrow.precision)[n:]
+    seen, n = logs.seen, logs.windows.num_theta
+    whole = np.diag(logs.arrow.precision)[n:]
     opened = []
     for k, probe in enumerate(logs.probes):
         size = probe.whole * tolerances.get(probe.site, 0.0)
@@ -56,7 +56,7 @@ def open_gains(logs: ProbedLogs, tolerances: Mapping[str, float]) -> list[Tolera
 
 def tolerance_findings(logs: ProbedLogs, opened: list[Tolerance]) -> list[Finding]:
     """Of each gain by which a value moves more than an sd of what the logs tell."""
-    sd, space = np.sqrt(logs.seen().variance), logs.windows.simulator.space
+    sd, space = np.sqrt(logs.seen.variance), logs.windows.simulator.space
     findings = []
     for one in opened:
         moved = [j for j in range(len(space)) if abs(one.shift[j]) > sd[j]]

@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import best_starts, both_predicted
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, ProbedLogs
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -110,17 +111,45 @@ def residuals(rho: float) -> ProbedLogs:
     return ProbedLogs(windows, theta, noise, best_starts(windows, theta, noise), flat)
 
 
+def close(one: FloatArray, other: FloatArray) -> None:
+    np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
+
+
 def test_products_formed_together_are_those_formed_one_by_one() -> None:
     made = residuals(0.9)
     draws, n = made.drawn(np.random.default_rng(0), 3), made.windows.num_theta
     kept = np.concatenate([made.jacobian[..., :n], made.jacobian[..., made.count :]], axis=-1)
-    noise = Noise(np.array([0.02]), np.array([0.05]))
-    for s, (plain, whitened) in enumerate(made.together(draws)):
-        reference = Moments(draws[..., s], kept, n, made.windows.sequences)
-        np.testing.assert_allclose(plain.products, reference.products, atol=1e-10 * np.abs(reference.products).max())
-        assert plain.num_theta == n
-        normal = Moments(draws[..., s], made.jacobian, made.count, made.windows.sequences).normal(noise)
-        np.testing.assert_allclose(whitened(noise), normal, atol=1e-10 * np.abs(normal).max())
+    for s, moments in enumerate(made.together(draws)):
+        assert moments.num_theta == n
+        close(moments.products, Moments(draws[..., s], kept, n, made.windows.sequences).products)
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.05])
+def test_whitened_rows_have_the_products_that_moments_have(tau: float) -> None:
+    made, noise = residuals(0.9), Noise(np.array([0.02]), np.array([tau]))
+    draw, n = made.drawn(np.random.default_rng(0), 1)[..., 0], made.windows.num_theta
+    reference = Moments(draw, made.jacobian, made.count, made.windows.sequences).normal(noise)
+    close(made.rows.normal(draw, noise), reference)
+    products, probes = made.rows.products(draw, noise, n), np.arange(n, made.count)
+    rest = np.delete(np.arange(reference.shape[1]), probes)
+    close(products.normal, reference[:, rest][:, :, rest])
+    close(products.cross, reference[:, rest][:, :, probes])
+    close(products.squares, np.diag(reference.sum(0))[probes])
+
+
+def test_statistics_are_those_of_the_normal_equations_of_theta_and_probes() -> None:
+    """Score and information of each probe are Schur's complement of theta among all normal equations."""
+    made, n = residuals(0.9), 2
+    information = made.arrow.precision + FLAT_PRECISION * np.eye(made.count)
+    answer = np.linalg.solve(information[:n, :n], information[:n])
+    base = np.linalg.solve(information[:n, :n], made.arrow.gradient[:n])
+    left = np.diag(information - information[:, :n] @ answer)[n:]
+    usable = np.isfinite(made.seen.information)
+    assert usable.sum() > 3
+    close(made.seen.answer, answer[:, n:])
+    close(made.seen.information[usable], left[usable])
+    close(made.seen.score, (made.arrow.gradient - information[:, :n] @ base)[n:])
+    close(np.linalg.inv(information[:n, :n]).diagonal(), made.seen.variance)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])

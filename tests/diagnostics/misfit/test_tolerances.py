@@ -37,7 +37,7 @@ def test_masses_are_allowed_the_tolerance_of_the_motor_and_said_to_be() -> None:
     seen = probed(simulator, simulator.space.normalise(np.array([0.6, 0.08]) / GAIN))
     (opened,) = open_gains(seen, TOLERANCES)
     np.testing.assert_allclose(opened.shift, truth - seen.theta, rtol=0.05)
-    scatter = np.sqrt(seen.seen().variance) * np.random.default_rng(0).standard_normal((4000, 2))
+    scatter = np.sqrt(seen.seen.variance) * np.random.default_rng(0).standard_normal((4000, 2))
     fitted = Particles(seen.theta + scatter, simulator.space)
     exact, allowed = (missing_physics(seen, fitted, prior(simulator.space), True, 0, t) for t in ({}, TOLERANCES))
     assert exact is not None

@@ -1,0 +1,100 @@
+"""The rows of a linearisation whitened by one noise: products of many columns, formed from the samples.
+
+``moments`` sums products once for every channel, gap and window, from which those of any noise follow; the sums grow
+with the square of the columns. Where there are many columns (a probe for each place of each extension) and few noises,
+it is cheaper to whiten the rows for each noise, and to form only the products that are asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.likelihood.noise import Noise, coefficients
+from sipe_bayes.likelihood.sequences import Sequence
+
+
+@dataclass(frozen=True)
+class Products:
+    """Sums over the whitened rows of each window, of K of the columns only what the first N ask of them.
+
+    Args:
+        normal: (W, P, P) of the columns [theta (N) | x_w (D) | x_{w-1} (D) | r], P = N + 2 D + 1.
+        cross: (W, P, K) of these with the others.
+        squares: (K,) of the others, each with itself, summed over the windows.
+    """
+
+    normal: FloatArray
+    cross: FloatArray
+    squares: FloatArray
+
+
+class WhitenedRows:
+    """Rows of N + K columns and D of the window's start, and the row before each.
+
+    Args:
+        jacobian: (W, L, C, N + K + D).
+        num_start: D.
+        all_sequences: the samples of each channel in a row.
+    """
+
+    def __init__(self, jacobian: FloatArray, num_start: int, all_sequences: list[Sequence]) -> None:
+        self.shape, self.num_theta = jacobian.shape[:3], jacobian.shape[-1] - num_start
+        self.sequences = all_sequences
+        self._crosses = self._placed([s.crosses.astype(float) for s in all_sequences]) > 0
+        self._rows, self._before = self._both(jacobian)
+
+    def normal(self, residual: FloatArray, noise: Noise) -> FloatArray:
+        """Products (W, K', K') of all columns with a residual (W, L, C), as ``Moments.normal`` gives them."""
+        rows = np.concatenate(self._whitened(residual, noise), axis=-1)
+        return np.swapaxes(rows, 1, 2) @ rows
+
+    def products(self, residual: FloatArray, noise: Noise, first: int) -> Products:
+        """Those of the ``first`` N columns of N + K, the starts' and a residual (W, L, C)."""
+        theta, others = self._whitened(residual, noise)
+        rows, rest = np.concatenate([theta[..., :first], others], axis=-1), theta[..., first:]
+        turned = np.swapaxes(rows, 1, 2)
+        return Products(turned @ rows, turned @ rest, np.einsum("wrk,wrk->k", rest, rest))
+
+    def _whitened(self, residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Rows (W, C L, N + K), and (W, C L, 2 D + 1) of [x_w | x_{w-1} | r]; zero where nothing was observed."""
+        n, weights, lags = self.num_theta, [], []
+        for s, sd, tau in zip(self.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
+            a = coefficients(s.gaps, tau)[s.gap]
+            weights.append(1 / (sd * np.sqrt(1 - a**2)))
+            lags.append(a * weights[-1])
+        weight, lag = self._placed(weights)[..., None], self._placed(lags)[..., None]
+        inside = np.where(self._crosses[..., None], 0.0, lag)
+        left, before_left = self._both(residual[..., None])
+        theta = weight * self._rows[..., :n] - lag * self._before[..., :n]
+        own = weight * self._rows[..., n:] - inside * self._before[..., n:]
+        # across an edge the row before belongs to the start of the window before
+        earlier = (inside - lag) * self._before[..., n:]
+        return theta, np.concatenate([own, earlier, weight * left - lag * before_left], axis=-1)
+
+    def _both(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Observed rows (W, C L, q) of values (W, L, C, q), and what is in the row before each."""
+        windows, length, channels, width = values.shape
+        flat = np.moveaxis(values, 2, 0).reshape(channels, windows * length, width)
+        rows, before = np.zeros((2, *flat.shape))
+        for c, s in enumerate(self.sequences):
+            linked = s.previous >= 0
+            rows[c, s.index] = flat[c, s.index]
+            before[c, s.index[linked]] = flat[c, s.previous[linked]]
+        return self._by_window(rows), self._by_window(before)
+
+    def _placed(self, values: list[FloatArray]) -> FloatArray:
+        """Numbers of each channel's samples at their rows (W, C L)."""
+        windows, length, channels = self.shape
+        out = np.zeros((channels, windows * length))
+        for row, s, own in zip(out, self.sequences, values, strict=True):
+            row[s.index] = own
+        return self._by_window(out[..., None])[..., 0]
+
+    def _by_window(self, rows: FloatArray) -> FloatArray:
+        """(W, C L, q) of (C, W L, q)."""
+        windows, length, channels = self.shape
+        turned = np.moveaxis(rows.reshape(channels, windows, length, -1), 0, 1)
+        return turned.reshape(windows, channels * length, -1)
