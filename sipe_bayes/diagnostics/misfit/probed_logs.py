@@ -244,9 +244,9 @@ def _eliminated(arrow: Eliminated, made: Products, n: int) -> _Eliminated:
     plain = made.cross.sum(0)
     coupling = made.cross[:, n : n + d].copy()
     coupling[:-1] += made.cross[1:, n + d : n + 2 * d]
-    flat = coupling.reshape(-1, k)
+    flat = coupling.reshape(len(coupling) * d, k)
     explained = (flat * arrow.solve(flat)).sum(0) if d else np.zeros(k)
-    cross = plain[:n] - arrow.slope.reshape(-1, n).T @ flat
+    cross = plain[:n] - arrow.slope.reshape(len(flat), n).T @ flat
     return _Eliminated(plain[-1] - arrow.shift.ravel() @ flat, made.squares - explained, cross)
 
 
