@@ -144,7 +144,10 @@ def run_discovery(
     except ValueError:
         release(folder)
         raise
-    if progress is not None:
-        progress("comparing before and after", structures.rollouts, structures.rollouts)
-    discovery = summarise(problem, structures, name, chosen, time.monotonic() - began)
+
+    def tell(what: str) -> None:
+        if progress is not None:
+            progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
+
+    discovery = summarise(problem, structures, name, chosen, time.monotonic() - began, tell)
     return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

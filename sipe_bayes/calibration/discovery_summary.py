@@ -30,6 +30,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, Posterior
@@ -39,7 +40,9 @@ from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.structures import Structures
 
 
-def summarise(problem: Problem, structures: Structures, name: str, seed: int, seconds: float) -> Discovery:
+def summarise(
+    problem: Problem, structures: Structures, name: str, seed: int, seconds: float, tell: Tell = silent
+) -> Discovery:
     """Everything that is told of a search.
 
     Args:
@@ -48,8 +51,9 @@ def summarise(problem: Problem, structures: Structures, name: str, seed: int, se
         name: of the run.
         seed: of draws.
         seconds: that the search took.
+        tell: called with what is being done.
     """
-    before, after = _Model(problem, structures, structures.plain), _Model(problem, structures, structures.best)
+    before, after = (_Model(problem, structures, one, tell) for one in (structures.plain, structures.best))
     logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
     compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
     added = [p for label in structures.best.labels for p in _added(structures, label, seed)]
@@ -98,6 +102,7 @@ class _Model:
     problem: Problem
     structures: Structures
     one: FittedStructure
+    tell: Tell
 
     def windows(self, logs: Trajectories) -> Windows:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
@@ -129,7 +134,7 @@ class _Model:
         windows = fitting.windows(self.structures.simulator(one))
         prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
         try:
-            return ProbedLogs(windows, one.theta, one.noise, one.starts, prior)
+            return ProbedLogs(windows, one.theta, one.noise, one.starts, prior, tell=self.tell)
         except ValueError:  # LinAlgError is one
             return None
 

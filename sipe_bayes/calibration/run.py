@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,7 +50,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.random_effects import LogEstimate
-from sipe_bayes.inference.recorded import Progress
+from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -61,6 +61,8 @@ from sipe_bayes.likelihood.state_space.process_noise import process_noise_findin
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.posterior import Posterior
+
+_CHECKING = "checking what the model lacks"
 
 
 def calibrate(
@@ -92,8 +94,8 @@ def calibrate(
     fit = _Fit.of(problem, method, theta)
     problem = replace(problem, train=_tamed(problem.train, method))
     alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
-    tell("checking what the model lacks")
-    probed, residuals = _residuals(problem, method, fit, unknown)
+    tell(_CHECKING)
+    probed, residuals = _residuals(problem, method, fit, unknown, tell)
     lacks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
     tell("simulating the posterior's band")
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
@@ -237,11 +239,11 @@ def _every_channel(problem: Problem, logs: Trajectories) -> Windows:
 
 def _tell(method: Estimator, progress: Progress | None, what: str) -> None:
     if progress is not None:
-        progress(what, method.rollouts, method.budget)
+        progress(what, method.rollouts, method.rollouts)  # the fit is over
 
 
 def _one_by_one(
-    problem: Problem, fit: _Fit, seed: int, tell: Callable[[str], None]
+    problem: Problem, fit: _Fit, seed: int, tell: Tell
 ) -> tuple[list[LogEstimate], Disagreement | None, list[Finding]]:
     """What each of several logs says by itself, how they disagree, and a finding for each that could not be fitted.
 
@@ -276,7 +278,7 @@ def _channel_noise(fitted: Windows, noise: Noise) -> dict[str, ChannelNoise]:
 
 
 def _residuals(
-    problem: Problem, method: Estimator, fit: _Fit, unknown: list[Finding]
+    problem: Problem, method: Estimator, fit: _Fit, unknown: list[Finding], tell: Tell
 ) -> tuple[ProbedLogs | None, list[Residual]]:
     """The logs as the checks of their residuals see them, and the residuals.
 
@@ -294,7 +296,8 @@ def _residuals(
         unknown.append(finding(Code.NOISE_FREE, share=left))
         return None, fitted_residuals(windows, theta, noise, starts)
     try:
-        probed = ProbedLogs(windows, theta, noise, starts, QuadraticPrior.of(problem.prior), fit.lin)
+        prior = QuadraticPrior.of(problem.prior)
+        probed = ProbedLogs(windows, theta, noise, starts, prior, fit.lin, lambda what: tell(f"{_CHECKING}: {what}"))
         if probed.windows.num_windows < windows.num_windows:
             asked = probed.windows.num_windows
             unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=windows.num_windows))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,13 +10,12 @@ import typer
 
 from sipe_bayes.cli.errors import exit_on_error
 from sipe_bayes.core.validation import at_least, whole
+from sipe_bayes.inference.progress_bar import ProgressBar
 from sipe_bayes.inference.registry import ESTIMATORS
 
 SimulatedOn = Annotated[
     str, typer.Option("--device", help="cpu; or cuda, cuda:1: rollouts in float32 on a GPU, with the extra gpu.")
 ]
-
-_TIMED = 3  # logs after which the time of all is told where there is no line that changes
 
 
 def check(
@@ -66,7 +64,8 @@ def check(
         of = f" of at most {each} rollouts each" * bool(each)
         if not as_json:
             print(f"{trained}{truths} fits{of}, kept in {folder}", flush=True)
-        outcome = checks.run(study, truths, folder, _silent if as_json else _say, early=not every)
+        with ProgressBar(quiet=as_json, unit="logs", estimate=False) as progress:
+            outcome = checks.run(study, truths, folder, progress, early=not every)
     if as_json:
         print(to_json(outcome.to_dict()))
     else:
@@ -78,14 +77,3 @@ def check(
         print(f"figures: {folder / 'ranks.png'}, {folder / 'coverage.png'}")
     if not outcome.calibrated:
         raise typer.Exit(1)
-
-
-def _say(what: str, done: int, of: int) -> None:
-    if sys.stderr.isatty():
-        print(f"\r{what}\033[K", end="\r", file=sys.stderr, flush=True)
-    elif done == _TIMED:
-        print(what, file=sys.stderr, flush=True)
-
-
-def _silent(what: str, done: int, of: int) -> None:
-    pass

@@ -13,7 +13,7 @@ explains it. And each log is left out in turn: where the others agree without on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.random_effects import LogEstimate
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.settings import Segments, StateSpace
@@ -97,7 +98,7 @@ def log_estimates(
     trajectories: Trajectories,
     theta: FloatArray,
     seed: int = 0,
-    tell: Callable[[str], object] = lambda _: None,
+    tell: Tell = silent,
 ) -> tuple[list[LogEstimate], list[str]]:
     """Fit each log by itself.
 

@@ -1,8 +1,9 @@
-"""How far a long fit is, as a bar on a terminal and in a notebook."""
+"""How far a long fit is: a bar on a terminal and in a notebook, lines elsewhere."""
 
 from __future__ import annotations
 
 import sys
+import time
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +11,11 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+_SECONDS = 15.0  # between two lines, and before the first: what is done sooner says nothing
+
 
 class ProgressBar:
-    """A bar by tqdm, on standard error; nothing where that is neither a terminal nor a notebook.
+    """A bar by tqdm on standard error; where that is neither a terminal nor a notebook, a line every 15 s at most.
 
     It is what ``progress`` of ``sipe.get_estimator``, ``sipe.calibrate`` and ``sipe.discover`` takes::
 
@@ -22,11 +25,16 @@ class ProgressBar:
     Args:
         quiet: show nothing anywhere.
         unit: of what is counted.
+        estimate: whether lines tell how long the rest will take at most; not where what is being done tells it.
     """
 
-    def __init__(self, quiet: bool = False, unit: str = "rollouts") -> None:
+    def __init__(self, quiet: bool = False, unit: str = "rollouts", estimate: bool = True) -> None:
         self._bar: Any = None
-        if not quiet and ("ipykernel" in sys.modules or sys.stderr.isatty()):
+        self._unit, self._estimate = unit, estimate
+        self._began = self._last = time.monotonic()
+        seen = "ipykernel" in sys.modules or sys.stderr.isatty()
+        self._lines = not quiet and not seen
+        if not quiet and seen:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a notebook without ipywidgets gets a bar of letters
                 from tqdm.auto import tqdm
@@ -53,3 +61,20 @@ class ProgressBar:
             self._bar.set_description(what, refresh=False)
             self._bar.total, self._bar.n = total, min(done, total)
             self._bar.refresh()
+        elif self._lines and time.monotonic() - self._last >= _SECONDS:
+            self._last = time.monotonic()
+            print(self._line(what, done, total), file=sys.stderr, flush=True)
+
+    def _line(self, what: str, done: int, total: int) -> str:
+        """The time until now, what is being done, and unless all is done how far and how long it takes at most."""
+        seconds = self._last - self._began
+        line = f"{seconds:.0f} s: {what}"
+        if done >= total:
+            return line
+        line += f"; {done} of at most {total} {self._unit}"
+        return f"{line}, {_spoken(seconds * (total - done) / done)} more at most" if self._estimate and done else line
+
+
+def _spoken(seconds: float) -> str:
+    """A duration in words."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
@@ -51,6 +52,7 @@ def candidates(
     noise: Noise,
     prior: QuadraticPrior,
     placed: Sequence[Placed],
+    tell: Tell = silent,
 ) -> list[Candidate]:
     """Extensions ranked by what they promise, best first; costs a linearisation and a rollout for each probe.
 
@@ -61,11 +63,12 @@ def candidates(
         noise: (C,), there.
         prior: of theta.
         placed: the extensions.
+        tell: called with what is being done.
     """
     linearisation = windows.linearise(theta, starts)
     around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
     plain = around.fitted(np.zeros((*linearisation.residual.shape, 0)))
-    seen = effects(windows, theta, starts, placed)
+    seen = effects(windows, theta, starts, placed, tell)
     ranked: dict[str, Candidate] = {}
     for candidate in (around.candidate(effect, plain) for effect in seen):
         label = candidate.placed.label

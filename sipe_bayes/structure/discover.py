@@ -102,15 +102,14 @@ def discover(
         ValueError: for a simulator of anything but an MJCF, unknown extensions, or sites that the model does not have.
         CheckpointError: for a checkpoint that is damaged or of another run.
     """
-    search = _search(simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed)
+    given = simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed, progress
+    search = _search(*given)
     fingerprint = _fingerprint(search, simulator, restriction or Restriction())
     state = DiscoverState()
     if checkpoint is not None and checkpoint.exists():
         state = load_state(checkpoint, DiscoverState, fingerprint)
     saved = -_SAVE_SECONDS
     while not state.done:
-        if progress is not None:
-            progress(search.describe(state), state.rollouts, search.budget)
         state = search.step(state)
         if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
             save_state(checkpoint, state, fingerprint)
@@ -164,6 +163,7 @@ def _search(
     options: DiscoverOptions | None,
     budget: int,
     seed: int,
+    progress: Progress | None,
 ) -> StructureSearch:
     environment = _environment(simulator)
     restriction, options = restriction or Restriction(), options or DiscoverOptions()
@@ -179,9 +179,8 @@ def _search(
         simulator.num_threads or cores(),
     )
     extensions = [get_extension(name) for name in restriction.names]
-    return StructureSearch(
-        fitting, extensions, restriction.sites, options, whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
-    )
+    most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
+    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress)
 
 
 def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:

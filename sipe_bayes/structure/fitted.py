@@ -15,6 +15,7 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
 from sipe_bayes.inference.laplace.strategy import distinct
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import Segments
@@ -119,20 +120,23 @@ class Fitting:
         mean[:n], covariance[:n, :n] = (x.numpy() for x in self.prior.gaussian_moments())
         return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
 
-    def fit(self, placed: Sequence[Placed], initial: FloatArray | None, budget: int) -> FittedStructure:
+    def fit(
+        self, placed: Sequence[Placed], initial: FloatArray | None, budget: int, progress: Progress | None = None
+    ) -> FittedStructure:
         """The best optimum of a structure, and its scores.
 
         Args:
             placed: its extensions.
             initial: (N + P,), where the search begins; default as ``laplace`` does.
             budget: rollouts at most.
+            progress: called along the way.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
         """
         simulator = self.simulator(placed)
         prior = self.prior_of(simulator)
-        optimum = self._optimum(simulator, prior, self.trajectories, initial, budget)
+        optimum = self._optimum(simulator, prior, self.trajectories, initial, budget, progress)
         best, windows = optimum.best, self.windows(simulator)
         both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         labels = tuple(one.label for one in placed)
@@ -151,7 +155,9 @@ class Fitting:
             settled,
         )
 
-    def log_score(self, placed: Sequence[Placed], one: FittedStructure) -> tuple[float, int]:
+    def log_score(
+        self, placed: Sequence[Placed], one: FittedStructure, progress: Progress | None = None
+    ) -> tuple[float, int]:
         """Log p of the held-out logs given the others, their noise estimated from themselves; and the rollouts.
 
         Minus infinity where the structure does not follow them at all.
@@ -159,12 +165,13 @@ class Fitting:
         Args:
             placed: the structure's extensions.
             one: fitted to the other logs.
+            progress: called along the way.
         """
         assert self.holdout is not None
         simulator = self.simulator(placed)
         prior = GaussianMixture(torch.zeros(1), one.mean[None], one.covariance[None], simulator.space)
         try:
-            optimum = self._optimum(simulator, prior, self.holdout, one.theta, _LOOK * len(self.holdout))
+            optimum = self._optimum(simulator, prior, self.holdout, one.theta, _LOOK * len(self.holdout), progress)
             windows, best = Windows(self.likelihood, simulator, self.holdout), optimum.best
             both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         except ValueError:  # LinAlgError and BudgetTooSmall are ones
@@ -172,7 +179,13 @@ class Fitting:
         return both.evidence, optimum.rollouts + windows.rollouts
 
     def _optimum(
-        self, simulator: Simulator, prior: Posterior, logs: Trajectories, initial: FloatArray | None, budget: int
+        self,
+        simulator: Simulator,
+        prior: Posterior,
+        logs: Trajectories,
+        initial: FloatArray | None,
+        budget: int,
+        progress: Progress | None,
     ) -> _Optimum:
         """The best optimum of some logs."""
         given = None if initial is None else initial[None]
@@ -183,6 +196,7 @@ class Fitting:
             budget=budget,
             seed=self.seed,
             likelihood=self.likelihood,
+            progress=progress,
             initial=given,
             tuning=tuning,
         )

@@ -14,6 +14,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended, placements
@@ -58,13 +59,16 @@ class Probe:
     whole: float = math.nan
 
 
-def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[list[Probe], FloatArray, BoolArray]:
+def probes(
+    windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell = silent
+) -> tuple[list[Probe], FloatArray, BoolArray]:
     """Probes of all extensions that the registry has; none where the environment is no user's MJCF.
 
     Args:
         windows: the logs, W windows of L samples and C channels.
         theta: (N,) where the model stands.
         starts: (W, D) of the windows.
+        tell: called with what is being done.
 
     Returns:
         The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
@@ -74,7 +78,7 @@ def probes(windows: Windows, theta: FloatArray, starts: FloatArray) -> tuple[lis
         return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
     machine = machine_of(windows, theta, starts)
     every = [p for name in EXTENSIONS for p in placements(get_extension(name), machine)]
-    seen = effects(windows, theta, starts, [p for p in every if not p.extension.last_resort])
+    seen = effects(windows, theta, starts, [p for p in every if not p.extension.last_resort], tell)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     nothing = np.zeros((*windows.observed.shape, 0))
@@ -114,7 +118,9 @@ def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray
     return np.minimum(down.max(1), 0.0), np.maximum(up.min(1), 0.0)
 
 
-def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Sequence[Placed]) -> list[Effect]:
+def effects(
+    windows: Windows, theta: FloatArray, starts: FloatArray, placed: Sequence[Placed], tell: Tell = silent
+) -> list[Effect]:
     """The effects of extensions that change what is observed.
 
     Args:
@@ -122,6 +128,7 @@ def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Seq
         theta: (N,), the estimate.
         starts: (W, D).
         placed: the extensions.
+        tell: called with what is being done.
     """
     groups: dict[str, list[Placed]] = {}
     for one in placed:
@@ -130,7 +137,11 @@ def effects(windows: Windows, theta: FloatArray, starts: FloatArray, placed: Seq
         if any(parameter.log is not None for parameter in one.parameters):
             key = key or "by log"  # which writes what others write for all logs
         groups.setdefault(key, []).append(one)
-    return [effect for group in groups.values() for effect in _of_group(windows, theta, starts, group)]
+    out: list[Effect] = []
+    for number, group in enumerate(groups.values()):
+        tell(f"simulating what extensions would do, {number} of {len(groups)}")
+        out += _of_group(windows, theta, starts, group)
+    return out
 
 
 def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed]) -> list[Effect]:

@@ -37,6 +37,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates
@@ -76,6 +77,7 @@ class StructureSearch:
         joints: names of joints, actuators and channels at which they may be placed; default all.
         options: of the search.
         budget: rollouts of all fits.
+        progress: called along the way.
     """
 
     def __init__(
@@ -85,16 +87,20 @@ class StructureSearch:
         joints: Sequence[str] | None = None,
         options: DiscoverOptions | None = None,
         budget: int = 20000,
+        progress: Progress | None = None,
     ) -> None:
         self.given = self.fitting = fitting
         self.extensions, self.joints = tuple(extensions), joints
-        self.options, self.budget = options or DiscoverOptions(), budget
+        self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
+        self._rollouts, self._doing = 0, ""  # before the present step, and what it does
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
         self.place(state)
+        self._rollouts, self._doing = state.rollouts, self.describe(state)
+        self._tell("")
         if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
             return replace(state, phase=Phase.DONE)
         return {
@@ -123,6 +129,11 @@ class StructureSearch:
             Phase.RESIDUAL: "fitting a force without a name",
             Phase.DONE: "done",
         }[state.phase]
+
+    def _tell(self, what: str, rollouts: int = 0, _: int = 0) -> None:
+        """How far the present step is, after some rollouts of its own."""
+        if self.progress is not None:
+            self.progress(f"{self._doing}{what and ': '}{what}", self._rollouts + rollouts, self.budget)
 
     @property
     def placed(self) -> dict[str, Placed]:
@@ -188,7 +199,7 @@ class StructureSearch:
         """The plain model fitted to logs with columns multiplied; None where it cannot be."""
         budget = self.options.column_budget if columns else self.options.fit_budget
         try:
-            return self.given.corrected(columns).fit([], None, budget)
+            return self.given.corrected(columns).fit([], None, budget, self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
             return None
 
@@ -226,7 +237,7 @@ class StructureSearch:
             and p.extension.last_resort == last_resort
             and not targets & {t for q in p.parameters for t in q.targets}
         ]
-        return candidates(windows, here.theta, here.starts, here.noise, prior, rest)
+        return candidates(windows, here.theta, here.starts, here.noise, prior, rest, self._tell)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
         label, *rest = state.queue
@@ -255,7 +266,7 @@ class StructureSearch:
         """With what the held-out logs say of a structure and of the present one, where there are such logs."""
         for each in (state.here, one) if self.fitting.holdout is not None else ():
             if state.judgement(each.labels) is None:
-                log_score, rollouts = self.fitting.log_score(self.structure(each.labels), each)
+                log_score, rollouts = self.fitting.log_score(self.structure(each.labels), each, self._tell)
                 state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
         return state
 
@@ -333,7 +344,7 @@ class StructureSearch:
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
         left = min(self.options.fit_budget, self.budget - state.rollouts)
         try:
-            one = self.fitting.fit(self.structure(labels), initial, max(left, 1))
+            one = self.fitting.fit(self.structure(labels), initial, max(left, 1), self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
             return replace(state, failed=(*state.failed, labels))
         return replace(state, fitted=(*state.fitted, one))

@@ -54,7 +54,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, log: pd.DataFrame) -> tup
 def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
     _, out, result = finished
     assert result.stdout.count("\n") == 1
-    assert result.stderr == ""  # no progress bar when piped
+    assert result.stderr == ""
     found = strict_json(result.stdout)
     assert {"parameters", "holdout", "train", "warnings", "rollouts", "seconds", "out", "left_out"} <= set(found)
     assert found["comparison"]["verdict"] == "better"
@@ -172,7 +172,7 @@ def test_table_for_people(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest
     text("bounds = [0.01, 0.2]", "bounds = [0.01, 0.2]\nper_log = true")(config.parent)
     result = call(config)
     assert result.exit_code == 0, result.stderr
-    assert result.stderr == ""
+    assert all(line.split(": ")[0].endswith(" s") for line in result.stderr.splitlines())  # how far it is, if slow
     assert (tmp_path / "runs" / "config-laplace").is_dir() or (tmp_path / "runs" / "swing-laplace").is_dir()
     shown = "mass", "damping[log]", "with what it may lack", "held out rest, angle: RMSE", "rollouts", "report: runs/"
     for words in shown:

@@ -1,4 +1,4 @@
-"""The progress bar: on a terminal and in a notebook, nowhere else."""
+"""The progress bar: on a terminal and in a notebook; lines elsewhere, one every 15 s at most."""
 
 from __future__ import annotations
 
@@ -30,9 +30,41 @@ def test_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "done: 100%" in text
 
 
+class Clock:
+    """Time that passes as a test has it."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, estimate: bool = True) -> list[str]:
+    """What is printed of a call every four seconds to 40 of 100, then of two after the fit, to no terminal."""
+    clock, stream = Clock(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr("sipe_bayes.inference.progress_bar.time", clock)
+    with sipe.ProgressBar(quiet=quiet, estimate=estimate) as progress:
+        for done in range(0, 50, 10):
+            progress(f"step {done}", done, 100)
+            clock.now += 4
+        for _ in range(2):
+            clock.now += 14
+            progress("checking", 40, 40)
+    return stream.getvalue().splitlines()
+
+
+def test_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit, checks = "16 s: step 40; 40 of at most 100 rollouts", "34 s: checking"
+    assert lines(monkeypatch) == [f"{fit}, 24 s more at most", checks]
+    assert lines(monkeypatch, estimate=False) == [fit, checks]
+
+
 def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert shown(monkeypatch, io.StringIO()) == ""
+    assert shown(monkeypatch, io.StringIO()) == ""  # what takes no 15 s
     assert shown(monkeypatch, Terminal(), quiet=True) == ""
+    assert lines(monkeypatch, quiet=True) == []
 
 
 def test_notebook(monkeypatch: pytest.MonkeyPatch) -> None:

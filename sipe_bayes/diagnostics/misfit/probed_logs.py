@@ -17,6 +17,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.thinning import spread_windows
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
@@ -90,6 +91,7 @@ class ProbedLogs:
         starts: (W, D) of the windows; default the best.
         prior: of the fit; default flat.
         lin: at theta and starts, where it is known.
+        tell: called with what is being done.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -103,6 +105,7 @@ class ProbedLogs:
         starts: FloatArray | None = None,
         prior: QuadraticPrior | None = None,
         lin: Linearisation | None = None,
+        tell: Tell = silent,
     ) -> None:
         kept = spread_windows(windows, MISFIT.steps)
         if len(kept) < windows.num_windows:
@@ -115,7 +118,8 @@ class ProbedLogs:
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        self.probes, effects, self.one_sided = probes(windows, theta, starts)
+        self.tell = tell
+        self.probes, effects, self.one_sided = probes(windows, theta, starts, tell)
         n = windows.num_theta
         parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
         self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
@@ -143,6 +147,7 @@ class ProbedLogs:
         """Statistics (simulated, K + 2 C) of noise alone, each with the noise that is then estimated; made once."""
         made = self._nulls.setdefault(seed, _Null(np.random.default_rng(seed)))
         while len(made.rows) < simulated:
+            self.tell(f"comparing with noise alone, draw {len(made.rows)} of at most {MISFIT.simulated}")
             draws = self.drawn(made.rng, MISFIT.batch)
             for s, moments in enumerate(self.together(draws)):
                 made.rows.append(self.solved(draws[..., s], self.estimated(moments)).statistics)
