@@ -16,6 +16,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
+from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
@@ -23,7 +24,6 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
-from sipe_bayes.likelihood.whitened_rows import Products, WhitenedRows
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.structure.probes import probes
 
