@@ -20,7 +20,7 @@ from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.report.discovery.words import discovery_verdicts
-from tests.problems.interruptions import stop_after
+from tests.problems.interruptions import stop_in_stage
 from tests.problems.lacking import FRICTION, OWN, write_lacking
 
 
@@ -155,10 +155,11 @@ def test_start_of_an_unknown_parameter_is_one_line(tmp_path: Path) -> None:
 def test_killed_search_goes_on_to_the_same_bits(case: tuple[Path, Discovery], tmp_path: Path) -> None:
     _, found = case
     config = write_lacking(tmp_path)
-    for step in (2, 3):
+    # inside the first fit; where the second and the third step begin; inside one of them
+    for stage, calls, kept in ((1, 3, False), (2, 1, True), (3, 1, True), (2, 2, True)):
         with pytest.raises(KeyboardInterrupt):
-            run_discovery(config, tmp_path / "out", num_threads=1, progress=stop_after(step))
-    assert (tmp_path / "out" / CHECKPOINT).exists()
+            run_discovery(config, tmp_path / "out", num_threads=1, progress=stop_in_stage(stage, calls))
+        assert (tmp_path / "out" / CHECKPOINT).exists() == kept
     resumed = run_discovery(config, tmp_path / "out", num_threads=1)
     assert resumed.rows == found.rows
     for name in ("posterior.safetensors", "discovered.xml"):
