@@ -44,7 +44,7 @@ class WindowTuning(Options):
 
 
 @dataclass(frozen=True)
-class WideTuning(Options):
+class WideDifferenceTuning(Options):
     """Differences as long as the posterior is wide; see ``wide_differences``."""
 
     rounds: int = option(3, "in which the normal grows, and is asked again", least=0)
@@ -118,7 +118,7 @@ class LaplaceTuning(Options):
     damping: DampingRule = option(DampingRule(), "how steps are damped")
     screening: ScreeningTuning = option(ScreeningTuning(), "how starting points are chosen")
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
-    wide: WideTuning = option(WideTuning(), "differences as long as the posterior is wide")
+    wide: WideDifferenceTuning = option(WideDifferenceTuning(), "differences as long as the posterior is wide")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
     contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
     scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")

@@ -10,7 +10,7 @@ import pytest
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.options import LaplaceOptions, LaplaceTuning, WideTuning
+from sipe_bayes.inference.laplace.options import LaplaceOptions, LaplaceTuning, WideDifferenceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.window_optimum import Ending, summarised, widened
 from sipe_bayes.likelihood.noise import Noise
@@ -70,7 +70,7 @@ def test_a_normal_that_jumps_make_narrow_grows_to_its_width(fitted: tuple[Laplac
 def test_one_that_is_left_narrow_is_said(fitted: tuple[Laplace, Windows, Ending]) -> None:
     """A single round does not ask the wider one again; the finding sends importance draws, or blocks."""
     method, windows, ending = fitted
-    options = LaplaceOptions(tuning=LaplaceTuning(wide=WideTuning(rounds=1)))
+    options = LaplaceOptions(tuning=LaplaceTuning(wide=WideDifferenceTuning(rounds=1)))
     problem: SearchProblem = replace(method.problem, options=options)
     wide = widened(problem, windows, jumpy(windows, ending, 6.0))
     assert wide.finding is not None
