@@ -312,7 +312,7 @@ def _outside(
     problem: Problem, method: Estimator, fit: _Fit, seen: _Predictions, unknown: list[Finding]
 ) -> list[OutsidePrior]:
     followed = follows(seen.windows["train"], seen.predicted["train"][0])
-    noise = observation_noise(method.diagnostics, problem.train, problem.likelihood)
+    noise = observation_noise(method.diagnostics, problem.train, problem.likelihood, fit.windows.simulator)
     try:
         return outside_prior(fit.windows, problem.prior, noise, seed=method.seed, followed=followed)
     except ValueError as error:

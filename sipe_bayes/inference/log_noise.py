@@ -68,5 +68,5 @@ def fitted_noise(
     coloured = replace(likelihood, noise="ar1") if isinstance(likelihood, Segments) else likelihood
     fit = Laplace(simulator, likelihood=coloured, prior=prior, initial=theta, budget=budget)
     fit.fit(trajectories)
-    noise = observation_noise(fit.diagnostics, trajectories, likelihood)
+    noise = observation_noise(fit.diagnostics, trajectories, likelihood, simulator)
     return LogNoise(noise, process_noise(fit.diagnostics), fit.rollouts)

@@ -283,7 +283,7 @@ class Recalibrated(Estimator[RecalibratedState]):
             fitted = fitted_noise(self.simulator, self.likelihood, trajectories, self.prior, theta)
             self.rollouts += fitted.rollouts
             return fitted.noise
-        return observation_noise(base.diagnostics, trajectories, self.likelihood)
+        return observation_noise(base.diagnostics, trajectories, self.likelihood, self.simulator)
 
     def _bound_budget(self, trajectories: Trajectories) -> None:
         if self._asked is None:

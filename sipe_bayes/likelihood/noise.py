@@ -17,8 +17,12 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts import smoothed
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
 
 NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
+_ROUNDING = 1e-6  # of the largest sample: trajectories are kept in single precision at places
+_ENOUGH = 30  # samples whose distances from their states have a size
 
 
 def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
@@ -71,11 +75,15 @@ def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> F
     return (residual[..., sequence.index] - a * before) / (sd * np.sqrt(1 - a**2))
 
 
-def noise_level(trajectories: Trajectories, likelihood: Segments | StateSpace) -> FloatArray:
+def noise_level(
+    trajectories: Trajectories, likelihood: Segments | StateSpace, simulator: Simulator | CallableSimulator
+) -> FloatArray:
     """Sd (O,) of each channel's noise in its unit.
 
-    As ``likelihood.noise_sd`` states it; else zero for trajectories with recorded states; else the robust sd of what
-    local quadratics over 60 ms leave of the recorded samples.
+    As ``likelihood.noise_sd`` states it. Else, where states are recorded, by how far channels are from the states that
+    they measure: those that measure none have no noise if another channel repeats its state to rounding, or if none
+    measures one and all states are recorded. Else the robust sd of what local quadratics over 60 ms leave of the
+    samples.
 
     Raises:
         ValueError: where the settings state another number of sds than there are channels.
@@ -84,8 +92,31 @@ def noise_level(trajectories: Trajectories, likelihood: Segments | StateSpace) -
     stated = likelihood.noise_sd or (None,) * count
     if len(stated) != count:
         raise ValueError(f"noise_sd: expected {count} values, one for each channel, got {len(stated)}")
-    estimated = np.zeros(count) if trajectories.states is not None else _residual_sd(trajectories)
+    estimated = _residual_sd(trajectories)
+    if trajectories.states is not None and isinstance(simulator, Simulator):
+        beside = _sd_beside_states(trajectories, trajectories.states, simulator)
+        estimated = np.where(np.isnan(beside), estimated, beside)
     return np.array([estimated[c] if sd is None else sd for c, sd in enumerate(stated)])
+
+
+def _sd_beside_states(trajectories: Trajectories, states: FloatArray, simulator: Simulator) -> FloatArray:
+    """Robust sd (O,) of samples about the states (B, T+1, S) that they measure, NaN where these say nothing."""
+    columns = simulator.environment.state_columns(simulator.model)
+    sd = np.full(len(columns), np.nan)
+    for channel, column in enumerate(columns):
+        if column is not None:
+            seen = trajectories.observations[..., channel]
+            off = seen - states[..., column]
+            off = off[np.isfinite(off)]
+            if off.size and np.abs(off).max() <= _ROUNDING * max(1.0, float(np.nanmax(np.abs(seen)))):
+                sd[channel] = 0.0
+            elif off.size >= _ENOUGH:
+                sd[channel] = NORMAL_MAD * np.median(np.abs(off - np.median(off)))
+    others = [column is None for column in columns]
+    recorded = np.isfinite(states[..., 0]).sum() == (trajectories.length + 1).sum()
+    if (sd == 0).any() or (all(others) and recorded):
+        sd[others] = 0.0
+    return sd
 
 
 def _residual_sd(trajectories: Trajectories) -> FloatArray:

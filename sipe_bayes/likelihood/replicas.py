@@ -28,14 +28,17 @@ from sipe_bayes.simulation.simulator import Simulator
 
 
 def observation_noise(
-    diagnostics: Mapping[str, Sequence[float]], trajectories: Trajectories, likelihood: Segments | StateSpace
+    diagnostics: Mapping[str, Sequence[float]],
+    trajectories: Trajectories,
+    likelihood: Segments | StateSpace,
+    simulator: Simulator | CallableSimulator,
 ) -> Noise:
     """Noise of all O channels.
 
     As an estimator's ``diagnostics`` say (``noise_sd``, ``noise_tau``) of the channels that it fitted; ``noise_level``
     tells of the others, as white.
     """
-    sd = noise_level(trajectories, likelihood)
+    sd = noise_level(trajectories, likelihood, simulator)
     tau = np.zeros(len(sd))
     fitted = list(range(len(sd)))
     if likelihood.fit is not None and trajectories.channels:

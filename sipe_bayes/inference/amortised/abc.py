@@ -85,7 +85,7 @@ class ABC(PriorSampling[PriorSamplingState[Bank], Bank]):
         theta, observations = simulations.theta, simulations.observations
         statistics, summaries = self.statistics(observations, trajectories), None
         if self.options.summary in REGRESSED:
-            noise = noise_level(trajectories, self.likelihood)
+            noise = noise_level(trajectories, self.likelihood, self.simulator)
             summaries, statistics = Summaries.of(
                 theta, observations, statistics, trajectories, noise, self.options.summary
             )

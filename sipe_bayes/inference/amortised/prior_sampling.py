@@ -182,7 +182,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         if state.learned is None:
             state = self._trained(state, self._simulated(state, trajectories))
         learned: Learned[L] = state.learned  # type: ignore[assignment]  # just trained
-        other = learned.experiment.other(trajectories, noise_level(trajectories, self.likelihood))
+        other = learned.experiment.other(trajectories, noise_level(trajectories, self.likelihood, self.simulator))
         if other is not None:
             self.find(Code.OTHER_EXPERIMENT, differs=other)
         p = float("nan")
@@ -230,7 +230,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         """Where a fit begins for which enough was learned before; None where it was not, and a note says why."""
         if last.state.learned is None:
             return None
-        noise = noise_level(trajectories, self.likelihood)
+        noise = noise_level(trajectories, self.likelihood, self.simulator)
         other = last.state.learned.experiment.other_form(self.simulator, trajectories, noise)
         if other is not None:
             self.find(Code.TRAINED_ANEW, differs=other)
@@ -319,7 +319,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         return self._noisy(made.usable(), trajectories, np.random.default_rng([self.seed, 1]))
 
     def _noisy(self, made: Simulations, trajectories: Trajectories, rng: np.random.Generator) -> Simulations:
-        sd = noise_level(trajectories, self.likelihood)
+        sd = noise_level(trajectories, self.likelihood, self.simulator)
         if not sd.any():
             return made
         noise = (sd * rng.standard_normal(made.observations.shape)).astype(np.float32)
@@ -333,7 +333,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
     def _trained(self, state: S, trajectories: Trajectories) -> S:
         simulations = self.simulations(state, trajectories)
         self._check_units(simulations)
-        noise = noise_level(trajectories, self.likelihood)
+        noise = noise_level(trajectories, self.likelihood, self.simulator)
         known = isinstance(self.simulator, CallableSimulator) or trajectories.states is not None
         every = np.tile(noise, trajectories.observations[..., 0].size)
         outside = Outside.of(*self._looks(simulations.observations[-_SEEN:], trajectories), every, known)

@@ -123,7 +123,8 @@ class Rounds(PriorSampling[RoundsState[L], Members[L]], Generic[L]):
         """All members."""
         theta, observations, summaries = simulations.theta, simulations.observations, None
         if self.summary in REGRESSED:
-            noise, statistics = noise_level(trajectories, self.likelihood), self.statistics(observations, trajectories)
+            noise = noise_level(trajectories, self.likelihood, self.simulator)
+            statistics = self.statistics(observations, trajectories)
             summaries, estimates = Summaries.of(theta, observations, statistics, trajectories, noise, self.summary)
             inputs = estimates.astype(np.float32)
         else:

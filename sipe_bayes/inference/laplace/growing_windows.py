@@ -92,7 +92,7 @@ def first_beginnings(
 
 def level(windows: Windows) -> Noise:
     """White noise of the size that the samples' roughness shows, or as given."""
-    rough = noise_level(windows.trajectories, windows.settings)[windows.channels]
+    rough = noise_level(windows.trajectories, windows.settings, windows.simulator)[windows.channels]
     rough = pooled(np.maximum(rough, windows.rounding), windows.scales)
     return Noise(np.where(np.isnan(windows.fixed_sd), rough, windows.fixed_sd), np.zeros(len(rough)))
 

@@ -64,7 +64,7 @@ class LearnedReward:
 
     def __init__(self, windows: Windows, options: RewardOptions | None = None, seed: int = 0) -> None:
         self.windows, self.options, self.seed = windows, options or RewardOptions(), seed
-        sd = noise_level(windows.trajectories, windows.settings)
+        sd = noise_level(windows.trajectories, windows.settings, windows.simulator)
         self.noise = sd[windows.channels]
         steps = int(windows.steps.sum())
         recorded = control_steps(windows.measured[None], windows.actions, windows.steps, steps)[0]

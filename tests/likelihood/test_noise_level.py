@@ -1,0 +1,70 @@
+"""How noisy samples are: by the states that they measure, which may be few; not at all where they repeat them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sipe_bayes as sipe
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.datasets.trajectory_sets import TASKS
+from sipe_bayes.likelihood.noise import noise_level
+from sipe_bayes.likelihood.settings import Segments
+from tests.problems.pendulums import DT, coloured, pendulum
+
+STEPS = 400
+SIMULATOR = pendulum()
+
+
+def clean() -> Trajectories:
+    """A swing with its states."""
+    actions = 0.8 * np.sin(2 * np.pi * 0.8 * DT * np.arange(STEPS))[None, :, None]
+    return SIMULATOR.rollout(np.full((1, 2), 0.5), actions, SIMULATOR.default_state()[None], dt=DT)
+
+
+def noisy(share: float, rho: float = 0.0) -> tuple[Trajectories, float]:
+    """The same with noise of a share of its spread, and the noise's sd."""
+    logs = clean()
+    sd = share * float(logs.observations.std())
+    noise = coloured(np.random.default_rng(2), STEPS + 1, sd, rho)[None, :, None]
+    return replace(logs, observations=logs.observations + noise), sd
+
+
+def first_alone(logs: Trajectories) -> Trajectories:
+    states = np.full_like(np.asarray(logs.states), np.nan)
+    states[:, 0] = np.asarray(logs.states)[:, 0]
+    return replace(logs, states=states)
+
+
+def level(logs: Trajectories) -> FloatArray:
+    return noise_level(logs, Segments(), SIMULATOR)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_clean_log_with_its_states_has_none(task: str) -> None:
+    simulator = sipe.Simulator(sipe.make_task(task), num_threads=1)
+    theta, start = np.full((1, len(simulator.space)), 0.4), simulator.default_state()[None]
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (1, 30, simulator.environment.num_actions))
+    goals = np.full((1, simulator.environment.goal_size), 0.5) if simulator.environment.goal_size else None
+    assert not noise_level(simulator.rollout(theta, actions, start, goals=goals), Segments(), simulator).any()
+
+
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize(("rho", "sds"), [(0.0, 0.06), (0.9, 0.18)])  # of the sd of 401 samples
+def test_noise_beside_recorded_states_has_its_size(share: float, rho: float, sds: float) -> None:
+    logs, sd = noisy(share, rho)
+    np.testing.assert_allclose(level(logs), [sd], rtol=3 * sds)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_noise_shows_where_the_first_state_alone_is_recorded(share: float) -> None:
+    logs, sd = noisy(share)
+    np.testing.assert_allclose(level(first_alone(logs)), [sd], rtol=0.2)
+    np.testing.assert_array_equal(level(first_alone(logs)), level(replace(logs, states=None)))
+
+
+def test_a_stated_sd_is_believed() -> None:
+    assert noise_level(noisy(0.1)[0], Segments(noise_sd=(0.25,)), SIMULATOR).tolist() == [0.25]
