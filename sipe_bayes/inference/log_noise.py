@@ -10,7 +10,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.noise import Noise, states_throughout
 from sipe_bayes.likelihood.replicas import observation_noise
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import Posterior
@@ -44,7 +44,8 @@ def noise_is_unknown(
     simulator: Simulator | CallableSimulator, likelihood: Segments | StateSpace, trajectories: Trajectories
 ) -> bool:
     """Whether these are logs of a machine, whose noise only a fit tells."""
-    return isinstance(simulator, Simulator) and isinstance(likelihood, Segments) and trajectories.states is None
+    of_machine = isinstance(simulator, Simulator) and isinstance(likelihood, Segments)
+    return of_machine and not states_throughout(trajectories)
 
 
 def fitted_noise(

@@ -16,7 +16,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import smoothed
+from sipe_bayes.likelihood.starts import left_by_smoothing, smoothed
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -99,6 +99,12 @@ def noise_level(
     return np.array([estimated[c] if sd is None else sd for c, sd in enumerate(stated)])
 
 
+def states_throughout(trajectories: Trajectories) -> bool:
+    """Whether the state of every sample is recorded, and not of none or the first alone."""
+    states = trajectories.states
+    return states is not None and int(np.isfinite(states[..., 0]).sum()) == int((trajectories.length + 1).sum())
+
+
 def _sd_beside_states(trajectories: Trajectories, states: FloatArray, simulator: Simulator) -> FloatArray:
     """Robust sd (O,) of samples about the states (B, T+1, S) that they measure, NaN where these say nothing."""
     columns = simulator.environment.state_columns(simulator.model)
@@ -113,8 +119,7 @@ def _sd_beside_states(trajectories: Trajectories, states: FloatArray, simulator:
             elif off.size >= _ENOUGH:
                 sd[channel] = NORMAL_MAD * np.median(np.abs(off - np.median(off)))
     others = [column is None for column in columns]
-    recorded = np.isfinite(states[..., 0]).sum() == (trajectories.length + 1).sum()
-    if (sd == 0).any() or (all(others) and recorded):
+    if (sd == 0).any() or (all(others) and states_throughout(trajectories)):
         sd[others] = 0.0
     return sd
 
@@ -128,6 +133,9 @@ def _residual_sd(trajectories: Trajectories) -> FloatArray:
         for c, seen in enumerate(finite.T):
             if seen.any():
                 filled[:, c] = np.interp(np.arange(len(series)), np.flatnonzero(seen), series[seen, c])
-        left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan))
-    # five points of a local quadratic take away about half of white noise's variance
-    return np.nan_to_num(NORMAL_MAD * np.nanmedian(np.abs(np.concatenate(left)), axis=0) * np.sqrt(2))
+        share = left_by_smoothing(len(series), trajectory.dt)
+        if share > 0:
+            left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan) / np.sqrt(share))
+    if not left:  # too short for any
+        return np.zeros(trajectories.observations.shape[2])
+    return np.nan_to_num(NORMAL_MAD * np.nanmedian(np.abs(np.concatenate(left)), axis=0))

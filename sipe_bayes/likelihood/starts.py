@@ -204,6 +204,12 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
     return np.asarray(smooth.reshape(series.shape) / dt**derivative)
 
 
+def left_by_smoothing(count: int, dt: float) -> float:
+    """Share of white noise's variance that is left of ``count`` samples, less ``smoothed``, away from their ends."""
+    span = _span(count, dt)
+    return 0.0 if span < 3 else float(1 - _weights(span, 0)[span // 2, span // 2])
+
+
 def _span(count: int, dt: float) -> int:
     """Samples of a local quadratic, an odd number."""
     return min(max(5, 2 * round(0.06 / dt / 2) + 1), count - (count + 1) % 2)

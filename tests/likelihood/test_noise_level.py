@@ -59,6 +59,14 @@ def test_noise_beside_recorded_states_has_its_size(share: float, rho: float, sds
     np.testing.assert_allclose(level(logs), [sd], rtol=3 * sds)
 
 
+@pytest.mark.parametrize("dt", [0.001, 0.002, 0.01, 0.02])
+def test_roughness_is_the_noise_at_any_rate(dt: float) -> None:
+    clock = dt * np.arange(2001)
+    swing = np.sin(2.0 * clock) + 0.3 * np.random.default_rng(4).standard_normal(len(clock))
+    logs = Trajectories.stack(sipe.Trajectory(swing[:, None], np.zeros((2000, 1)), dt))
+    np.testing.assert_allclose(level(logs), [0.3], rtol=0.09)  # three sds
+
+
 @pytest.mark.parametrize("share", [0.01, 0.1])
 def test_noise_shows_where_the_first_state_alone_is_recorded(share: float) -> None:
     logs, sd = noisy(share)
