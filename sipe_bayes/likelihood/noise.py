@@ -1,4 +1,4 @@
-"""Noise of the residuals of windows: white or coloured, and how residuals are whitened; how noisy samples are.
+"""Noise of the residuals of windows: white or coloured, and how residuals are whitened.
 
 Residual model, per channel c and along each log: e_j = a_j e_{j-1} + sqrt(1 - a_j^2) sigma_c z_j, z_j ~ N(0, 1), with
 a_j = exp(-gap_j / tau_c) for the time since the previous sample there is (first-order autoregression, which carries
@@ -13,16 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
-from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import left_by_smoothing, smoothed
-from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.simulator import Simulator
 
 NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
-_ROUNDING = 1e-6  # of the largest sample: trajectories are kept in single precision at places
-_ENOUGH = 30  # samples whose distances from their states have a size
 
 
 def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
@@ -73,69 +66,3 @@ def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> F
     a = coefficients(sequence.gaps, tau)[sequence.gap]
     before = np.where(sequence.previous >= 0, residual[..., sequence.previous], 0.0)
     return (residual[..., sequence.index] - a * before) / (sd * np.sqrt(1 - a**2))
-
-
-def noise_level(
-    trajectories: Trajectories, likelihood: Segments | StateSpace, simulator: Simulator | CallableSimulator
-) -> FloatArray:
-    """Sd (O,) of each channel's noise in its unit.
-
-    As ``likelihood.noise_sd`` states it. Else, where states are recorded, by how far channels are from the states that
-    they measure: those that measure none have no noise if another channel repeats its state to rounding, or if none
-    measures one and all states are recorded. Else the robust sd of what local quadratics over 60 ms leave of the
-    samples.
-
-    Raises:
-        ValueError: where the settings state another number of sds than there are channels.
-    """
-    count = trajectories.observations.shape[2]
-    stated = likelihood.noise_sd or (None,) * count
-    if len(stated) != count:
-        raise ValueError(f"noise_sd: expected {count} values, one for each channel, got {len(stated)}")
-    estimated = _residual_sd(trajectories)
-    if trajectories.states is not None and isinstance(simulator, Simulator):
-        beside = _sd_beside_states(trajectories, trajectories.states, simulator)
-        estimated = np.where(np.isnan(beside), estimated, beside)
-    return np.array([estimated[c] if sd is None else sd for c, sd in enumerate(stated)])
-
-
-def states_throughout(trajectories: Trajectories) -> bool:
-    """Whether the state of every sample is recorded, and not of none or the first alone."""
-    states = trajectories.states
-    return states is not None and int(np.isfinite(states[..., 0]).sum()) == int((trajectories.length + 1).sum())
-
-
-def _sd_beside_states(trajectories: Trajectories, states: FloatArray, simulator: Simulator) -> FloatArray:
-    """Robust sd (O,) of samples about the states (B, T+1, S) that they measure, NaN where these say nothing."""
-    columns = simulator.environment.state_columns(simulator.model)
-    sd = np.full(len(columns), np.nan)
-    for channel, column in enumerate(columns):
-        if column is not None:
-            seen = trajectories.observations[..., channel]
-            off = seen - states[..., column]
-            off = off[np.isfinite(off)]
-            if off.size and np.abs(off).max() <= _ROUNDING * max(1.0, float(np.nanmax(np.abs(seen)))):
-                sd[channel] = 0.0
-            elif off.size >= _ENOUGH:
-                sd[channel] = NORMAL_MAD * np.median(np.abs(off - np.median(off)))
-    others = [column is None for column in columns]
-    if (sd == 0).any() or (all(others) and states_throughout(trajectories)):
-        sd[others] = 0.0
-    return sd
-
-
-def _residual_sd(trajectories: Trajectories) -> FloatArray:
-    """Robust sd (O,) of what smoothing leaves."""
-    left = []
-    for trajectory in trajectories:
-        series = trajectory.observations
-        finite, filled = np.isfinite(series), np.zeros(series.shape)
-        for c, seen in enumerate(finite.T):
-            if seen.any():
-                filled[:, c] = np.interp(np.arange(len(series)), np.flatnonzero(seen), series[seen, c])
-        share = left_by_smoothing(len(series), trajectory.dt)
-        if share > 0:
-            left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan) / np.sqrt(share))
-    if not left:  # too short for any
-        return np.zeros(trajectories.observations.shape[2])
-    return np.nan_to_num(NORMAL_MAD * np.nanmedian(np.abs(np.concatenate(left)), axis=0))

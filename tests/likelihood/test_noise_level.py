@@ -11,7 +11,7 @@ import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.trajectory_sets import TASKS
-from sipe_bayes.likelihood.noise import noise_level
+from sipe_bayes.likelihood.noise_level import noise_level
 from sipe_bayes.likelihood.settings import Segments
 from tests.problems.pendulums import DT, coloured, pendulum
 
@@ -43,13 +43,48 @@ def level(logs: Trajectories) -> FloatArray:
     return noise_level(logs, Segments(), SIMULATOR)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_a_clean_log_with_its_states_has_none(task: str) -> None:
+def recorded(task: str) -> tuple[sipe.Simulator, Trajectories]:
+    """A clean log of a benchmark's task."""
     simulator = sipe.Simulator(sipe.make_task(task), num_threads=1)
     theta, start = np.full((1, len(simulator.space)), 0.4), simulator.default_state()[None]
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (1, 30, simulator.environment.num_actions))
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (1, 60, simulator.environment.num_actions))
     goals = np.full((1, simulator.environment.goal_size), 0.5) if simulator.environment.goal_size else None
-    assert not noise_level(simulator.rollout(theta, actions, start, goals=goals), Segments(), simulator).any()
+    return simulator, simulator.rollout(theta, actions, start, goals=goals)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_clean_log_with_its_states_has_none(task: str) -> None:
+    simulator, logs = recorded(task)
+    assert not noise_level(logs, Segments(), simulator).any()
+    assert not noise_level(first_alone(logs), Segments(), simulator).any()
+
+
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("task", ["FetchPush", "HalfCheetahLinks"])
+def test_a_task_s_noise_shows_beside_its_states(task: str, every: int) -> None:
+    """Of 61 samples or 13, the median channel's to three sds of one channel's."""
+    simulator, logs = recorded(task)
+    sd = 0.01 * logs.observations.std((0, 1)) + 1e-5
+    states = np.asarray(logs.states).copy()
+    states[:, np.arange(states.shape[1]) % every != 0] = np.nan
+    noisy = logs.observations + sd * np.random.default_rng(5).standard_normal(logs.observations.shape)
+    level = noise_level(replace(logs, observations=noisy, states=states), Segments(), simulator)
+    assert abs(np.median(level / sd) - 1) < 3 / np.sqrt(2 * 60 / every)
+
+
+def test_slow_noise_shows_where_the_first_state_alone_is_recorded() -> None:
+    """Five logs of a correlation of .99 are smooth: their first samples tell, five of them to a third."""
+    simulator, logs = SIMULATOR, [clean().observations[0] for _ in range(5)]
+    rng, (states,) = np.random.default_rng(6), np.asarray(first_alone(clean()).states)
+    many = Trajectories.stack(
+        [
+            sipe.Trajectory(x + coloured(rng, STEPS + 1, 0.3, 0.99)[:, None], np.zeros((STEPS, 1)), DT, states)
+            for x in logs
+        ]
+    )
+    rough = noise_level(replace(many, states=None), Segments(), simulator)[0]
+    assert rough < 0.1
+    assert 0.1 < noise_level(many, Segments(), simulator)[0] < 0.6
 
 
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.1])

@@ -26,6 +26,7 @@ from tests.problems.quick import FORM
 
 METHODS = ("abc", "bayessim", "npe", "regression", "maml")
 BUDGET, TEST_TIME = 100, 25  # rollouts; of these what maml takes at test time
+NOISE = 0.01  # rad, of ``repeated``
 ACTIONS = log(pendulum(), TRUTH, 1, steps=60).actions
 
 
@@ -34,7 +35,9 @@ def draws(posterior: Posterior) -> torch.Tensor:
 
 
 def made(simulator: Simulator, name: str, **settings: Any) -> Estimator:
-    return get_estimator(simulator, name, **{"budget": BUDGET, "seed": 1, **FORM.get(name, {}), **settings})
+    """Its noise is stated, so that training depends on nothing that was observed."""
+    stated = {"likelihood": sipe.Segments(noise_sd=(NOISE,)), "budget": BUDGET, "seed": 1}
+    return get_estimator(simulator, name, **{**stated, **FORM.get(name, {}), **settings})
 
 
 def at_test_time(name: str) -> int:
@@ -42,7 +45,6 @@ def at_test_time(name: str) -> int:
 
 
 def states_log(simulator: Simulator, seed: int) -> Trajectory:
-    """Recorded states: no noise is estimated, so training depends on nothing that was observed."""
     return repeated(simulator, ACTIONS, states=True, seed=seed)
 
 
@@ -161,13 +163,13 @@ OTHER_FORMS: dict[str, Callable[[Simulator], Any]] = {
 def test_trajectories_of_another_form_are_trained_for_anew(what: str) -> None:
     """What a new estimator finds, with a note of why it took so long, which is no warning."""
     simulator = Counting()
-    estimator, other = made(simulator, "bayessim"), OTHER_FORMS[what](simulator)
+    estimator, other = made(simulator, "bayessim", likelihood=sipe.Segments()), OTHER_FORMS[what](simulator)
     estimator.fit(repeated(simulator, ACTIONS))
     simulator.lanes = 0
     posterior = estimator.fit(other)
     assert simulator.lanes == estimator.rollouts == BUDGET
     assert [f"the log's {what} differ" in f.text for f in estimator.findings.of(Code.TRAINED_ANEW)] == [True]
-    alone = made(pendulum(), "bayessim")
+    alone = made(pendulum(), "bayessim", likelihood=sipe.Segments())
     assert torch.equal(draws(posterior), draws(alone.fit(other)))
     assert estimator.warnings == alone.warnings
 
@@ -218,7 +220,7 @@ def test_observed_x_of_a_function_are_of_one_form() -> None:
         calls.append(len(values))
         return values + 0.1 * rng.standard_normal(values.shape)
 
-    estimator = made(sipe.CallableSimulator(function, space), "bayessim")  # type: ignore[arg-type]
+    estimator = made(sipe.CallableSimulator(function, space), "bayessim", likelihood=None)  # type: ignore[arg-type]
     estimator.fit([0.4, 0.5])
     calls.clear()
     posterior = estimator.fit([0.7, 0.2])
