@@ -10,8 +10,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.noise_level import states_throughout
+from sipe_bayes.likelihood.noise import Noise, states_throughout
 from sipe_bayes.likelihood.replicas import observation_noise
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.posterior import Posterior

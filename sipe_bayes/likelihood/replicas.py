@@ -20,8 +20,7 @@ import scipy.signal
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.rotations import with_noise
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.noise_level import noise_level
+from sipe_bayes.likelihood.noise import Noise, noise_level
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts import estimate_states, first_states, moved, with_history
 from sipe_bayes.simulation.callable_simulator import CallableSimulator

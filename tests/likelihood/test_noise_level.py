@@ -11,7 +11,7 @@ import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.trajectory_sets import TASKS
-from sipe_bayes.likelihood.noise_level import noise_level
+from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.settings import Segments
 from tests.problems.pendulums import DT, coloured, pendulum
 

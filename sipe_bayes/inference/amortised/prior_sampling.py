@@ -51,7 +51,7 @@ from sipe_bayes.inference.amortised.outside import Outside
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
-from sipe_bayes.likelihood.noise_level import noise_level
+from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.starts import first_states
 from sipe_bayes.models.statistics import step_statistics

@@ -39,8 +39,7 @@ from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint
 from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowOptimum
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, pooled
-from sipe_bayes.likelihood.noise_level import noise_level
+from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, noise_level, pooled
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.starts import STATE_STEP

@@ -31,7 +31,7 @@ from torch.nn.functional import logsigmoid
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.likelihood.noise_level import noise_level
+from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.models.discriminator import Discriminator, Training, TrainingState
 from sipe_bayes.models.transitions import control_steps
