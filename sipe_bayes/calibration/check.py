@@ -283,12 +283,15 @@ class _Worker:
         warned = tuple(str(item.code) for item in own)
         return Fit(truth, draws, estimator.rollouts - rollouts, seconds, error, warned)
 
+    def _tell_training(self, what: str, done: int, total: int) -> None:
+        self.tell(f"{what}, {done} of at most {total} rollouts", done, total)
+
     def _estimator(self, number: int) -> Estimator:
         study = self.study
         if study.estimator.amortised and self._trained is None:
             self._trained = study.estimator.fresh()
             self._trained.checkpoint = self.folder / "trained.safetensors"
-            self._trained.progress = self.tell
+            self._trained.progress = self._tell_training
             self._trained.fit(study.trajectories)
             self._trained.progress = None
             self._before = self._trained.rollouts, frozenset(self._trained.findings)

@@ -64,7 +64,7 @@ def check(
         of = f" of at most {each} rollouts each" * bool(each)
         if not as_json:
             print(f"{trained}{truths} fits{of}, kept in {folder}", flush=True)
-        with ProgressBar(quiet=as_json, unit="logs", estimate=False) as progress:
+        with ProgressBar(quiet=as_json, unit="logs", counted=False) as progress:
             outcome = checks.run(study, truths, folder, progress, early=not every)
     if as_json:
         print(to_json(outcome.to_dict()))

@@ -275,6 +275,11 @@ class MjcfEnvironment(Environment):
         return [(j, *one) for j, one in sensed if one is not None]
 
     @cached_property
+    def sensed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """Channels of whose sensor something is unknown."""
+        return tuple(sorted({k for _, _, channels in self._sensed for k in channels}))
+
+    @cached_property
     def _controls(self) -> list[int]:
         return _controls_of(self._model, (*self.actuators, *supplies_of(self.edits)))
 

@@ -25,13 +25,15 @@ class ProgressBar:
     Args:
         quiet: show nothing anywhere.
         unit: of what is counted.
-        estimate: whether lines tell how long the rest will take at most; not where what is being done tells it.
+        counted: whether lines tell how much is done and how long the rest takes; not where what is being done says so.
     """
 
-    def __init__(self, quiet: bool = False, unit: str = "rollouts", estimate: bool = True) -> None:
+    def __init__(self, quiet: bool = False, unit: str = "rollouts", counted: bool = True) -> None:
         self._bar: Any = None
-        self._unit, self._estimate = unit, estimate
+        self._unit, self._counted = unit, counted
         self._began = self._last = time.monotonic()
+        self._first = self._before = (0, 0)  # what was done, and of how much, when this count began and last
+        self._since = self._began  # when it began
         seen = "ipykernel" in sys.modules or sys.stderr.isatty()
         self._lines = not quiet and not seen
         if not quiet and seen:
@@ -61,18 +63,26 @@ class ProgressBar:
             self._bar.set_description(what, refresh=False)
             self._bar.total, self._bar.n = total, min(done, total)
             self._bar.refresh()
-        elif self._lines and time.monotonic() - self._last >= _SECONDS:
-            self._last = time.monotonic()
+        elif self._lines:
+            self._print(what, done, total)
+
+    def _print(self, what: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if total != self._before[1] or done < self._before[0]:  # another count
+            self._first, self._since = (done, total), now
+        self._before = (done, total)
+        if now - self._last >= _SECONDS:
+            self._last = now
             print(self._line(what, done, total), file=sys.stderr, flush=True)
 
     def _line(self, what: str, done: int, total: int) -> str:
-        """The time until now, what is being done, and unless all is done how far and how long it takes at most."""
-        seconds = self._last - self._began
-        line = f"{seconds:.0f} s: {what}"
-        if done >= total:
+        """The time until now, what is being done, and unless all is done how far and how long the rest may take."""
+        line = f"{self._last - self._began:.0f} s: {what}"
+        if done >= total or not self._counted:
             return line
         line += f"; {done} of at most {total} {self._unit}"
-        return f"{line}, {_spoken(seconds * (total - done) / done)} more at most" if self._estimate and done else line
+        own = done - self._first[0]  # not what an earlier run did
+        return f"{line}, {_spoken((self._last - self._since) * (total - done) / own)} for the rest" if own else line
 
 
 def _spoken(seconds: float) -> str:

@@ -18,13 +18,13 @@ from sipe_bayes.core.rotations import between
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import left_by_smoothing, smoothed
+from sipe_bayes.likelihood.starts import are_states, left_by_smoothing, smoothed
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
 _ROUNDING = 1e-6  # of the largest sample: trajectories are kept in single precision at places
-_ENOUGH = 10  # differences of a channel that tell their sd to a quarter
+_ENOUGH = 10  # differences of a channel, which tell their sd to a quarter
 _FALSE_ALARM = 1e-3  # with which roughness is corrected by fewer
 
 
@@ -83,10 +83,12 @@ def noise_level(
 ) -> FloatArray:
     """Sd (O,) of each channel's noise in its unit.
 
-    As ``likelihood.noise_sd`` states it. Else, where states are recorded, the sd of what channels differ from what they
-    show, none where they show the same; of a few states alone that only scales the roughness, where it does not fit.
-    Else the robust sd of what local quadratics over 60 ms leave of the samples. States count as exact: where they are
-    measurements, from which the channels were made, nothing tells their noise.
+    As ``likelihood.noise_sd`` states it. Else, where ten states or all of them are recorded, the root mean square of
+    what samples differ from what these show; channels that they do not show, or whose sensor is unknown, have none
+    where nothing differs. Else the robust sd of what local quadratics over 60 ms leave of the samples, scaled where
+    fewer states do not fit that. It takes contact, where a channel jumps from sample to sample, for noise.
+
+    States count as exact: where they are measurements, from which the channels were made, nothing tells their noise.
 
     Raises:
         ValueError: where the settings state another number of sds than there are channels.
@@ -95,9 +97,12 @@ def noise_level(
     stated = likelihood.noise_sd or (None,) * count
     if len(stated) != count:
         raise ValueError(f"noise_sd: expected {count} values, one for each channel, got {len(stated)}")
-    estimated = _roughness(trajectories)
-    if trajectories.states is not None and isinstance(simulator, Simulator):
-        estimated = _beside_states(_differences(trajectories, trajectories.states, simulator), trajectories, estimated)
+    if all(sd is not None for sd in stated):
+        return np.array(stated, float)
+    estimated, states = _roughness(trajectories), trajectories.states
+    if states is not None and isinstance(simulator, Simulator) and are_states(simulator, states):
+        off, sensed = _differences(trajectories, states, simulator), bool(simulator.environment.sensed)
+        estimated = _beside_states(off, trajectories, estimated, sensed)
     return np.array([estimated[c] if sd is None else sd for c, sd in enumerate(stated)])
 
 
@@ -116,6 +121,7 @@ def _differences(trajectories: Trajectories, states: FloatArray, simulator: Simu
     for channel, column in enumerate(environment.state_columns(simulator.model)):
         if column is not None:
             shown[..., channel] = states[..., column]
+    shown[..., list(environment.sensed)] = np.nan
     off = seen - shown
     for triple in environment.rotations:
         channels = list(triple)
@@ -123,31 +129,31 @@ def _differences(trajectories: Trajectories, states: FloatArray, simulator: Simu
     return off
 
 
-def _beside_states(off: FloatArray, trajectories: Trajectories, rough: FloatArray) -> FloatArray:
-    """Sd (O,) by differences (R, T+1, O) and roughness (O,)."""
+def _beside_states(off: FloatArray, trajectories: Trajectories, rough: FloatArray, sensed: bool) -> FloatArray:
+    """Sd (O,) by differences (R, T+1, O) and roughness (O,); whether something of a sensor is unknown."""
     seen = trajectories.observations
-    largest = np.maximum(1.0, np.abs(np.where(np.isfinite(seen), seen, 0.0)).max((0, 1)))
+    largest = np.abs(np.where(np.isfinite(seen), seen, 0.0)).max((0, 1))
     known, differs = np.isfinite(off).sum((0, 1)), (np.abs(off) > _ROUNDING * largest).any((0, 1))
-    if not differs.any() and (known.any() or states_throughout(trajectories)):
+    enough = (known >= _ENOUGH) | ((known > 0) & states_throughout(trajectories))
+    unshown = not known.any() and not sensed and states_throughout(trajectories)
+    if not differs.any() and (enough.any() or unshown):
         return np.zeros(len(known))  # what the states do not show is as exact as what they do
-    rough = _corrected(off, known, differs, rough)
-    # about the mean: a sensor's bias is none of the noise
-    about = off - np.nansum(off, (0, 1)) / np.maximum(known, 1)
-    own = np.sqrt(np.nansum(about**2, (0, 1)) / np.maximum(known - 1, 1))
-    return np.where((known > 0) & ~differs, 0.0, np.where(known >= _ENOUGH, own, rough))
+    own = np.sqrt(np.nansum(off**2, (0, 1)) / np.maximum(known, 1))
+    return np.where(enough, np.where(differs, own, 0.0), _corrected(off, differs & ~enough, rough))
 
 
-def _corrected(off: FloatArray, known: FloatArray, differs: BoolArray, rough: FloatArray) -> FloatArray:
-    """Roughness (O,), scaled where the channels' few differences together do not fit it: slow noise is smooth."""
-    few = differs & (known < _ENOUGH) & (rough > 0)
-    total, count = float((np.nansum(off**2, (0, 1))[few] / rough[few] ** 2).sum()), int(known[few].sum())
+def _corrected(off: FloatArray, few: BoolArray, rough: FloatArray) -> FloatArray:
+    """Roughness (O,), of ``few`` scaled where their differences together do not fit it: slow noise is smooth."""
+    few = few & (rough > 0)
+    seen = np.isfinite(off[..., few])
+    total, count = float(np.nansum((off[..., few] / rough[few]) ** 2)), int(seen.sum())
     if not count or min(chi2.cdf(total, count), chi2.sf(total, count)) > _FALSE_ALARM / 2:
         return rough
     return np.where(few, rough * np.sqrt(total / count), rough)
 
 
 def _roughness(trajectories: Trajectories) -> FloatArray:
-    """Robust sd (O,) of what smoothing leaves."""
+    """Robust sd (O,) of what smoothing leaves; zero of what was not measured, or of fewer than five samples."""
     left = []
     for trajectory in trajectories:
         series = trajectory.observations
@@ -158,6 +164,8 @@ def _roughness(trajectories: Trajectories) -> FloatArray:
         share = left_by_smoothing(len(series), trajectory.dt)
         if share > 0:
             left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan) / np.sqrt(share))
-    if not left:  # too short for any
-        return np.zeros(trajectories.observations.shape[2])
-    return np.nan_to_num(NORMAL_MAD * np.nanmedian(np.abs(np.concatenate(left)), axis=0))
+    sd = np.zeros(trajectories.observations.shape[2])
+    for c, rest in enumerate(np.concatenate(left).T if left else ()):
+        if np.isfinite(rest).any():
+            sd[c] = NORMAL_MAD * np.nanmedian(np.abs(rest))
+    return sd

@@ -205,9 +205,9 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
 
 
 def left_by_smoothing(count: int, dt: float) -> float:
-    """Share of white noise's variance that is left of ``count`` samples, less ``smoothed``, away from their ends."""
+    """Share of white noise's variance in samples less ``smoothed``, away from their ends; 0 of fewer than five."""
     span = _span(count, dt)
-    return 0.0 if span < 3 else float(1 - _weights(span, 0)[span // 2, span // 2])
+    return 0.0 if span < 5 else float(1 - _weights(span, 0)[span // 2, span // 2])
 
 
 def _span(count: int, dt: float) -> int:

@@ -40,12 +40,12 @@ class Clock:
         return self.now
 
 
-def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, estimate: bool = True) -> list[str]:
+def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, counted: bool = True) -> list[str]:
     """What is printed of a call every four seconds to 40 of 100, then of two after the fit, to no terminal."""
     clock, stream = Clock(), io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setattr("sipe_bayes.inference.progress_bar.time", clock)
-    with sipe.ProgressBar(quiet=quiet, estimate=estimate) as progress:
+    with sipe.ProgressBar(quiet=quiet, counted=counted) as progress:
         for done in range(0, 50, 10):
             progress(f"step {done}", done, 100)
             clock.now += 4
@@ -57,8 +57,22 @@ def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, estimate: bool =
 
 def test_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     fit, checks = "16 s: step 40; 40 of at most 100 rollouts", "34 s: checking"
-    assert lines(monkeypatch) == [f"{fit}, 24 s more at most", checks]
-    assert lines(monkeypatch, estimate=False) == [fit, checks]
+    assert lines(monkeypatch) == [f"{fit}, 24 s for the rest", checks]
+    assert lines(monkeypatch, counted=False) == ["16 s: step 40", checks]
+
+
+def test_a_count_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an earlier run did tells nothing of this one's speed, nor what came before another count."""
+    clock, stream = Clock(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr("sipe_bayes.inference.progress_bar.time", clock)
+    with sipe.ProgressBar() as progress:
+        for done, total in ((800, 1000), (850, 1000), (0, 500), (50, 500)):
+            progress("fitting", done, total)
+            clock.now += 15
+    first, _, second = stream.getvalue().splitlines()
+    assert first.endswith("850 of at most 1000 rollouts, 45 s for the rest")
+    assert second.endswith("50 of at most 500 rollouts, 2 min for the rest")
 
 
 def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:
