@@ -39,7 +39,7 @@ class Environment(ABC):
     channels: tuple[str, ...]
     num_actions: int
     needs_derived: bool = False
-    sensed: tuple[int, ...] = ()
+    sensed: tuple[int, ...] = ()  # channels of whose sensor a parameter changes something
     data_fields: tuple[str, ...] = ()  # MjData arrays derived in place of sensordata, for what no sensor returns
     derived_late: bool = False  # derived belongs to the state before the last physics step, as Gymnasium reads it
     frame_skip: int = 1  # physics steps of a control step where no dt is given
