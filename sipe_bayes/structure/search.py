@@ -92,14 +92,14 @@ class StructureSearch:
         self.given = self.fitting = fitting
         self.extensions, self.joints = tuple(extensions), joints
         self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
-        self._rollouts, self._doing = 0, ""  # before the present step, and what it does
+        self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
         self.place(state)
-        self._rollouts, self._doing = state.rollouts, self.describe(state)
+        self._rollouts, self._fit_rollouts, self._doing = state.rollouts, 0, self.describe(state)
         self._tell("")
         if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
             return replace(state, phase=Phase.DONE)
@@ -131,7 +131,10 @@ class StructureSearch:
         }[state.phase]
 
     def _tell(self, what: str, rollouts: int = 0, _: int = 0) -> None:
-        """How far the present step is, after some rollouts of its own."""
+        """How far the present step is, after some rollouts of a fit of its own; fewer are those of its next fit."""
+        if rollouts < self._fit_rollouts:
+            self._rollouts += self._fit_rollouts
+        self._fit_rollouts = rollouts
         if self.progress is not None:
             self.progress(f"{self._doing}{what and ': '}{what}", self._rollouts + rollouts, self.budget)
 

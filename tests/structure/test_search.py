@@ -133,13 +133,15 @@ class Bias(Extension):
 @pytest.mark.parametrize("same", [True, False])
 def test_held_out_logs_speak_against_what_only_one_log_has(same: bool) -> None:
     """A machine that rubbed on one day and not on the other: friction is no part of it."""
-    other = log(pendulum(FRICTION), [0.6, 0.08, 0.1 if same else 0.0], 12)
+    other, done = log(pendulum(FRICTION), [0.6, 0.08, 0.1 if same else 0.0], 12), list[int]()
     structures = discover(
         pendulum(),
         Trajectories.stack([log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)]),
         holdout=Trajectories.stack([other]),
         restriction=Restriction(only=("dry_friction", "delay")),
+        progress=lambda _, rollouts, __: done.append(rollouts),
     )
+    assert done == sorted(done)
     label = ("dry_friction:hinge",)
     plain, rubbing = (structures.state.judgement(labels) for labels in ((), label))
     print(plain, rubbing)
