@@ -7,7 +7,7 @@ bootstrap filters (tests/problems/particle_judge.py). 0.5 is perfect, the bar 0.
 of the same posterior, which says how much one C2ST scatters. On the spring, "exact" compares both with a grid of Kalman
 filters.
 
-    python examples/studies/particles.py --seeds 0 3                    # a minute of a core for each log
+    python examples/studies/particles.py --seeds 0 2                    # minutes of a core for each log
     python examples/studies/particles.py --select pusher --seeds 0 8
 
 Rows are kept in runs/particles and an interrupted study goes on; each run writes the summary of all there are.
@@ -42,7 +42,8 @@ from sipe_bayes.posterior import Particles, Posterior
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "particles"
 sys.path.insert(0, str(HERE.parents[1]))
-DT, STEPS, THETAS, PARTICLES = 0.02, 40, 128, 64
+DT, STEPS, THETAS = 0.02, 40, 128
+TIMES, MOST = 4, 24  # moves of each of the judge's draws in the end, and steps until then at most
 
 MODELS: dict[str, tuple[str, list[str], list[Parameter], float]] = {
     # body, joints, unknowns, size of the command
@@ -122,7 +123,7 @@ def logged(name: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, sipe.Traje
 
 def one_row(name: str, seed: int) -> dict[str, Any]:
     """Both posteriors of one log."""
-    from tests.problems.particle_judge import ChainModel, judge
+    from tests.problems.particle_judge import ChainModel, enough_particles, judge
 
     simulator, truth, log = logged(name, seed)
     estimator = sipe.get_estimator(simulator, "laplace", likelihood=sipe.StateSpace(), seed=seed)
@@ -134,7 +135,9 @@ def one_row(name: str, seed: int) -> dict[str, Any]:
     chain = estimator.bound(Trajectories.stack([log]))
     chain.budget = np.inf
     begin = time.process_time()
-    result = judge(ChainModel(chain, optimum.noise), len(truth), THETAS, PARTICLES, np.random.default_rng(seed))
+    model, rng = ChainModel(chain, optimum.noise), np.random.default_rng(seed)
+    particles = enough_particles(model, optimum.theta, rng)
+    result = judge(model, len(truth), THETAS, particles, rng, TIMES, MOST)
     draws = np.unique(result.theta, axis=0)  # a repeated draw gives itself away
     mean, sd = posterior.mean.numpy(), posterior.stddev.numpy()
     generator = torch.Generator().manual_seed(1000 + seed)  # other draws than c2st's own
@@ -147,7 +150,9 @@ def one_row(name: str, seed: int) -> dict[str, Any]:
         "sd_ratio": (sd / draws.std(0)).round(3).tolist(),
         "z": ((mean - truth) / sd).round(2).tolist(),
         "judge_z": ((draws.mean(0) - truth) / draws.std(0)).round(2).tolist(),
+        "particles": particles,
         "draws": len(draws),
+        "moved": result.moved,
         "accepted": round(result.accepted, 3),
         "blocking": [str(f.code) for f in estimator.findings.blocking],
         "pareto_k": estimator.diagnostics["pareto_k"],
@@ -188,6 +193,8 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     values = np.array([r["c2st"] for r in rows])
     out = {
         "logs": len(rows),
+        "fewest_draws": min(r["draws"] for r in rows),
+        "particles": sorted({r["particles"] for r in rows}),
         "c2st": round(float(values.mean()), 3),
         "standard_error": round(float(values.std(ddof=1) / np.sqrt(len(rows))), 3) if len(rows) > 1 else None,
         "worst": round(float(values.max()), 3),
@@ -216,7 +223,7 @@ def main() -> None:
     table = {
         "command": "python examples/studies/particles.py --seeds 0 N, for the logs of each model",
         "thetas": THETAS,
-        "particles": PARTICLES,
+        "moves": TIMES,
         "versions": {p: version(p) for p in ("mujoco", "numpy", "sbi")},
         "models": {name: summary(mine) for name in names if (mine := [r for r in rows if r["model"] == name])},
     }

@@ -42,7 +42,7 @@ class Particular(Protocol):
 
 @dataclass(frozen=True)
 class Judged:
-    """Draws (M, N) of the posterior; the share that moved since they were drawn, and Metropolis steps accepted."""
+    """Draws (M, N) of the posterior; the share that moved as often as asked for, and Metropolis steps accepted."""
 
     theta: FloatArray
     moved: float
@@ -85,17 +85,31 @@ def filtered(
     return total, states
 
 
+def enough_particles(
+    model: Particular, theta: FloatArray, rng: np.random.Generator, first: int = 64, most: int = 2048
+) -> int:
+    """Particles, doubled until estimates of the log likelihood at theta (N,) have an sd of one, or ``most``.
+
+    With fewer a Metropolis chain sticks where an estimate came out too large (A. Doucet, M. Pitt, G. Deligiannidis,
+    R. Kohn 2015, https://doi.org/10.1093/biomet/asu075).
+    """
+    particles = first
+    while particles < most and filtered(model, np.tile(theta, (16, 1)), particles, rng)[0].std(ddof=1) > 1.0:
+        particles *= 2
+    return particles
+
+
 def judge(
-    model: Particular, size: int, thetas: int, particles: int, rng: np.random.Generator, most_moves: int = 8
+    model: Particular, size: int, thetas: int, particles: int, rng: np.random.Generator, times: int = 1, most: int = 8
 ) -> Judged:
     """Draws of the posterior of theta, uniform a priori in the unit cube of ``size`` dimensions.
 
-    They are moved until 19 of 20 have, ``most_moves`` times at most.
+    In the end they are moved until 19 of 20 have ``times``, by ``most`` steps at most: what was drawn alike parts.
     """
     theta = rng.random((thetas, size))
     states = model.first(0, thetas * particles, rng).reshape(thetas, particles, -1)
     total, log_weight = np.zeros(thetas), np.zeros(thetas)
-    moved, accepted = np.zeros(thetas, bool), []
+    moves, accepted = np.zeros(thetas, int), []
     for k in range(model.samples):
         increment, states = advanced(model, theta, states, k, rng)
         total, log_weight = total + increment, log_weight + increment
@@ -108,8 +122,8 @@ def judge(
         root = np.linalg.cholesky(spread)
         chosen = np.searchsorted(np.cumsum(weight), (np.arange(thetas) + rng.random()) / thetas).clip(0, thetas - 1)
         theta, states, total = theta[chosen], states[chosen], total[chosen]
-        log_weight, moved = np.zeros(thetas), np.zeros(thetas, bool)
-        for n in range(most_moves):
+        log_weight, moves, last = np.zeros(thetas), np.zeros(thetas, int), k + 1 == model.samples
+        for n in range(most):
             length = (2.4, 1.2)[n % 2] / np.sqrt(size)
             proposed = theta + length * rng.standard_normal((thetas, size)) @ root.T
             inside = ((proposed >= 0) & (proposed <= 1)).all(1)
@@ -117,10 +131,10 @@ def judge(
             taken = inside & (np.log(rng.random(thetas)) < value - total)
             theta, total = np.where(taken[:, None], proposed, theta), np.where(taken, value, total)
             states = np.where(taken[:, None, None], ends, states)
-            moved, accepted = moved | taken, [*accepted, taken.mean()]
-            if moved.mean() > (0.95 if k + 1 == model.samples else 0.5):
+            moves, accepted = moves + taken, [*accepted, taken.mean()]
+            if (moves >= times).mean() > 0.95 if last else (moves > 0).mean() > 0.5:
                 break
-    return Judged(theta, float(moved.mean()), float(np.mean(accepted)))
+    return Judged(theta, float((moves >= times).mean()), float(np.mean(accepted)))
 
 
 class ChainModel:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectory
-from tests.problems.particle_judge import filtered, judge
+from tests.problems.particle_judge import enough_particles, filtered, judge
 from tests.problems.springs import DAMPING, HIGH, LOW, MASS, PROCESS, SD, SKIP, STEP, kalman, spring_logs
 
 LOGS = spring_logs(1, count=1, steps=40)
@@ -58,6 +58,16 @@ def test_filters_estimate_the_likelihood_without_bias() -> None:
     print(ratio.mean(), error, estimate.std())
     assert abs(ratio.mean() - 1) < 4 * error
     assert error < 0.1
+
+
+def test_particles_are_doubled_until_the_likelihood_scatters_little() -> None:
+    """To an sd of about one, by 16 filters, where the first few have one of three and more."""
+    model, rng = Spring(LOGS[0], PROCESS), np.random.default_rng(3)
+    count = enough_particles(model, np.array([0.35]), rng, first=2)
+    few, many = (filtered(model, np.full((200, 1), 0.35), n, rng)[0].std(ddof=1) for n in (2, count))
+    print(count, few, many)
+    assert few > 3
+    assert many < 1.5
 
 
 def test_draws_are_the_exact_posteriors() -> None:
