@@ -109,7 +109,7 @@ def judge(
     theta = rng.random((thetas, size))
     states = model.first(0, thetas * particles, rng).reshape(thetas, particles, -1)
     total, log_weight = np.zeros(thetas), np.zeros(thetas)
-    moves, accepted = np.zeros(thetas, int), []
+    moves, accepted = np.zeros(thetas, int), list[float]()
     for k in range(model.samples):
         increment, states = advanced(model, theta, states, k, rng)
         total, log_weight = total + increment, log_weight + increment
