@@ -91,7 +91,9 @@ class Laplace(Estimator[LaplaceState]):
     def budget_for(self, trajectories: Trajectories) -> int:
         """So many that each starting point may be followed to the end: it grows with logs and unknowns."""
         each = _STEPS * (len(self.space) + self._num_start + _TRIALS)
-        each += draws_size(len(self.space), self.problem) if isinstance(self.likelihood, StateSpace) else 0
+        if isinstance(self.likelihood, StateSpace):
+            each += draws_size(len(self.space), self.problem)
+            each += self.options.tuning.state_space.shooting.all_room if self._num_start else 0
         return max(self.default_budget, each * len(trajectories))
 
     @property

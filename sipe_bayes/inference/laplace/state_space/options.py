@@ -104,12 +104,24 @@ class ShootingTuning(Options):
     shots: int = option(2, "how often it is tried, the budget allowing", least=0)
     window: int = option(8, "control steps of the first windows: hardly more than one impact", least=2)
     first: int = option(4, "control steps of their first beginnings", least=2)
-    follows: float = option(3.0, "residual up to which longer windows count as following", "noise sds", above=0)
+    follows: float = option(1.25, "growth of the residual up to which longer windows count as following", least=1)
+    room: int = option(800, "rollouts of a log for each try in the default budget", least=0)
+    lost: float = option(1.5, "residual from which a window's start is sought by draws", "noise sds", above=1)
+    rounds: int = option(3, "of seeking such starts and of descending, on windows of one length", least=1)
+    draw_rounds: int = option(25, "of draws, each about the best until then: few windows are lost", least=0)
+    most_drawn: int = option(150, "rollouts of them, after which no round begins", least=0)
+    draws: int = option(40, "of a round: thirty found the right side of a pushed box's contact", least=1)
+    decades: tuple[float, float] = option((-2.0, 0.3), "their widths, over the noise of a start", "powers of ten")
     steps: int = option(20, "wide ones for which it leaves room in the budget: few searches take more", least=1)
     process: float = option(0.01, "process noise of the smoother that goes on from there", "of the movement", above=0)
     absorbed: float = option(
         0.1, "share of the samples that process noise explains, through contact, with which it is tried", above=0
     )
+
+    @property
+    def all_room(self) -> int:
+        """Rollouts of a log that the default budget leaves to all of them."""
+        return self.shots * self.room
 
 
 @dataclass(frozen=True)
