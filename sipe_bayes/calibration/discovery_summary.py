@@ -249,7 +249,7 @@ def _log_score(structures: Structures, label: str) -> float | None:
     state, gained = structures.state, None
     for one in state.judged:
         rest = state.judgement([other for other in one.labels if other != label])
-        if label in one.labels and rest is not None:
+        if label in one.labels and rest is not None and one.log_score is not None and rest.log_score is not None:
             gained = one.log_score - rest.log_score
     return gained
 

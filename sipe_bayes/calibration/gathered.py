@@ -112,7 +112,7 @@ class Marginals:
     @property
     def _near(self) -> FloatArray:
         """How near to a bound a theta (N,) sits on it."""
-        return THRESHOLDS.at_bound * np.minimum(1.0, THRESHOLDS.bound_sds * self.sd)
+        return np.minimum(THRESHOLDS.at_bound, THRESHOLDS.bound_sds * self.sd)
 
     def _shows_none(self, j: int) -> bool:
         """Whether a parameter is as small as nature lets it be."""

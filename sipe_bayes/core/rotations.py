@@ -111,7 +111,7 @@ def written_near(values: FloatArray, others: FloatArray, triples: Sequence[tuple
 
     Args:
         values: (..., C).
-        others: (..., C); where it is NaN, values stay.
+        others: (..., C); where a vector of it has a NaN, values stay.
         triples: which channels are together a rotation vector.
     """
     if not triples:
@@ -120,5 +120,5 @@ def written_near(values: FloatArray, others: FloatArray, triples: Sequence[tuple
     for triple in map(list, triples):
         other = others[..., triple]
         near = other - between(other, values[..., triple])
-        out[..., triple] = np.where(np.isfinite(other), near, values[..., triple])
+        out[..., triple] = np.where(np.isfinite(other).all(-1, keepdims=True), near, values[..., triple])
     return out

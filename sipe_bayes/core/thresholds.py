@@ -21,9 +21,7 @@ class Thresholds(Options):
         "a median or mode nearer to a bound than this sits on it: a truth beyond would have pushed it there",
         "of the range",
     )
-    bound_sds: float = option(
-        10.0, "a mode may be as near to a bound as its sd is small: within at_bound times this many sds", "sds"
-    )
+    bound_sds: float = option(1.0, "the same of a mode that is nearer than at_bound and than so many of its sds", "sds")
     not_determined: float = option(
         0.5,
         "a parameter that contracts less keeps more than half of the prior's sd: the logs do not determine it",

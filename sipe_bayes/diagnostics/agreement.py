@@ -177,9 +177,10 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
     parameter, per_log = space[shared[worst]], []
     for log, theta, sd in zip(logs, *apart[worst].own, strict=True):
         if sd < (1 - THRESHOLDS.not_determined) / np.sqrt(12):  # of the uniform prior's
-            inside = float(np.clip(theta, 0.0, 1.0))  # what lies beyond a bound, to first order, is at it
+            inside = float(np.clip(theta, 0.0, 1.0))
             slope = float(parameter.value(inside + 1e-6) - parameter.value(inside - 1e-6)) / 2e-6
-            per_log.append((log.name, float(parameter.value(inside)), float(sd) * slope))
+            value = float(parameter.value(inside)) + slope * (float(theta) - inside)  # beyond a bound to first order
+            per_log.append((log.name, value, float(sd) * slope))
     left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
     agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree

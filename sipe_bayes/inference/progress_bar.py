@@ -82,7 +82,8 @@ class ProgressBar:
             return line
         line += f"; {done} of at most {total} {self._unit}"
         own = done - self._first[0]  # not what an earlier run did
-        return f"{line}, {_spoken((self._last - self._since) * (total - done) / own)} for the rest" if own else line
+        rest = _spoken((self._last - self._since) * (total - done) / own) if own else ""
+        return f"{line}, at most {rest} for the rest" if own else line
 
 
 def _spoken(seconds: float) -> str:

@@ -1,7 +1,7 @@
 """A column of a log with a flipped sign or in another unit: tried before any physics is blamed.
 
-Where the plain model leaves much of a channel unexplained, each measured channel and each command is multiplied by -1,
-180 / pi, 1000 and their inverses, and the model fitted again. For a channel y, p(y) = |f|^n p(f y), n its samples.
+Where the plain model leaves much of a channel unexplained, each channel that moves and each command is multiplied by
+-1, 180 / pi, 1000 and their inverses, and the model fitted again. For a channel y, p(y) = |f|^n p(f y), n its samples.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.windows import Windows
 
 _DEGREES = 180 / math.pi
@@ -48,14 +49,20 @@ class Column:
         return f"the {kind} {self.name} has {words[self.factor]}: multiply it by {self.factor:.6g}"
 
 
+def moving(windows: Windows) -> BoolArray:
+    """The channels (C,) that show more than noise: what rests has neither sign nor unit."""
+    noise = noise_level(windows.trajectories, windows.settings, windows.simulator)[windows.channels]
+    return np.asarray(windows.spread > 2 * noise)
+
+
 def unexplained(windows: Windows, sd: FloatArray) -> float:
-    """The largest share of a channel's spread that the residuals' sd (C,) is."""
-    moving = windows.spread > 0
-    return float((sd[moving] / windows.spread[moving]).max()) if moving.any() else 0.0
+    """The largest share of a moving channel's spread that the residuals' sd (C,) is."""
+    shown = moving(windows)
+    return float((sd[shown] / windows.spread[shown]).max()) if shown.any() else 0.0
 
 
 def choices(channels: Sequence[str], actuators: Sequence[str]) -> Iterator[Column]:
-    """Every column with every factor."""
+    """Every one of these columns with every factor."""
     for name in channels:
         yield from (Column(name, False, factor) for factor in FACTORS)
     for name in actuators:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -29,7 +30,6 @@ from sipe_bayes.structure.scores import scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
 _COARSE = WindowTuning(tolerance=0.1, rough_tolerance=1e-3, most_steps=30)
-_LOOK = 300  # rollouts of a fit to a held-out log, at most
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
 
 
@@ -156,27 +156,31 @@ class Fitting:
         )
 
     def log_score(
-        self, placed: Sequence[Placed], one: FittedStructure, progress: Progress | None = None
-    ) -> tuple[float, int]:
+        self, placed: Sequence[Placed], one: FittedStructure, budget: int, progress: Progress | None = None
+    ) -> tuple[float | None, int]:
         """Log p of the held-out logs given the others, their noise estimated from themselves; and the rollouts.
 
-        Minus infinity where the structure does not follow them at all.
+        Minus infinity where the structure does not follow them at all; None where the budget cut the fit short, whose
+        noise is then that of a stage on the way.
 
         Args:
             placed: the structure's extensions.
             one: fitted to the other logs.
+            budget: rollouts at most, or 300 of each log if that is more.
             progress: called along the way.
         """
         assert self.holdout is not None
         simulator = self.simulator(placed)
         prior = GaussianMixture(torch.zeros(1), one.mean[None], one.covariance[None], simulator.space)
         try:
-            optimum = self._optimum(simulator, prior, self.holdout, one.theta, _LOOK * len(self.holdout), progress)
+            most = max(budget, 300 * len(self.holdout))
+            optimum = self._optimum(simulator, prior, self.holdout, one.theta, most, progress)
             windows, best = Windows(self.likelihood, simulator, self.holdout), optimum.best
             both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         except ValueError:  # LinAlgError and BudgetTooSmall are ones
             return -np.inf, 0
-        return both.evidence, optimum.rollouts + windows.rollouts
+        short = best.finding is not None and best.finding.code is Code.SEARCH_CUT_SHORT
+        return None if short else both.evidence, optimum.rollouts + windows.rollouts
 
     def _optimum(
         self,

@@ -41,7 +41,7 @@ from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates
-from sipe_bayes.structure.columns import Column, choices, log_jacobian, unexplained
+from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, unexplained
 from sipe_bayes.structure.extension import Extension, Placed, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -183,10 +183,14 @@ class StructureSearch:
         """The column whose factor makes the plain model fit far better, if any does."""
         given, plain = self.given, state.fitted[0] if state.fitted else None
         state = replace(state, phase=Phase.RANK)
-        if plain is not None and unexplained(given.windows(given.simulator([])), plain.sd) < self.options.gross:
+        windows = given.windows(given.simulator([]))
+        if plain is not None and unexplained(windows, plain.sd) < self.options.gross:
             return state
-        columns = list(choices(given.environment.channels, given.environment.actuators))
-        fits = [(column, self._try([column])) for column in columns]
+        names = [given.environment.channels[c] for c in np.asarray(windows.channels)[moving(windows)]]
+        columns, fits = list(choices(names, given.environment.actuators)), []
+        for number, column in enumerate(columns, 1):
+            self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"
+            fits.append((column, self._try([column])))
         tried = [(self._of_given(one, [column]), column, one) for column, one in fits if one is not None]
         if plain is None and not tried:
             given.fit([], None, self.options.fit_budget)  # raises what keeps the plain model from being fitted
@@ -269,14 +273,16 @@ class StructureSearch:
         """With what the held-out logs say of a structure and of the present one, where there are such logs."""
         for each in (state.here, one) if self.fitting.holdout is not None else ():
             if state.judgement(each.labels) is None:
-                log_score, rollouts = self.fitting.log_score(self.structure(each.labels), each, self._tell)
+                own = self.structure(each.labels)
+                log_score, rollouts = self.fitting.log_score(own, each, self.options.fit_budget, self._tell)
                 state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
         return state
 
     def _speaks_against(self, state: DiscoverState, one: FittedStructure) -> bool:
         """Whether held-out logs are foretold worse by a structure than by the present one."""
-        here, other = state.judgement(state.present), state.judgement(one.labels)
-        return here is not None and other is not None and other.log_score < here.log_score - self.options.against
+        judgements = state.judgement(state.present), state.judgement(one.labels)
+        here, other = (None if judgement is None else judgement.log_score for judgement in judgements)
+        return here is not None and other is not None and other < here - self.options.against
 
     def _again(self, state: DiscoverState) -> DiscoverState:
         """The present structure from where the larger one ended, whose gain may be nothing but a better optimum."""

@@ -48,12 +48,13 @@ class Judgement:
 
     Args:
         labels: of the structure.
-        log_score: log p of the held-out logs given the others, in nats, their noise estimated from themselves.
+        log_score: log p of the held-out logs given the others, in nats, their noise estimated from themselves; None
+            where the budget cut its fit to them short.
         rollouts: that it took.
     """
 
     labels: tuple[str, ...]
-    log_score: float
+    log_score: float | None
     rollouts: int
 
 

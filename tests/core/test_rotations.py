@@ -73,3 +73,12 @@ def test_a_turning_body_is_written_without_jumps() -> None:
     filled = rotations.bridged(seen)
     np.testing.assert_allclose(rotations.between(filled[[50, 51]], true[[50, 51]]), 0, atol=1e-9)
     np.testing.assert_allclose(filled[[0, 199]], filled[[1, 198]])
+
+
+def test_a_vector_of_which_a_number_is_missing_stays() -> None:
+    """Near a whole turn, where another way of writing would be nearer."""
+    values, others = np.array([[3.3, 0.0, 0.1], [0.1, 0.0, 0.2]]), np.array([[-2.9, 0.0, -0.1], [0.1, np.nan, 0.2]])
+    near = rotations.written_near(values, others, [(0, 1, 2)])
+    assert np.isfinite(near).all()
+    assert near[0] == pytest.approx(others[0] - rotations.between(others[0], values[0]))
+    assert near[1] == pytest.approx(values[1])

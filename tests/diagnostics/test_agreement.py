@@ -108,6 +108,16 @@ def test_a_parameter_that_few_logs_determine_is_named_alone() -> None:
     assert single >= 290  # 297 expected at the 1 % level, sd 1.7
 
 
+def test_what_a_log_asks_for_beyond_a_bound_is_shown_there() -> None:
+    """Three logs at the same bound would not seem to disagree."""
+    space = ParameterSpace([Parameter("friction", 0.0, 2.0)])
+    logs = [LogEstimate(str(k), np.array([mean]), np.array([[1e4]])) for k, mean in enumerate((0.05, -0.2, 0.05))]
+    found = disagreement(space, logs)
+    assert found is not None
+    assert [value for _, value, _ in found.per_log] == pytest.approx([0.1, -0.4, 0.1])
+    assert "1 says -0.4" in found.text
+
+
 def test_the_odd_log_is_named() -> None:
     """One of four differs: without it the others agree, at the 1 % level. Where two pairs differ nobody is odd."""
     space, rng = ParameterSpace([Parameter("a"), Parameter("b")]), np.random.default_rng(5)

@@ -57,7 +57,7 @@ def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, counted: bool = 
 
 def test_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     fit, checks = "16 s: step 40; 40 of at most 100 rollouts", "34 s: checking"
-    assert lines(monkeypatch) == [f"{fit}, 24 s for the rest", checks]
+    assert lines(monkeypatch) == [f"{fit}, at most 24 s for the rest", checks]
     assert lines(monkeypatch, counted=False) == ["16 s: step 40", checks]
 
 
@@ -71,8 +71,8 @@ def test_a_count_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
             progress("fitting", done, total)
             clock.now += 15
     first, _, second = stream.getvalue().splitlines()
-    assert first.endswith("850 of at most 1000 rollouts, 45 s for the rest")
-    assert second.endswith("50 of at most 500 rollouts, 2 min for the rest")
+    assert first.endswith("850 of at most 1000 rollouts, at most 45 s for the rest")
+    assert second.endswith("50 of at most 500 rollouts, at most 2 min for the rest")
 
 
 def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,11 +54,14 @@ def test_a_piece_whose_round_is_not_known_has_no_rivals() -> None:
     assert [r.labels for r in rivals(fitted, ("d",), lambda one: one.evidence, 0.9, 2)] == [("e",)]
 
 
-@pytest.mark.parametrize(("log_score", "ends_with"), [(50.0, ("b", "d")), (-50.0, ("a", "d"))])
+@pytest.mark.parametrize(("log_score", "ends_with"), [(50.0, ("b", "d")), (-50.0, ("a", "d")), (None, ("b", "d"))])
 def test_a_rival_takes_the_place_unless_held_out_logs_speak_against_it(
-    log_score: float, ends_with: tuple[str, ...]
+    log_score: float | None, ends_with: tuple[str, ...]
 ) -> None:
-    """One that they speak against is refused, so that it does not count among the structures either."""
+    """One that they speak against is refused, so that it does not count among the structures either.
+
+    A fit to them that was cut short says nothing.
+    """
     better = replace(structure("bd", 210), held_out=1.0)
     fitted = (structure("", 0), structure("a", 100), structure("b", 95), structure("ad", 200), better)
     judged = (Judgement(("a", "d"), 0.0, 1), Judgement(("b", "d"), log_score, 1))
@@ -68,5 +71,5 @@ def test_a_rival_takes_the_place_unless_held_out_logs_speak_against_it(
     for _ in range(2):
         state = search._swap(state)
     assert state.present == ends_with
-    assert state.is_refused(("b", "d")) == (log_score < 0)
+    assert state.is_refused(("b", "d")) == (log_score is not None and log_score < 0)
     assert state.phase is Phase.RESIDUAL

@@ -13,7 +13,9 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
+from sipe_bayes.structure.columns import moving, unexplained
 from sipe_bayes.structure.machine import Machine
 from tests.problems.pendulums import log, pendulum
 
@@ -130,6 +132,16 @@ class Bias(Extension):
         return (Parameter(f"{site}.bias", -size, size, targets=(f"actuator:{site}.bias_force",)),)
 
 
+def test_what_rests_has_neither_sign_nor_unit() -> None:
+    """A channel of noise alone is left unexplained by every model, and no reason to try columns."""
+    simulator, moves = pendulum(), log(pendulum(), [0.6, 0.08], 4)
+    rests = replace(moves, observations=0.01 * np.random.default_rng(0).standard_normal(moves.observations.shape))
+    for trajectory, expected in ((moves, True), (rests, False)):
+        windows = Windows(Segments(0.5), simulator, Trajectories.stack([trajectory]))
+        assert moving(windows).tolist() == [expected] * len(windows.channels)
+        assert (unexplained(windows, windows.spread) > 0) == expected
+
+
 @pytest.mark.parametrize("same", [True, False])
 def test_held_out_logs_speak_against_what_only_one_log_has(same: bool) -> None:
     """A machine that rubbed on one day and not on the other: friction is no part of it."""
@@ -149,6 +161,8 @@ def test_held_out_logs_speak_against_what_only_one_log_has(same: bool) -> None:
     assert structures.state.is_refused(label) != same
     assert plain is not None
     assert rubbing is not None
+    assert plain.log_score is not None
+    assert rubbing.log_score is not None
     assert (rubbing.log_score > plain.log_score) == same
 
 

@@ -220,6 +220,7 @@ def group(windows: Windows, number: int, count: int) -> Windows:
 def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuning) -> WindowOptimum:
     """The optimum with the normal that the scatter of estimates (G, N) gives, where the linearisation's is too narrow.
 
+    In no direction is it narrower than that: what the logs leave open, every search leaves where it began.
     Estimates far from the others, whose search was lost, count for nothing while ``tuning.reliable`` are left.
     """
     gap = np.abs(estimates - np.median(estimates, axis=0))
@@ -234,8 +235,17 @@ def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuni
         return optimum
     if freedom < 2 * n:  # so few say nothing of correlations
         covariance = np.diag(np.diag(covariance))
-    covariance *= freedom / (freedom - 2)  # of Student's t
+    covariance = not_below(covariance * freedom / (freedom - 2), optimum.covariance)  # of Student's t
     half = 0.5 * (kept.mean(0) - optimum.theta)
     covariance = covariance + np.outer(half, half)
     scatter = finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
     return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=scatter)
+
+
+def not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:
+    """The smallest covariance (N, N), along axes common to both, that has no smaller variance than either anywhere."""
+    root = np.linalg.cholesky(least)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
+    eigenvalues, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    axes = root @ axes
+    return np.asarray((axes * np.maximum(eigenvalues, 1.0)) @ axes.T)

@@ -151,6 +151,17 @@ def test_a_smooth_problem_keeps_its_curvature() -> None:
     assert scattered(before, estimates, TUNING) is before
 
 
+def test_no_scatter_is_narrower_than_what_the_logs_leave_open() -> None:
+    """Searches all end where they began along a direction that no log tells; across it their scatter counts."""
+    rng, ridge = np.random.default_rng(2), np.array([1.0, -1.0]) / np.sqrt(2)
+    across = np.array([1.0, 1.0]) / np.sqrt(2)
+    left_open = replace(optimum(1e-5), covariance=1e-10 * np.eye(2) + 0.3**2 * np.outer(ridge, ridge))
+    wide = scattered(left_open, 0.5 + 0.01 * rng.normal(size=(4, 2)), TUNING).covariance
+    print(wide)
+    assert 0.3**2 < ridge @ wide @ ridge < 0.31**2
+    assert 1e-3**2 < across @ wide @ across < 0.03**2
+
+
 def test_a_lost_group_counts_for_nothing() -> None:
     rng = np.random.default_rng(1)
     estimates = 0.5 + 0.01 * rng.normal(size=(8, 2))
