@@ -12,6 +12,7 @@ from sipe_bayes.calibration.gathered import Marginals
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
@@ -33,7 +34,7 @@ from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.fitted import FittedStructure
@@ -56,10 +57,10 @@ def summarise(
     before, after = (_Model(problem, structures, one, tell) for one in (structures.plain, structures.best))
     logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
     compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
-    added = [p for label in structures.best.labels for p in _added(structures, label, seed)]
     averaged = Marginals.of(structures.posterior, problem.prior, seed)
     plain, left = before.stage(seed), after.stage(seed)
     further = after.further(seed) if left.misfit is None or left.misfit.matters else None
+    added = [p for label in structures.best.labels for p in _added(structures, label, further, seed)]
     return Discovery(
         name=name,
         columns=tuple(column.sentence for column in structures.columns),
@@ -68,7 +69,7 @@ def summarise(
         promises=_promises(structures),
         posterior=structures.posterior,
         prior=problem.prior,
-        parameters=tuple(averaged.summaries(further)),
+        parameters=tuple(averaged.summaries(_part(further, problem.prior.space))),
         plain_parameters=tuple(before.summaries(seed)),
         added=tuple(added),
         cost=structures.search.cost,
@@ -138,17 +139,14 @@ class _Model:
         except ValueError:  # LinAlgError is one
             return None
 
-    def further(self, seed: int) -> Posterior | None:
-        """Of the user's parameters that a further log would ask for; None where that cannot be said."""
+    def further(self, seed: int) -> Particles | None:
+        """Of all parameters that a further log would ask for; None where that cannot be said."""
         if self.probed is None:
             return None
         prior = self.structures.search.fitting.prior_of(self.structures.simulator(self.one))
         own = self.structures.posterior_of(self.one)
         missing = missing_physics(self.probed, own, prior, True, seed, self.problem.tolerances)
-        if missing is None:
-            return None
-        space = self.problem.prior.space
-        return Particles(missing.further.theta[:, : len(space)], space, weights=missing.further.weights)
+        return None if missing is None else missing.further
 
     def stage(self, seed: int) -> Stage:
         """What it leaves of the training logs."""
@@ -254,10 +252,22 @@ def _log_score(structures: Structures, label: str) -> float | None:
     return gained
 
 
-def _added(structures: Structures, label: str, seed: int) -> list[ParameterSummary]:
-    """Parameters of an extension of the best structure, averaged over the structures that have it."""
+def _added(structures: Structures, label: str, further: Particles | None, seed: int) -> list[ParameterSummary]:
+    """Parameters of an extension of the best structure, averaged over the structures that have it.
+
+    further: of all parameters of the best one.
+    """
     posterior = structures.posterior_of_piece(label)
-    return Marginals.of(posterior, default_prior(posterior.space), seed).summaries()
+    marginals = Marginals.of(posterior, default_prior(posterior.space), seed)
+    return marginals.summaries(_part(further, posterior.space))
+
+
+def _part(every: Particles | None, space: ParameterSpace) -> Particles | None:
+    """The draws of a space's parameters alone."""
+    if every is None:
+        return None
+    columns = [every.space.names.index(name) for name in space.names]
+    return Particles(every.theta[:, columns], space, weights=every.weights)
 
 
 def _promises(structures: Structures) -> tuple[Promise, ...]:

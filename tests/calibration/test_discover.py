@@ -40,6 +40,8 @@ def test_finds_what_was_planted(case: tuple[Path, Discovery]) -> None:
     assert piece.held_out is not None
     assert min(piece.evidence, piece.held_out) > 3
     (friction,) = found.added
+    assert found.after.misfit is not None
+    assert {p.further is None for p in (*found.parameters, friction)} == {not found.after.misfit.matters}
     assert abs(friction.mode - FRICTION) < 5 * friction.sd
     (held_out,) = [row for row in found.errors if row.use == "holdout"]
     assert held_out.fitted_after < 0.8 * held_out.fitted_before
