@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from sipe_bayes.cli.discover import print_discovery
-from sipe_bayes.core.findings import Code, Finding, Severity
+from sipe_bayes.core.findings import Code, Finding, Severity, finding
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.diagnostics.records import Comparison
 from sipe_bayes.report.discovery.page import discovery_pictures, render_discovery
@@ -64,6 +64,14 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
         make_discovery(piece("cogging", undecided=True, evidence=27.0, held_out=-2.2)),
         "fair",
         "cogging at hinge (evidence +27 nats, but held-out pieces -2.2); more or longer logs would tell.",
+    ),
+    "contradiction, parts of the logs": (
+        changed(
+            piece("cogging", undecided=True),
+            findings=(finding(Code.SEARCHED_ON_PARTS, used=10.0, all=24.0),),
+        ),
+        "fair",
+        "logs cut to where it shows, or other motions, would tell.",
     ),
     "noise": (make_discovery(FRICTION), "good", "What remains passes for noise (p = 0.4)."),
     "share": (make_discovery(FRICTION), "good", "Pieces with a name explain 80 %"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sipe_bayes.core.findings import Findings
+from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
 from sipe_bayes.report.verdicts import Verdict
@@ -112,7 +112,9 @@ def undecided(discovery: Discovery) -> Verdict | None:
         return None
     named = [f"{p.sentence} ({_why_open(p)})" for p in open_pieces]
     more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
-    return Verdict("fair", f"Not decided: {listed([*named[:_NAMED], *more])}; more or longer logs would tell.")
+    parts = any(one.code is Code.SEARCHED_ON_PARTS for one in discovery.findings)
+    would = "logs cut to where it shows, or other motions," if parts else "more or longer logs"
+    return Verdict("fair", f"Not decided: {listed([*named[:_NAMED], *more])}; {would} would tell.")
 
 
 def _why_open(piece: Piece) -> str:
