@@ -388,7 +388,7 @@ class Structure(Table):
     sites: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """joints, actuators, bodies and channels where extensions may be placed; default all"""
     budget: Budget | None = None
-    """rollouts of all its fits; default 20,000"""
+    """rollouts of all its fits; default 30,000"""
     probability: Annotated[float, Strict(), Field(gt=0, le=1)] = 1.0
     """of this model's structure among those that it tried, as `sipe discover` writes it into `discovered.toml`"""
 

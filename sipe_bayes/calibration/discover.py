@@ -16,10 +16,9 @@ from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.structure.discover import Restriction, check_restriction
 from sipe_bayes.structure.discover import discover as search
-from sipe_bayes.structure.search import DiscoverOptions
+from sipe_bayes.structure.search import BUDGET, DiscoverOptions
 from sipe_bayes.structure.structures import Structures
 
-_BUDGET = 20000  # rollouts of all fits
 _KEYS = (*IDENTITY, "only", "without", "extensions_sha256")
 
 
@@ -41,7 +40,7 @@ def discover(
         only: names of the extensions that may be tried; default the configuration's, then all.
         without: names that are left out, beside the configuration's.
         seed: default the configuration's.
-        budget: rollouts of all fits; default the configuration's, then 20,000.
+        budget: rollouts of all fits; default the configuration's, then 30,000.
         options: of the search.
         checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits.
         progress: called along the way.
@@ -86,7 +85,7 @@ def restriction_of(problem: Problem, only: Sequence[str] | None = None, without:
 
 
 def _budget(problem: Problem, budget: int | None) -> int:
-    return budget or problem.config.structure.budget or _BUDGET
+    return budget or problem.config.structure.budget or BUDGET
 
 
 def run_discovery(
@@ -108,7 +107,7 @@ def run_discovery(
         config: the TOML file.
         out: folder of the results; default runs/NAME-discover.
         seed: default the configuration's.
-        budget: rollouts of all fits; default the configuration's, then 20,000.
+        budget: rollouts of all fits; default the configuration's, then 30,000.
         only: names of the extensions that may be tried.
         without: names that are left out.
         num_threads: native ones; default all cores.

@@ -24,7 +24,7 @@ from sipe_bayes.structure.extension import placements
 from sipe_bayes.structure.fitted import Fitting
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
-from sipe_bayes.structure.search import DiscoverOptions, StructureSearch
+from sipe_bayes.structure.search import BUDGET, DiscoverOptions, StructureSearch
 from sipe_bayes.structure.state import DiscoverState
 from sipe_bayes.structure.structures import Structures
 
@@ -78,7 +78,7 @@ def discover(
     likelihood: Segments | None = None,
     restriction: Restriction | None = None,
     options: DiscoverOptions | None = None,
-    budget: int = 20000,
+    budget: int = BUDGET,
     seed: int = 0,
     checkpoint: Path | None = None,
     progress: Progress | None = None,

@@ -48,6 +48,8 @@ from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.rivals import rivals
 from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
 
+BUDGET = 30_000  # rollouts of all fits by default: structures with two pieces of a machine with two joints
+
 
 @dataclass(frozen=True)
 class DiscoverOptions(Options):
@@ -86,7 +88,7 @@ class StructureSearch:
         extensions: Sequence[Extension],
         joints: Sequence[str] | None = None,
         options: DiscoverOptions | None = None,
-        budget: int = 20000,
+        budget: int = BUDGET,
         progress: Progress | None = None,
     ) -> None:
         self.given = self.fitting = fitting
