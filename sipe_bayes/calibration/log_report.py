@@ -47,10 +47,12 @@ def report_of(
         trajectory: what came out.
     """
     finite = np.isfinite(trajectory.observations)
-    names = [*_column_names(config), *(c.target for c in config.drives)]
-    signals = [y.values for y in (*raw.measurements, *raw.commands)]
+    measured = zip(_column_names(config), config.sources, raw.measurements, strict=True)
+    # a quaternion has length one: where a body rests or lies squarely, a component is at its largest
+    signals = {name: y.values for name, (m, _), y in measured if not m.quaternion}
+    signals |= {c.target: y.values for c, y in zip(config.drives, raw.commands, strict=True)}
     missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
-    clipped = {name: count_clipped(values) for name, values in zip(names, signals, strict=True)}
+    clipped = {name: count_clipped(values) for name, values in signals.items()}
     saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
     commands = zip(config.drives, raw.commands, strict=True)
     blank = {c.target: int((~np.isfinite(y.values[:-1])).sum()) for c, y in commands}

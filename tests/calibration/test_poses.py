@@ -145,3 +145,13 @@ def test_a_body_that_is_filmed_slowly_is_named(tmp_path: Path, rate: float, slow
     texts = {item.text for report in problem.reports for item in report.findings if item.code is Code.LOG_SLOW}
     assert bool(texts) == slow
     assert all("cube.position, turn were recorded at 20 Hz" in text for text in texts)
+
+
+def test_a_body_at_rest_has_no_saturated_quaternion(tmp_path: Path) -> None:
+    """Its w is one, sample after sample; a position that is cut off is told still."""
+    turns = quaternions(np.stack([0 * TIME, 0 * TIME, np.maximum(TIME - 0.15, 0)], axis=1))
+    columns = dict(zip("abcd", turns.T, strict=True)) | {"x": np.minimum(100 * TIME, 15)}
+    config = load_config(write(tmp_path, **columns))
+    _, report = load_log(config, config.logs[0])
+    said = [finding.text.split(":")[0] for finding in report.findings if finding.code == Code.LOG_CLIPPED]
+    assert said == ["cube.position (x)"], report.clipped
