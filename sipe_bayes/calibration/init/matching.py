@@ -11,7 +11,7 @@ import numpy as np
 import scipy.optimize
 
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
-from sipe_bayes.calibration.init.names import Kind, Label, alike, number_of, read_name
+from sipe_bayes.calibration.init.names import Kind, Label, alike, number_of, pieces_of, read_name
 from sipe_bayes.calibration.init.signals import slope_of
 from sipe_bayes.core.arrays import FloatArray
 
@@ -274,8 +274,7 @@ def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[L
     groups: dict[str, list[Label]] = defaultdict(list)
     for label in labels:
         if label.axis or label.number is not None:
-            stem = label.column[: -len(label.axis)] if label.axis else label.stem
-            groups[stem if label.axis else label.stem].append(label)
+            groups[label.vector if label.axis else label.stem].append(label)
     out: list[Match] = []
     taken: set[str] = set()
     for wanted, size, target_of in _wanted(machine):
@@ -335,7 +334,7 @@ def _turns(label: Label, stem: str) -> bool:
 
 
 def _spins(label: Label, stem: str) -> bool:
-    return label.kind == Kind.VELOCITY and (_speaks(stem, "ang", "omega", "gyro") or stem.lower() in ("w", "w_"))
+    return label.kind == Kind.VELOCITY and (_speaks(stem, "ang", "omega", "gyro") or "w" in pieces_of(stem))
 
 
 def _sensor(name: str, stem: str) -> tuple[str, float]:

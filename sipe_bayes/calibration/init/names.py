@@ -42,6 +42,7 @@ class Label:
         unit: unit word; "" where it names none.
         angular: whether it speaks of an angle; None where it says nothing.
         axis: "x", "y", "z" or "w".
+        vector: the name without that axis; columns of one are its components.
         measured: whether it says so, as in ``tau_measured``.
     """
 
@@ -53,6 +54,7 @@ class Label:
     unit: str = ""
     angular: bool | None = None
     axis: str = ""
+    vector: str = ""
     measured: bool = False
 
 
@@ -63,7 +65,22 @@ _ANGLES = {"angle", "angles", "theta", "phi", "alpha", "beta", "gamma", "psi", "
 _LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel", "extension", "height"}
 _PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
 _POSITIONS = _ANGLES | _LENGTHS | _PLACES
-_SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av", "angvel"}
+_ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz"}  # velocities of a body
+_SPEEDS = {
+    "velocity",
+    "velocities",
+    "vel",
+    "speed",
+    "omega",
+    "w",
+    "qvel",
+    "rate",
+    "gyro",
+    "v",
+    "xv",
+    "av",
+    "angvel",
+} | (_ALONG | _ABOUT)
 _ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"}
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
@@ -118,7 +135,7 @@ def read_name(column: str) -> Label:
     for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
         if word := _unit_of([piece.lower() for piece in re.findall(r"[A-Za-z%]+", match[1])]):
             unit, plain = word, plain.replace(match[0], " ")
-    pieces = [piece.lower() for piece in _PIECE.findall(plain)]
+    pieces = pieces_of(plain)
     numbers = [int(piece) for piece in pieces if piece.isdigit()]
     words = [piece for piece in pieces if not piece.isdigit()]
     last = re.split(r"[^A-Za-z]+", plain.rstrip("0123456789_ "))[-1]
@@ -133,7 +150,8 @@ def read_name(column: str) -> Label:
     if len(words) == 1 and words[0] in ("us", "ms", "ns"):
         return Label(column, Kind.TIME, (), None, column, words[0])
     flags, rest = _flags(words)
-    flags |= {"length"} if words and words[-1] in ("px", "py", "pz") else set()
+    flags |= {"length"} if words and words[-1] in _ALONG | {"px", "py", "pz"} else set()
+    flags |= {"angle"} if words and words[-1] in _ABOUT else set()
     kind = _kind(flags, unit, words)
     axis = _axis(words)
     if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
@@ -142,7 +160,13 @@ def read_name(column: str) -> Label:
     angular = False if flags & {"length"} or unit in ("m", "mm", "cm", "um", "m/s", "mm/s", "N") else angular
     number = numbers[-1] if numbers else None
     stem = column if number is None else re.sub(r"\d+(?=\D*$)", "#", column)
-    return Label(column, kind, tuple(rest), number, stem, unit, angular, axis, bool(flags & {"measured"}))
+    vector = _without_axis(column, words[-1]) if axis else ""
+    return Label(column, kind, tuple(rest), number, stem, unit, angular, axis, vector, bool(flags & {"measured"}))
+
+
+def pieces_of(name: str) -> list[str]:
+    """Its words and numbers, in small letters."""
+    return [piece.lower() for piece in _PIECE.findall(name)]
 
 
 def _unit_of(pieces: list[str]) -> str:
@@ -257,6 +281,12 @@ def _axis(words: list[str]) -> str:
     return last[-1] if len(last) == 2 and last[-1] in "xyzw" and last[0] in "qprvw" else ""
 
 
+def _without_axis(column: str, last: str) -> str:
+    """The name without the axis that its last word ends with, whatever unit comes after it."""
+    piece = [piece for piece in _PIECE.finditer(column) if piece[0].lower() == last][-1]
+    return column[: piece.end() - 1] + column[piece.end() :]
+
+
 def _is_quaternion(words: list[str]) -> bool:
     last = words[-1]
     return last[0] == "q" or bool({"quat", "quaternion", "orientation", "rotation"} & set(words))
@@ -264,7 +294,7 @@ def _is_quaternion(words: list[str]) -> bool:
 
 def alike(words: tuple[str, ...], name: str) -> float:
     """How much of a name of the model stands in a column's words, from 0 to 1; spelt shorter counts too."""
-    own = [piece.lower() for piece in _PIECE.findall(name) if not piece.isdigit()]
+    own = [piece for piece in pieces_of(name) if not piece.isdigit()]
     if not own or not words:
         return 0.0
     return sum(max(_similar(mine, word) for word in words) for mine in own) / len(own)

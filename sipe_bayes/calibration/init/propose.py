@@ -46,7 +46,7 @@ from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
-from sipe_bayes.envs.poses import has_pose
+from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.likelihood.starts import estimate_states
 
 _LOOKED_AT = 3  # logs that are simulated
@@ -165,17 +165,26 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
     still = [a.name for a in machine.actuators if f"actuator:{a.name}" not in driven]
     if still:
         out.append(f"no column drives {', '.join(still)}: it gets zero; name its column under [[commands]]")
-    measured = {m.target.rpartition(".")[0] for m in (*matches.positions, *matches.velocities, *matches.vectors)}
-    blind = [joint.name for joint in machine.joints if f"joint:{joint.name}" not in measured]
-    felt = _is_felt(machine, matches)
-    bodies = [] if felt else [body for body in machine.bodies if f"body:{body}" not in measured]
+    measured = {m.target for m in (*matches.positions, *matches.velocities, *matches.vectors)}
+    owners = {target.rpartition(".")[0] for target in measured}
+    blind = [joint.name for joint in machine.joints if f"joint:{joint.name}" not in owners]
+    posed = [] if _is_felt(machine, matches) else [j for j in range(model.njnt) if has_pose(model, j)]
+    blind += [pose for j in posed for pose in _poses(model, j) if f"body:{pose}" not in measured]
     unnamed = sum(not has_pose(model, j) and not model.joint(j).name for j in range(model.njnt))
-    if blind or bodies:
-        names = ", ".join([*blind, *bodies])
-        out.append(f"no column measures {names}: windows start it where the model does")
+    if blind:
+        out.append(f"no column measures {', '.join(blind)}: windows start it where the model does")
     if unnamed:
         out.append(f"{unnamed} joints have no name; give them one in the MJCF, so that they can be measured")
     return out
+
+
+def _poses(model: mujoco.MjModel, joint: int) -> list[str]:
+    """What of a body that a free joint or a ball carries a log should measure: none of a body without a name."""
+    body = model.body(int(model.jnt_bodyid[joint])).name
+    free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    turns = not (free and is_round(model, joint))
+    quantities = ["position"] * free + ["orientation"] * turns
+    return [f"{body}.{quantity}" for quantity in quantities if body]
 
 
 def _unused(matches: Matches, commands: Sequence[Reading]) -> tuple[str, ...]:

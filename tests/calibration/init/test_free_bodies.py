@@ -9,7 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.write import summary
 
 PUSHED = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <geom name="table" type="plane" size="3 3 .1"/><body name="puck" pos=".12 0 .02"><freejoint/>
@@ -40,3 +43,38 @@ def test_the_mass_of_a_free_body(tmp_path: Path, driven: bool) -> None:
     print(unknowns)
     assert ("puck_mass" in unknowns) == driven
     assert "puck_friction" in unknowns
+
+
+POSE = ["{}x{}", "{}y{}", "{}z{}", "{}qw", "{}qx", "{}qy", "{}qz"]
+VELOCITIES = ["{}vx{}", "{}vy{}", "{}vz{}", "{}wx{}", "{}wy{}", "{}wz{}"]
+
+
+@pytest.mark.parametrize("units", [("", "", ""), ("_m", "_m_s", "_rad_s"), ("[mm]", "", "")])
+@pytest.mark.parametrize("called", ["puck_", ""])
+def test_columns_of_a_free_body_with_their_units_in_their_names(units: tuple[str, str, str], called: str) -> None:
+    model = mujoco.MjModel.from_xml_string(PUSHED.format(pusher=PUSHER, motor=MOTOR))
+    length, along, about = units
+    names = [name.format(called, length) for name in POSE]
+    names += [name.format(called, along if k < 3 else about) for k, name in enumerate(VELOCITIES)]
+    table = dict.fromkeys([*names, "stroke_m", "stroke_vel", "push_N"], np.arange(30.0))
+    matches = match_columns(Machine.of(model), table)
+    expected = {"position": names[:3], "orientation": names[3:7], "linear_velocity": names[7:10]}
+    expected |= {"angular_velocity": names[10:]}
+    found = {match.target: list(match.columns) for match in matches.vectors}
+    assert found == {f"body:puck.{quantity}": columns for quantity, columns in expected.items()}
+    assert [match.column for match in matches.velocities] == ["stroke_vel"]
+    assert not matches.left
+
+
+@pytest.mark.parametrize(("geom", "said"), [("box", "ball.position, ball.orientation"), ("sphere", "ball.position")])
+def test_a_pose_without_columns_is_told(tmp_path: Path, geom: str, said: str) -> None:
+    """A ball's orientation is not missed: it moves alike however it is turned."""
+    path = tmp_path / "model.xml"
+    ball = f'<body name="ball" pos="1 0 .5"><freejoint/><geom type="{geom}" size=".05 .05 .05" mass=".1"/></body>'
+    path.write_text(PUSHED.format(pusher=ball, motor=""))
+    time = 0.01 * np.arange(60)
+    columns = {"t": time, "puck_x_m": 0.1 * time, "puck_y_m": 0.2 * time, "puck_z_m": 0.02 + 1e-4 * np.sin(time)}
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(path, [tmp_path / "log.csv"], tmp_path)
+    print(draft.open_doubts)
+    assert any(f"no column measures puck.orientation, {said}:" in line for line in summary(draft, "calibrate.toml"))
