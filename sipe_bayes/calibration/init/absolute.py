@@ -7,8 +7,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.decisions import Case, Layout, questions, ranked
-from sipe_bayes.calibration.init.draft import Draft
+from sipe_bayes.calibration.init.decisions import Case, Layout, ranked
+from sipe_bayes.calibration.init.draft import Draft, questions
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.trials import Trial
 

@@ -8,11 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
+from sipe_bayes.calibration.init.draft import (
+    Answer,
+    Draft,
+    Question,
+    Reading,
+    Scale,
+    answered,
+    is_tried,
+    questions,
+    turned,
+    unit_words,
+)
 from sipe_bayes.calibration.init.fits import fit
-from sipe_bayes.calibration.init.machine import Drive, Machine
-from sipe_bayes.calibration.init.names import Kind
-from sipe_bayes.calibration.init.trials import Assumption, Trial
+from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 
@@ -28,26 +38,6 @@ _SAME = np.log(1.02)
 _UNLIKELY = 0.01  # by which what is not likely has to be better
 _FITTED = 4  # units, and combinations of signs with each, that are fitted where the nominal model does not decide
 _FIRST_DELAYS = (0, 1, 2, 4)
-
-Answer = Scale | int
-
-
-@dataclass(frozen=True)
-class Question:
-    """What is open: the unit of some readings, or the sign of one.
-
-    Args:
-        readings: places in ``Draft.readings``.
-        units: scales; empty for a sign.
-    """
-
-    readings: tuple[int, ...]
-    units: tuple[Scale, ...] = ()
-
-    @property
-    def answers(self) -> tuple[Answer, ...]:
-        """What may be answered, the likeliest first."""
-        return self.units or (1, -1)
 
 
 @dataclass(frozen=True)
@@ -95,74 +85,30 @@ def scale_of(reading: Reading) -> float:
     return reading.sign * reading.factor * find_unit(reading.unit).factor
 
 
-def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
-    """The units that a column without one in its name may have, the likeliest first."""
-    target, kind = reading.match.target, reading.match.label.kind
-    if target.startswith("body:"):
-        return ("m", "mm", "cm") if target.endswith(".position") else (reading.unit,)
-    if target.startswith("sensor:"):
-        return (reading.unit,)
-    if target.startswith("joint:"):
-        joint = next(j for j in machine.joints if target.startswith(f"joint:{j.name}."))
-        if target.endswith(".position"):
-            return ("rad", "deg") if joint.hinge else ("m", "mm", "cm")
-        return ("rad/s", "deg/s", "rpm") if joint.hinge else ("m/s", "mm/s")
-    actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
-    hinge = actuator.joint is None or actuator.joint.hinge
-    if actuator.drive == Drive.POSITION:
-        return ("rad", "deg") if hinge else ("m", "mm", "cm")
-    if actuator.drive == Drive.VELOCITY:
-        return ("rad/s", "deg/s", "rpm") if hinge else ("m/s", "mm/s")
-    if kind == Kind.CURRENT:
-        return ("A", "mA")
-    if kind == Kind.DUTY:
-        return (reading.unit,)
-    if kind == Kind.VOLTAGE or (actuator.drive == Drive.VOLTAGE and kind != Kind.TORQUE):
-        return ("V", "mV")
-    if kind == Kind.TORQUE or reading.unit != "1":
-        return ("N m", "mN m") if hinge else ("N", "mN")
-    return ("1", "%")
-
-
-def questions(draft: Draft, machine: Machine) -> list[Question]:
-    """What the names leave open: one unit for alike columns without one, one sign for each scalar."""
-    groups: dict[tuple[str, tuple[Scale, ...]], list[int]] = {}
-    signs = []
-    for k, reading in enumerate(draft.readings):
-        scalar = len(reading.match.columns) == 1
-        if not _is_tried(draft, reading):
-            continue
-        scales = reading.scales or tuple(Scale(word) for word in unit_words(reading, machine))
-        if not reading.match.label.unit and len(scales) > 1 and (reading.factor == 1 or reading.scales):
-            own = "command" if reading.commanded else "measured"
-            groups.setdefault((own, scales), []).append(k)
-        if scalar:
-            signs.append(Question((k,)))
-    return [Question(tuple(members), scales) for (_, scales), members in groups.items()] + signs
-
-
-def _is_tried(draft: Draft, reading: Reading) -> bool:
-    """Whether simulations say something of it: commands, positions, and velocities of joints without these."""
-    target = reading.match.target
-    if reading.match.quaternion or target.startswith("sensor:"):
-        return False
-    if target.endswith(".velocity"):
-        place = target.removesuffix("velocity") + "position"
-        return all(other.match.target != place for other in draft.measurements)
-    return not target.endswith(("angular_velocity", "linear_velocity"))
-
-
 @dataclass(frozen=True)
 class Ranking:
-    """Answers that were tried (H tuples), the logarithm of what each misses in all channels together (H,)."""
+    """Answers that were tried (H tuples), the logarithm of what each misses in all channels together (H,).
+
+    Args:
+        answers: to all questions.
+        scores: the smaller the better.
+        decided: by how much a simulation has to be better than another one, so that it tells.
+        named: the answers of the names, against which the model as given has to tell; None where it is fitted.
+    """
 
     answers: list[tuple[Answer, ...]]
     scores: FloatArray
+    decided: float
+    named: tuple[Answer, ...] | None = None
 
     @property
     def best(self) -> int:
-        """Which misses least."""
-        return int(np.argmin(self.scores))
+        """Which misses least, or of those that the model as given does not tell from it, the nearest to the names."""
+        if self.named is None:
+            return int(np.argmin(self.scores))
+        near = np.flatnonzero(self.scores < self.scores.min() + self.decided)
+        apart = [sum(a != b for a, b in zip(self.answers[i], self.named, strict=True)) for i in near]
+        return int(min(zip(apart, self.scores[near], near, strict=True))[2])
 
     def gap(self, question: int, answer: Answer) -> float:
         """By how much the best combination with another answer to a question is worse."""
@@ -187,53 +133,52 @@ def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draf
     if rivals:
         ranking, theta = _fitted(case, asked, ranking, rivals)
         case = replace(case, theta=theta)
-    answers = ranking.answers[ranking.best]
-    readings = list(_answered(draft.readings, asked, answers))
+    readings = list(answered(draft.readings, asked, ranking.answers[ranking.best]))
     base = case.misses([readings])[0]
+    if base.min() > _USELESS:
+        return _by_names(draft, asked)
     for q in range(len(asked)):
         readings = _with_evidence(case, asked, ranking, q, readings, base)
     readings = _against_names(case, readings, base)
     doubts = [*draft.doubts, *_mirrored(asked, ranking, readings)]
-    if float(np.log(base).mean()) > np.log(_USELESS):
-        text = "no simulation follows these logs better than a straight line does, so units and signs stand on names"
-        doubts.append(f"{text} alone; look at the model and at what drives it")
+    return _read_as(draft, readings, doubts)
+
+
+def _by_names(draft: Draft, asked: Sequence[Question]) -> Draft:
+    """The draft as names have it, where simulations tell nothing."""
+    text = "no simulation follows these logs better than a straight line does, so units and signs stand on names alone"
+    doubt = f"{text}; look at the model and at what drives it"
+    return _read_as(draft, answered(draft.readings, asked, _named(asked)), [*draft.doubts, doubt])
+
+
+def _read_as(draft: Draft, readings: Sequence[Reading], doubts: Sequence[str]) -> Draft:
     measured = len(draft.measurements)
     return replace(
         draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]), doubts=tuple(doubts)
     )
 
 
-def _turned(sign: Answer) -> int:
-    """The other sign."""
-    return -1 if sign == 1 else 1
+def _named(asked: Sequence[Question]) -> tuple[Answer, ...]:
+    return tuple(question.answers[0] for question in asked)
 
 
 def _mirrored(asked: Sequence[Question], ranking: Ranking, readings: Sequence[Reading]) -> list[str]:
     """Signs that may be turned round together."""
     groups: list[frozenset[int]] = []
     for q, question in enumerate(asked):
-        if question.units or ranking.gap(q, _turned(ranking.answers[ranking.best][q])) >= _DECIDED:
+        other = turned(ranking.answers[ranking.best][q])
+        if not question.of_sign or ranking.gap(q, other) >= ranking.decided:
             continue
-        other = _turned(ranking.answers[ranking.best][q])
         rows = [i for i, a in enumerate(ranking.answers) if a[q] == other]
         nearest = ranking.answers[min(rows, key=lambda i: float(ranking.scores[i]))]
         pairs = zip(nearest, ranking.answers[ranking.best], strict=True)
-        groups.append(frozenset(k for k, (a, b) in enumerate(pairs) if a != b and not asked[k].units))
+        groups.append(frozenset(k for k, (a, b) in enumerate(pairs) if a != b and asked[k].of_sign))
     out = []
     for group in sorted(set(groups), key=sorted):
         names = " and ".join(repr(readings[asked[k].readings[0]].match.column) for k in sorted(group))
         if len(group) > 1:
             out.append(f"all moves alike with {names} turned round together: only how they go together is known")
     return out
-
-
-def _answered(readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[Answer]) -> tuple[Reading, ...]:
-    out = list(readings)
-    for question, answer in zip(asked, answers, strict=True):
-        for k in question.readings:
-            now = {"sign": answer} if isinstance(answer, int) else {"unit": answer.unit, "factor": answer.factor}
-            out[k] = replace(out[k], **now)
-    return tuple(out)
 
 
 def ranked(case: Case, asked: Sequence[Question]) -> Ranking:
@@ -243,7 +188,7 @@ def ranked(case: Case, asked: Sequence[Question]) -> Ranking:
         combinations = list(itertools.product(*(q.answers for q in asked)))
         return _tried(case, asked, combinations)
     seen: dict[tuple[Answer, ...], float] = {}
-    now: tuple[Answer, ...] = tuple(q.answers[0] for q in asked)
+    now = _named(asked)
     for _ in range(4):
         around = [now, *_neighbours(now, asked)]
         fresh = [a for a in around if a not in seen]
@@ -252,7 +197,7 @@ def ranked(case: Case, asked: Sequence[Question]) -> Ranking:
         tried = _tried(case, asked, fresh)
         seen |= dict(zip(tried.answers, tried.scores.tolist(), strict=True))
         now = min(seen, key=lambda a: seen[a])
-    return Ranking(list(seen), np.array(list(seen.values())))
+    return Ranking(list(seen), np.array(list(seen.values())), _CLEAR, _named(asked))
 
 
 def _neighbours(now: tuple[Answer, ...], asked: Sequence[Question]) -> list[tuple[Answer, ...]]:
@@ -260,20 +205,20 @@ def _neighbours(now: tuple[Answer, ...], asked: Sequence[Question]) -> list[tupl
     out = []
     for q, question in enumerate(asked):
         out += [(*now[:q], answer, *now[q + 1 :]) for answer in question.answers if answer != now[q]]
-    signs = [q for q, question in enumerate(asked) if not question.units]
+    signs = [q for q, question in enumerate(asked) if question.of_sign]
     for a, b in itertools.combinations(signs, 2):
         both = list(now)
-        both[a], both[b] = _turned(now[a]), _turned(now[b])
+        both[a], both[b] = turned(now[a]), turned(now[b])
         out.append(tuple(both))
     return out
 
 
 def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[Answer, ...]]) -> Ranking:
-    sets = [_answered(case.draft.readings, asked, a) for a in answers]
+    sets = [answered(case.draft.readings, asked, a) for a in answers]
     misses = np.concatenate([case.misses(sets[i : i + 64]) for i in range(0, len(sets), 64)])
-    scores = np.log(misses).sum(axis=-1) + np.array([_odd_sizes(case, readings) for readings in sets])
+    scores = followed(misses) + np.array([_odd_sizes(case, readings) for readings in sets])
     scores += [_unlikely(asked, a) for a in answers]
-    return Ranking(answers, scores)
+    return Ranking(answers, scores, _CLEAR, _named(asked))
 
 
 def _odd_sizes(case: Case, readings: Sequence[Reading]) -> float:
@@ -311,7 +256,7 @@ def _fitted(case: Case, asked: Sequence[Question], ranking: Ranking, rivals: lis
     """
     scores, thetas = [], []
     for i in rivals:
-        readings = _answered(case.draft.readings, asked, ranking.answers[i])
+        readings = answered(case.draft.readings, asked, ranking.answers[i])
         assumption = case.assumption(readings)
         miss, theta = fitted_miss(case.trial, assumption, rounds=3)
         scores.append(miss + _odd_sizes(case, readings) + _unlikely(asked, ranking.answers[i]))
@@ -319,7 +264,7 @@ def _fitted(case: Case, asked: Sequence[Question], ranking: Ranking, rivals: lis
     rest = [i for i in range(len(ranking.answers)) if i not in rivals]
     shifted = ranking.scores[rest] + max(scores) - float(ranking.scores[rivals].max())
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
-    return Ranking(answers, np.array([*scores, *shifted.tolist()])), thetas[int(np.argmin(scores))]
+    return Ranking(answers, np.array([*scores, *shifted.tolist()]), _DECIDED), thetas[int(np.argmin(scores))]
 
 
 def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:
@@ -329,7 +274,7 @@ def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[floa
     """
     left = fit(trial, assumption, _FIRST_DELAYS, rounds)
     misses = trial.misses([replace(assumption, delay=left.best)], left.theta)
-    return float(np.log(misses).sum()), left.theta
+    return float(followed(misses).sum()), left.theta
 
 
 def _with_evidence(
@@ -343,22 +288,23 @@ def _with_evidence(
     """What speaks for the answer to a question, or that nothing does."""
     question, answer = asked[q], ranking.answers[ranking.best][q]
     others = [a for a in question.answers if a != answer]
-    sets = [_answered(readings, [question], [other]) for other in others]
-    ratios = np.log(case.misses(sets) / base)
+    sets = [answered(readings, [question], [other]) for other in others]
+    misses = case.misses(sets)
+    clearer = followed(misses) - followed(base)
+    ratios = (misses / base)[:, base < 1].max(axis=1)
     out = list(readings)
-    for other, ratio in zip(others, ratios, strict=True):
-        alone, together = float(ratio.sum()), ranking.gap(q, other)
-        times = f"{np.exp(ratio.max()):.2g}"
+    for other, alone, ratio in zip(others, clearer, ratios, strict=True):
+        together, times = ranking.gap(q, other), f"{ratio:.2g}"
         for k in question.readings:
             note, doubt, instead = "", "", ""
             if isinstance(other, Scale):
                 note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
-                if together < _DECIDED:
+                if together < ranking.decided:
                     note, doubt = "", f"{answer} or {other}? simulations follow the log as well with either"
                     instead = "\n".join(other.keys)
-            elif alone < _DECIDED and together < _DECIDED:
+            elif alone < ranking.decided and together < ranking.decided:
                 doubt, instead = "its sign does not show in these logs", f"sign = {other}"
-            elif together < _DECIDED:
+            elif together < ranking.decided:
                 note = (
                     f"sign {answer}: alone it can not be turned ({times} times the miss), but all moves alike where "
                     "the others that belong to it are turned too"
@@ -379,13 +325,13 @@ def _against_names(case: Case, readings: list[Reading], base: FloatArray) -> lis
     out = list(readings)
     for k, reading in enumerate(readings):
         label = reading.match.label
-        if not label.unit or reading.match.quaternion or not _is_tried(case.draft, reading):
+        if not label.unit or reading.match.quaternion or not is_tried(case.draft, reading):
             continue
         others = [u for u in unit_words(reading, case.machine) if u != reading.unit]
         sets = [[replace(r, unit=u) if i == k else r for i, r in enumerate(readings)] for u in others]
         if not sets:
             continue
-        gaps = np.log(case.misses(sets) / base).sum(axis=1)
+        gaps = followed(case.misses(sets)) - followed(base)
         best = int(np.argmin(gaps))
         note = f"{reading.unit}, as its name says"
         if gaps[best] < -AGAINST:

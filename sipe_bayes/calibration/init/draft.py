@@ -1,14 +1,20 @@
-"""What is proposed, as data: how columns are read, with evidence and doubts, logs, unknowns; and its configuration."""
+"""What is proposed, as data: how columns are read, with evidence and doubts, logs, unknowns; and its configuration.
+
+What names leave open of units and signs is a list of questions with their answers.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Use
+from sipe_bayes.calibration.init.machine import Drive, Machine
 from sipe_bayes.calibration.init.matching import Match
+from sipe_bayes.calibration.init.names import Kind
 from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
@@ -188,3 +194,101 @@ class Draft:
             "parameters": [unknown.row() for unknown in self.proposed],
         }
         return Config.model_validate(data, context={"folder": folder})
+
+
+Answer = Scale | int
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is open: the unit of some readings, or the sign of one.
+
+    Args:
+        readings: places in ``Draft.readings``.
+        answers: scales or signs, the likeliest first: what names say, or a configuration that is checked.
+    """
+
+    readings: tuple[int, ...]
+    answers: tuple[Answer, ...]
+
+    @property
+    def of_sign(self) -> bool:
+        """Whether it is a sign."""
+        return isinstance(self.answers[0], int)
+
+
+def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
+    """The units that a column without one in its name may have, the likeliest first."""
+    target, kind = reading.match.target, reading.match.label.kind
+    if target.startswith("body:"):
+        return ("m", "mm", "cm") if target.endswith(".position") else (reading.unit,)
+    if target.startswith("sensor:"):
+        return (reading.unit,)
+    if target.startswith("joint:"):
+        joint = next(j for j in machine.joints if target.startswith(f"joint:{j.name}."))
+        if target.endswith(".position"):
+            return ("rad", "deg") if joint.hinge else ("m", "mm", "cm")
+        return ("rad/s", "deg/s", "rpm") if joint.hinge else ("m/s", "mm/s")
+    actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
+    hinge = actuator.joint is None or actuator.joint.hinge
+    if actuator.drive == Drive.POSITION:
+        return ("rad", "deg") if hinge else ("m", "mm", "cm")
+    if actuator.drive == Drive.VELOCITY:
+        return ("rad/s", "deg/s", "rpm") if hinge else ("m/s", "mm/s")
+    if kind == Kind.CURRENT:
+        return ("A", "mA")
+    if kind == Kind.DUTY:
+        return (reading.unit,)
+    if kind == Kind.VOLTAGE or (actuator.drive == Drive.VOLTAGE and kind != Kind.TORQUE):
+        return ("V", "mV")
+    if kind == Kind.TORQUE or reading.unit != "1":
+        return ("N m", "mN m") if hinge else ("N", "mN")
+    return ("1", "%")
+
+
+def questions(draft: Draft, machine: Machine) -> list[Question]:
+    """What the names leave open: one unit for alike columns without one, one sign for each scalar."""
+    groups: dict[tuple[str, tuple[Scale, ...]], list[int]] = {}
+    signs = []
+    for k, reading in enumerate(draft.readings):
+        if not is_tried(draft, reading):
+            continue
+        scales = _scales(reading, machine)
+        if not reading.match.label.unit and len(scales) > 1 and (reading.factor == 1 or reading.scales):
+            own = "command" if reading.commanded else "measured"
+            groups.setdefault((own, scales), []).append(k)
+        if len(reading.match.columns) == 1:
+            signs.append(Question((k,), (reading.sign, turned(reading.sign))))
+    return [Question(tuple(members), scales) for (_, scales), members in groups.items()] + signs
+
+
+def _scales(reading: Reading, machine: Machine) -> tuple[Scale, ...]:
+    """What a column may be multiplied by, first what the draft has."""
+    scales = reading.scales or tuple(Scale(word) for word in unit_words(reading, machine))
+    return tuple(sorted(scales, key=lambda scale: scale != (reading.unit, reading.factor)))
+
+
+def is_tried(draft: Draft, reading: Reading) -> bool:
+    """Whether simulations say something of it: commands, positions, and velocities of joints without these."""
+    target = reading.match.target
+    if reading.match.quaternion or target.startswith("sensor:"):
+        return False
+    if target.endswith(".velocity"):
+        place = target.removesuffix("velocity") + "position"
+        return all(other.match.target != place for other in draft.measurements)
+    return not target.endswith(("angular_velocity", "linear_velocity"))
+
+
+def turned(sign: Answer) -> int:
+    """The other sign."""
+    return -1 if sign == 1 else 1
+
+
+def answered(readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[Answer]) -> tuple[Reading, ...]:
+    """The readings with the answers to all questions."""
+    out = list(readings)
+    for question, answer in zip(asked, answers, strict=True):
+        for k in question.readings:
+            now = {"sign": answer} if isinstance(answer, int) else {"unit": answer.unit, "factor": answer.factor}
+            out[k] = replace(out[k], **now)
+    return tuple(out)

@@ -167,6 +167,14 @@ class Trial:
         return values - np.einsum("lk,...kc->...lc", self._line, along)
 
 
+def followed(misses: FloatArray) -> FloatArray:
+    """The logarithm of what is missed in all channels together (...) of misses (..., C).
+
+    A channel that a line follows better than a simulation tells nothing, by however much: it may be noise alone.
+    """
+    return np.asarray(np.log(np.minimum(misses, 1.0)).sum(axis=-1))
+
+
 def spread_of(values: FloatArray) -> FloatArray:
     """Root mean squares (H, C) of (H, W, L+1, C), of the middle window: those with an impact do not decide."""
     return np.asarray(np.median(np.sqrt((values**2).mean(axis=2)), axis=1))

@@ -8,11 +8,14 @@ import mujoco
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
+from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.write import summary
+from sipe_bayes.calibration.init.write import summary, toml_of
+from sipe_bayes.cli.app import app
 
 PUSHED = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <geom name="table" type="plane" size="3 3 .1"/><body name="puck" pos=".12 0 .02"><freejoint/>
@@ -43,6 +46,45 @@ def test_the_mass_of_a_free_body(tmp_path: Path, driven: bool) -> None:
     print(unknowns)
     assert ("puck_mass" in unknowns) == driven
     assert "puck_friction" in unknowns
+
+
+def pushed(folder: Path, seed: int, noise: float) -> Draft:
+    """What is proposed for a slider that pushes the puck now and then, of a machine whose friction is another one."""
+    path = folder / "model.xml"
+    path.write_text(PUSHED.format(pusher=PUSHER, motor=MOTOR))
+    real = PUSHER.replace('damping="3"', 'damping="5" frictionloss=".2"')
+    model = mujoco.MjModel.from_xml_string(PUSHED.format(pusher=real, motor=MOTOR).replace('n=".4', 'n=".25'))
+    data, rows = mujoco.MjData(model), []
+    for k in range(300):
+        data.ctrl[:] = 5 * np.sin(2 * np.pi * k / 110) + 1.5 * np.sin(2 * np.pi * k / 37 + seed)
+        rows.append([0.01 * k, float(data.ctrl[0]), *data.qpos])
+        mujoco.mj_step(model, data, 2)
+    table = np.array(rows)
+    table[:, 2:] += noise * np.random.default_rng(seed).standard_normal((300, 8))
+    names = ["t", "force", "x", "y", "z", "qw", "qx", "qy", "qz", "stroke"]
+    pd.DataFrame(table, columns=names).to_csv(folder / "log.csv", index=False)
+    return propose(path, [folder / "log.csv"], folder)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_rests_turns_no_units_and_signs(tmp_path: Path, seed: int) -> None:
+    """Simulations follow the noise of a height or a tilt worse than a line does, which tells nothing of the force."""
+    draft = pushed(tmp_path, seed, 1e-4)
+    read = {r.match.column: (r.unit, r.sign) for r in draft.readings if len(r.match.columns) == 1}
+    assert read == {"stroke": ("m", 1), "force": ("N", 1)}, draft.open_doubts
+
+
+def test_where_no_simulation_follows_names_stand_and_a_check_says_so(tmp_path: Path) -> None:
+    draft = pushed(tmp_path, 2, 1e-3)
+    assert any("stand on names alone" in doubt for doubt in draft.open_doubts)
+    assert [(r.unit, r.sign) for r in draft.readings if len(r.match.columns) == 1] == [("m", 1), ("N", 1)]
+    path = tmp_path / "calibrate.toml"
+    path.write_text(toml_of(draft, "sipe init"))
+    result = CliRunner().invoke(app, ["init", "--check", str(path)])
+    print(result.output)
+    assert result.exit_code == 0
+    assert "OPEN: no simulation follows these logs" in result.output
+    assert "agree with simulations" not in result.output
 
 
 POSE = ["{}x{}", "{}y{}", "{}z{}", "{}qw", "{}qx", "{}qy", "{}qz"]
