@@ -23,12 +23,14 @@ def init(
         if check is not None:
             if model is not None or logs or force:
                 raise ValueError("--check: takes one configuration and nothing else; drop the other arguments")
-            from sipe_bayes.calibration.init.check import oddities
+            from sipe_bayes.calibration.init.check import checked
 
-            odd = oddities(check)
-            for line in odd or [f"{check}: nothing is odd: units, signs, delays and columns agree with simulations"]:
+            found = checked(check)
+            agreed = "units, signs, delays and columns agree with simulations"
+            nothing = f"{check}: nothing is odd: {'what simulations tell agrees' if found.doubts else agreed}"
+            for line in [*(found.odd or [nothing]), *(f"OPEN: {doubt}" for doubt in found.doubts)]:
                 print(line)
-            if odd:
+            if found.odd:
                 raise typer.Exit(1)
             return
         if model is None or not logs:

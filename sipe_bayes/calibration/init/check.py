@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from sipe_bayes.calibration.init.names import read_name
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.signals import turn_of
 from sipe_bayes.calibration.init.tables import Opened, open_table
-from sipe_bayes.calibration.init.trials import Assumption, Trial
+from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
 from sipe_bayes.calibration.init.unknowns import Sizes, delay_of, springs
 from sipe_bayes.calibration.init.windows import (
     FEW,
@@ -41,8 +41,21 @@ _BETTER = np.log(1.5)  # of the logarithm of misses together, from which another
 _ROUNDS = 12  # of the fits with either reading: a model that is far off speaks for wrong units
 
 
-def oddities(path: Path) -> list[str]:
-    """One line for each thing that simulations and slopes speak against.
+@dataclass(frozen=True)
+class Checked:
+    """What was found in a configuration.
+
+    Args:
+        odd: one line for each thing that simulations and slopes speak against.
+        doubts: one line for each that they can not tell.
+    """
+
+    odd: list[str]
+    doubts: list[str]
+
+
+def checked(path: Path) -> Checked:
+    """Hold a configuration against its logs.
 
     Raises:
         ConfigError: for a configuration that can not be used.
@@ -83,7 +96,8 @@ def oddities(path: Path) -> list[str]:
             out.append(f"parameters: {note}; ask for actuator:{config.commands[0].actuator}.delay")
         if late and delays and left.best * logs[0].dt > max(p.range[1] for p in delays):
             out.append(f"parameters: {note}, beyond the bounds of {delays[0].name!r}; widen them")
-    return out + _slopes(draft, opened) + _turns(draft, opened)
+    doubts = [doubt for doubt in better.open_doubts if doubt != draft.clock.doubt]
+    return Checked(out + _slopes(draft, opened) + _turns(draft, opened), doubts)
 
 
 def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
@@ -148,7 +162,7 @@ def _swapped(draft: Draft, trial: Trial) -> tuple[float, list[str]]:
             tried.append((names, now))
     if not tried:
         return 0.0, []
-    misses = np.log(trial.misses([given, *(now for _, now in tried)], trial.theta)).sum(axis=1)
+    misses = followed(trial.misses([given, *(now for _, now in tried)], trial.theta))
     best = int(np.argmin(misses[1:]))
     gain, names = float(misses[0] - misses[1 + best]), tried[best][0]
     if gain < _BETTER:
