@@ -244,8 +244,10 @@ def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuni
 
 def not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:
     """The smallest covariance (N, N), along axes common to both, that has no smaller variance than either anywhere."""
-    root = np.linalg.cholesky(least)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
-    eigenvalues, axes = np.linalg.eigh(0.5 * (whitened + whitened.T))
-    axes = root @ axes
+    scale = np.sqrt(np.diag(least))
+    squares, own = np.linalg.eigh(least / np.outer(scale, scale))
+    lengths = np.sqrt(np.maximum(squares, 1e-12))  # a ridge may be singular to rounding
+    white = (own / lengths).T / scale
+    eigenvalues, axes = np.linalg.eigh(white @ covariance @ white.T)
+    axes = scale[:, None] * own * lengths @ axes
     return np.asarray((axes * np.maximum(eigenvalues, 1.0)) @ axes.T)

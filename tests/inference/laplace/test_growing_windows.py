@@ -14,6 +14,7 @@ from sipe_bayes.inference.laplace.growing_windows import (
     ManyStarts,
     grown_starts,
     grows,
+    not_below,
     num_groups,
     scattered,
     told_starts,
@@ -160,6 +161,20 @@ def test_no_scatter_is_narrower_than_what_the_logs_leave_open() -> None:
     print(wide)
     assert 0.3**2 < ridge @ wide @ ridge < 0.31**2
     assert 1e-3**2 < across @ wide @ across < 0.03**2
+
+
+def test_the_wider_of_two_covariances_is_wider_than_both() -> None:
+    """In every direction, and no wider than their sum; one that is singular to rounding is no error."""
+    rng = np.random.default_rng(3)
+    for size in (1, 2, 5):
+        for _ in range(20):
+            drawn = rng.normal(size=(2, size, size)) * 10.0 ** rng.uniform(-3, 0, (2, size, 1))
+            one, other = (each @ each.T + 1e-6 * np.eye(size) for each in drawn)
+            wide = not_below(one, other)
+            gaps = [np.linalg.eigvalsh(gap).min() for gap in (wide - one, wide - other, one + other - wide)]
+            assert min(gaps) > -1e-9 * np.trace(wide)
+    ridge = np.array([1.0, -1.0])
+    assert np.isfinite(not_below(1e-6 * np.eye(2), np.outer(ridge, ridge))).all()
 
 
 def test_a_lost_group_counts_for_nothing() -> None:
