@@ -127,7 +127,7 @@ def _misfits(windows: Windows, theta: FloatArray, starts: FloatArray) -> FloatAr
     """Root mean squares (B, W) of the windows' residuals in noise sds, at theta (N,) and starts (B, W, D)."""
     predicted, _ = windows.predict(np.tile(theta, (len(starts), 1)), starts)
     residual = np.where(windows.observed, (windows.measured - predicted) / level(windows).sd, 0.0)
-    squares = (residual**2).sum((2, 3)) / windows.observed.sum((1, 2))
+    squares = (residual**2).sum((2, 3)) / np.maximum(windows.observed.sum((1, 2)), 1)
     return np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
 
 
