@@ -25,12 +25,12 @@ def init(
                 raise ValueError("--check: takes one configuration and nothing else; drop the other arguments")
             from sipe_bayes.calibration.init.check import checked
 
-            found = checked(check)
+            result = checked(check)
             agreed = "units, signs, delays and columns agree with simulations"
-            nothing = f"{check}: nothing is odd: {'what simulations tell agrees' if found.doubts else agreed}"
-            for line in [*(found.odd or [nothing]), *(f"OPEN: {doubt}" for doubt in found.doubts)]:
+            nothing = f"{check}: nothing is odd: {'what simulations tell agrees' if result.doubts else agreed}"
+            for line in [*(result.odd or [nothing]), *(f"OPEN: {doubt}" for doubt in result.doubts)]:
                 print(line)
-            if found.odd:
+            if result.odd:
                 raise typer.Exit(1)
             return
         if model is None or not logs:

@@ -55,9 +55,8 @@ def moving(windows: Windows) -> BoolArray:
     return np.asarray(windows.spread > 2 * noise)
 
 
-def unexplained(windows: Windows, sd: FloatArray) -> float:
-    """The largest share of a moving channel's spread that the residuals' sd (C,) is."""
-    shown = moving(windows)
+def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> float:
+    """The largest share of a channel's spread that the residuals' sd (C,) is, of those that are ``shown`` to move."""
     return float((sd[shown] / windows.spread[shown]).max()) if shown.any() else 0.0
 
 

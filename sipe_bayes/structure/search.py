@@ -185,10 +185,14 @@ class StructureSearch:
         """The column whose factor makes the plain model fit far better, if any does."""
         given, plain = self.given, state.fitted[0] if state.fitted else None
         state = replace(state, phase=Phase.RANK)
-        windows = given.windows(given.simulator([]))
-        if plain is not None and unexplained(windows, plain.sd) < self.options.gross:
-            return state
-        names = [given.environment.channels[c] for c in np.asarray(windows.channels)[moving(windows)]]
+        rests: set[int] = set()
+        if plain is not None:
+            windows = given.windows(given.simulator([]))
+            shown = moving(windows)
+            if unexplained(windows, plain.sd, shown) < self.options.gross:
+                return state
+            rests = set(np.asarray(windows.channels)[~shown].tolist())
+        names = [name for c, name in enumerate(given.environment.channels) if c not in rests]
         columns, fits = list(choices(names, given.environment.actuators)), []
         for number, column in enumerate(columns, 1):
             self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"

@@ -14,10 +14,12 @@ import pytest
 
 import sipe_bayes as sipe
 from sipe_bayes.calibration.discover import run_discovery
+from sipe_bayes.calibration.discovery_summary import summarise
 from sipe_bayes.calibration.output import CHECKPOINT
 from sipe_bayes.calibration.run import run
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.diagnostics.discovery import Discovery
+from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.report.discovery.words import discovery_verdicts
 from tests.problems.interruptions import stop_in_stage
@@ -40,14 +42,26 @@ def test_finds_what_was_planted(case: tuple[Path, Discovery]) -> None:
     assert piece.held_out is not None
     assert min(piece.evidence, piece.held_out) > 3
     (friction,) = found.added
-    assert found.after.misfit is not None
-    assert {p.further is None for p in (*found.parameters, friction)} == {not found.after.misfit.matters}
     assert abs(friction.mode - FRICTION) < 5 * friction.sd
     (held_out,) = [row for row in found.errors if row.use == "holdout"]
     assert held_out.fitted_after < 0.8 * held_out.fitted_before
     assert found.after.noise["angle"].sd < found.before.noise["angle"].sd
     assert found.comparison is not None
     assert found.comparison.verdict == "better"
+
+
+def test_what_was_added_has_an_interval_with_what_the_model_lacks(
+    case: tuple[Path, Discovery], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the user's values have, where what remains matters; the plain intervals lie within."""
+    config, _ = case
+    monkeypatch.setattr(Misfit, "matters", True)
+    problem = sipe.prepare(config, 1)
+    again = summarise(problem, sipe.discover(problem), "again", 0, 0.0)
+    assert [p.name for p in again.added] == ["hinge.dry_friction"]
+    for p in (*again.parameters, *again.added):
+        assert p.further is not None
+        assert p.further[0] <= p.q05 < p.q95 <= p.further[1], p
 
 
 def test_averaged_values_hold_the_truth(case: tuple[Path, Discovery]) -> None:

@@ -139,7 +139,7 @@ def test_what_rests_has_neither_sign_nor_unit() -> None:
     for trajectory, expected in ((moves, True), (rests, False)):
         windows = Windows(Segments(0.5), simulator, Trajectories.stack([trajectory]))
         assert moving(windows).tolist() == [expected] * len(windows.channels)
-        assert (unexplained(windows, windows.spread) > 0) == expected
+        assert (unexplained(windows, windows.spread, moving(windows)) > 0) == expected
 
 
 @pytest.mark.parametrize("same", [True, False])
