@@ -11,7 +11,9 @@ weighted draws' moments, widened, and to a tenth from the prior, which keeps the
 effective draws grows with the dimension and the square of what is added, which therefore shrinks with the dimension's
 root. A draw's weight is the posterior's density by that of all batches together. They end with enough effective draws,
 and become a mixture of kernels, drawn together so that mean and covariance stay those of the draws away from bounds (M.
-West 1993, "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55).
+West 1993, "Approximating Posterior Distributions by Mixtures", J. R. Stat. Soc. B 55). Of several normals each has its
+own draws, those that most likely come from it: the next batch is about the one where a draw has the most mass, and
+kernels are made of each alone.
 
 ``judged``: how far draws from a normal are from the posterior that it stands for, by the shape k of the Pareto
 distribution of their largest weights (A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, "Pareto Smoothed Importance
@@ -30,9 +32,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.search.gaussians import log_normal
 from sipe_bayes.posterior import GaussianMixture, Posterior
@@ -178,14 +179,17 @@ def batch_size(size: int, tuning: ImportanceTuning) -> int:
 
 
 def draw(
-    draws: Draws, target: Target, normal: GaussianMixture, prior: Posterior, seed: int, tuning: ImportanceTuning
+    draws: Draws, target: Target, normals: GaussianMixture, prior: Posterior, seed: int, tuning: ImportanceTuning
 ) -> Draws:
-    """One more batch; ``normal`` is that of Laplace's method, ``target`` gives log densities."""
+    """One more batch; ``normals`` are those of Laplace's method, ``target`` gives log densities.
+
+    Of several normals it is about the one whose draws have the most mass each.
+    """
     if draws.batches:
-        share, (mean, covariance) = tuning.share, _moments(draws, normal, prior, tuning)
+        share, (mean, covariance) = tuning.share, _moments(draws, normals, prior, tuning)
     else:
-        share, mean = tuning.first_share, normal.means.numpy()[0]
-        covariance = tuning.first_wider**2 * normal.covariances.numpy()[0]
+        share, mean = tuning.first_share, normals.means.numpy()[0]
+        covariance = tuning.first_wider**2 * normals.covariances.numpy()[0]
     return drawn_from(draws, target, mean, covariance, share, prior, seed, tuning)
 
 
@@ -246,40 +250,68 @@ def effective(weight: FloatArray) -> float:
 def kernels(
     points: FloatArray,
     weight: FloatArray,
-    space: ParameterSpace,
+    normals: GaussianMixture,
     seed: int,
     tuning: ImportanceTuning,
     blur: FloatArray | float = 0.0,
 ) -> GaussianMixture:
-    """The posterior that draws (M, N) with weights (M,) stand for.
+    """The posterior that draws (M, N) with weights (M,) stand for; of normals each with its own draws.
+
+    Around one of several that has too few of them, that normal with their mass.
 
     blur: covariance (N, N) that each kernel has in addition.
     """
-    n = len(space)
+    nearest, parts = _nearest(points, normals), []
+    for k in np.unique(nearest[weight > 0]):
+        own = nearest == k
+        mass = weight[own].sum()
+        if len(normals.means) > 1 and effective(weight[own] / mass) < tuning.least:
+            parts.append((np.array([mass]), normals.means[k][None].numpy(), normals.covariances[k][None].numpy()))
+        else:
+            parts.append(_kernels(points[own], weight[own] / mass, mass, seed, tuning, blur))
+    shares, means, spreads = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
+    return GaussianMixture(np.log(shares), means, spreads, normals.space).of_masses()  # at a bound not whole
+
+
+def _kernels(
+    points: FloatArray, weight: FloatArray, mass: float, seed: int, tuning: ImportanceTuning, blur: FloatArray | float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Shares (K,) of the mass, means (K, N) and covariances (K, N, N) of the kernels of draws (M, N)."""
+    n, number = points.shape[1], max(1, round(tuning.kernels * mass))
     mean = weight @ points
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
     silverman = (4 / (effective(weight) * (n + 2))) ** (1 / (n + 4))  # of the sds
     width = tuning.narrower * silverman
     shrunk = mean + np.sqrt(1 - width**2) * (points - mean)
     order = np.argsort((points - mean) @ np.linalg.eigh(covariance)[1][:, -1], kind="stable")
-    comb = (np.arange(tuning.kernels) + np.random.default_rng([seed, 0, 1]).random()) / tuning.kernels
+    comb = (np.arange(number) + np.random.default_rng([seed, 0, 1]).random()) / number
     picked = order[np.minimum(np.searchsorted(np.cumsum(weight[order]), comb), len(weight) - 1)]
     which, counts = np.unique(picked, return_counts=True)
     # rounding leaves some kernels' covariance singular
     spread = width**2 * covariance + 1e-9 * np.diag(np.diag(covariance))
-    means, spreads = shrunk[which], np.tile(spread + blur, (len(which), 1, 1))
-    return GaussianMixture(np.log(counts), means, spreads, space).of_masses()  # at a bound not whole
+    return mass * counts / number, shrunk[which], np.tile(spread + blur, (len(which), 1, 1))
+
+
+def _nearest(points: FloatArray, normals: GaussianMixture) -> IntArray:
+    """Which normal each of points (M, N) most likely comes from (M,)."""
+    own = zip(normals.means.numpy(), normals.covariances.numpy(), strict=True)
+    return np.argmax([log_normal(points, mean, covariance) for mean, covariance in own], axis=0)
 
 
 def _moments(
-    draws: Draws, normal: GaussianMixture, prior: Posterior, tuning: ImportanceTuning
+    draws: Draws, normals: GaussianMixture, prior: Posterior, tuning: ImportanceTuning
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (N,) and covariance (N, N) of the next proposal."""
-    weight, points = weights(draws, prior), draws.points
-    base, count = normal.covariances.numpy()[0], effective(weight)
-    if not count:
-        return normal.means.numpy()[0], base
-    mean, trust = weight @ points, count / (count + 2 * points.shape[1])
+    weight, nearest = weights(draws, prior), _nearest(draws.points, normals)
+    count = np.bincount(nearest, minlength=len(normals.means))
+    chosen = int(np.argmax(np.bincount(nearest, weight, len(count)) / np.maximum(count, 1)))
+    own = (nearest == chosen) & (weight > 0)
+    base = normals.covariances.numpy()[chosen]
+    if not own.any():
+        return normals.means.numpy()[chosen], base
+    weight, points = weight[own] / weight[own].sum(), draws.points[own]
+    number, mean = effective(weight), weight @ points
+    trust = number / (number + 2 * points.shape[1])
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
     width = 1 + tuning.wider / np.sqrt(points.shape[1])
     return mean, width**2 * (trust * covariance + (1 - trust) * base)

@@ -119,7 +119,8 @@ def test_kernels_at_a_bound_keep_the_draws_mean() -> None:
     space, ratios = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)]), []
     for seed in range(8):
         draws = np.abs(0.1 * np.random.default_rng(seed).standard_normal((400, 1)))
-        found = importance.kernels(draws, np.full(400, 1 / 400), space, seed, TUNING)
+        own = GaussianMixture([0.0], np.zeros((1, 1)), np.full((1, 1, 1), 0.01), space)
+        found = importance.kernels(draws, np.full(400, 1 / 400), own, seed, TUNING)
         quartiles = np.quantile(draws[:, 0], [0.25, 0.5, 0.75])
         ratios.append(
             [float(found.mean[0]) / draws.mean(), *(found.quantile([0.25, 0.5, 0.75])[:, 0].numpy() / quartiles)]

@@ -97,7 +97,7 @@ def test_draws_from_stretches_are_the_posterior() -> None:
             draws = importance.draw(draws, floored, own, prior, seed, tuning)
         weight = importance.weights(draws, prior)
         assert importance.effective(weight) >= tuning.enough
-        fitted = importance.kernels(draws.points, weight, space, seed, tuning)
+        fitted = importance.kernels(draws.points, weight, own, seed, tuning)
         seen.append(fitted.quantile(levels)[:, 1].numpy())
     # below the edge the others' normal holds, above it that with the second integrated out
     grid = np.linspace(0, 1, 20001)

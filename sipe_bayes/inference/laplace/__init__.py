@@ -34,7 +34,8 @@ mean lies beyond it, and the truncated density is right up to the bound.
 6. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
 7. Probe whether a single optimum's normal is the posterior (``inference.importance``), and whether that goes on beyond
-   it (``inference.stretches``); where the normal does not stand, importance draws and kernels on them take its place.
+   it (``inference.stretches``); where it does not stand, and where several optima share the posterior, importance draws
+   and kernels on them take the normals' place (``window_draws``).
 
 **Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::
 
@@ -76,9 +77,10 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
   noise (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts
   the misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what
   predicts best.
-- Whether the posterior is normal is not asked where there are several optima, where residuals are as small as the
-  simulation's rounding or intervals as small as the search resolves, where the intervals are guessed; where starts are
-  estimated it is only asked whether it is wider, and where states are inferred by draws from the normal. Where the
-  budget has no room for it (6 N + 2 rollouts to ask of windows from known starts, 8 N + 2 and the unknowns of a start
-  from estimated ones, up to 16 N + 2 of chains, and some hundreds for draws where it is none), a finding says so.
+- Whether the posterior is normal is not asked where several optima have starts of their own, where residuals are as
+  small as the simulation's rounding or intervals as small as the search resolves, where the intervals are guessed;
+  where starts are estimated it is only asked whether it is wider, and where states are inferred by draws from the
+  normal. Where the budget has no room for it (6 N + 2 rollouts to ask of windows from known starts, 8 N + 2 and the
+  unknowns of a start from estimated ones, up to 16 N + 2 of chains, and some hundreds for draws where it is none), a
+  finding says so.
 """

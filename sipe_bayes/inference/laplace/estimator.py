@@ -17,18 +17,16 @@ from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
-from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.noise_average import averaged
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
-from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, merged, mixture
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
+from sipe_bayes.inference.laplace.window_draws import draw_size, more, probed, sharing
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
-from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget, value_cost
-from sipe_bayes.inference.stretches import look_size, proposals, stretches
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -173,7 +171,7 @@ class Laplace(Estimator[LaplaceState]):
 
     def _probed(self, windows: Windows | Chain, state: LaplaceState) -> LaplaceState:
         """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
-        ended, tuning, n = replace(state, done=True), self.options.tuning.importance, len(self.space)
+        ended = replace(state, done=True)
         if isinstance(windows, Chain):
             optima, shots_left = distinct(state.search.optima), self._shots_left(state.search)
             if shots_left and self._absorbs(windows, optima[0]):
@@ -181,39 +179,13 @@ class Laplace(Estimator[LaplaceState]):
             state, target = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
             return self._looked_beyond(windows, state, target) if stands or not shots_left else state
-        best, *others = distinct(state.search.optima)
-        if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
-            return ended
-        if others and not best.unsmooth:
-            return ended
-        assert isinstance(state.search, WindowState)
-        if np.sqrt(np.diag(best.covariance)).min() < 10 * SHORTEST:
-            return ended  # an sd that the look around the optimum may have set
-        probes = 0 if windows.num_start else importance.probe_size(n)
-        if not windows.has_room(windows.num_start + probes + value_cost(windows) * look_size(n, near=False)):
-            return replace(ended, unjudged=True)
-        of_windows = self._target(windows, best)
-        if of_windows.silent:
-            return ended
-        normal = not best.unsmooth and not best.heavier
-        if normal and probes:
-            normal = importance.is_normal(of_windows, best.theta, best.mean, best.covariance, tuning)
-        try:
-            beyond = stretches(of_windows, best.theta, best.mean, best.covariance, self.options.tuning.stretches, False)
-        except BudgetExhausted:
-            windows.short = True
-            return replace(ended, unjudged=True)
-        if normal and not beyond:
-            return replace(ended, search=_looked_around(state.search, best))
-        first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(beyond, best.covariance)]
-        draws, size = Draws.none(n), self._draw_size(windows)
-        for mean, covariance in first:
-            if not windows.has_room(size):
-                break
-            share = tuning.share if draws.batches else tuning.first_share
-            draws = importance.drawn_from(draws, of_windows, mean, covariance, share, self.prior, self.seed, tuning)
-        state = replace(state, draws=draws, given=draws.batches, unjudged=draws.batches < len(first))
-        return replace(state, done=not windows.has_room(size))
+        kept = distinct(state.search.optima)
+        probe = probed(self.problem, windows, kept)
+        if probe.stands:
+            assert isinstance(state.search, WindowState)
+            return replace(ended, search=_looked_around(state.search, kept[0]))
+        state = replace(ended, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
+        return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows)))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where windows of the logs lead."""
@@ -266,25 +238,13 @@ class Laplace(Estimator[LaplaceState]):
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
         assert isinstance(state.search, WindowState)
-        kept, tuning = distinct(state.search.optima), self.options.tuning.importance
-        normal, target = mixture([merged(kept)], self.space), self._target(windows, kept[0])
-        draws = importance.draw(draws, target, normal, self.prior, self.seed, tuning)
-        if draws.values.max() > target(kept[0].theta[None])[0] + tuning.elsewhere:
+        draws, elsewhere = more(self.problem, windows, distinct(state.search.optima), draws)
+        if elsewhere:
             search = WindowSearch(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
             if search is not None:
                 return replace(state, search=search, draws=None)
-        done = importance.ended(draws, self.prior, tuning, state.given)
-        done = done or not windows.has_room(self._draw_size(windows))
-        return replace(state, draws=draws, done=done)
-
-    def _draw_size(self, windows: Windows) -> int:
-        """Simulations of the logs that one more batch of draws takes, with the optimum's linearisation and value."""
-        values = importance.batch_size(len(self.space), self.options.tuning.importance) + 1
-        return value_cost(windows) * values + windows.num_start + 1
-
-    def _target(self, windows: Windows, optimum: Optimum) -> WindowTarget:
-        assert isinstance(optimum, WindowOptimum)
-        return WindowTarget(self.prior, windows, WindowFit.at(windows, optimum))
+        done = importance.ended(draws, self.prior, self.options.tuning.importance, state.given)
+        return replace(state, draws=draws, done=done or not windows.has_room(draw_size(self.problem, windows)))
 
     def posterior(self, state: LaplaceState, trajectories: Trajectories) -> GaussianMixture:
         """The optima's normals, or kernels on the draws that take their place.
@@ -304,8 +264,8 @@ class Laplace(Estimator[LaplaceState]):
         weight = importance.weights(draws, self.prior)
         effective = importance.effective(weight)
         enough = effective >= tuning.least
-        if enough and isinstance(kept[0], WindowOptimum):
-            kept = [replace(kept[0], finding=None) if kept[0].unsmooth else kept[0]]  # draws ask for no slope
+        if enough and isinstance(kept[0], WindowOptimum) and kept[0].unsmooth:
+            kept = [replace(kept[0], finding=None)]  # draws ask for no slope
         self._report(kept, state, enough)
         if state.draws is not None:
             self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
@@ -318,7 +278,8 @@ class Laplace(Estimator[LaplaceState]):
         if not enough:
             return normals
         wider = blur(kept[0].covariance, kept[0].spread) if isinstance(kept[0], ChainOptimum) else 0.0
-        return importance.kernels(draws.points, weight, self.space, self.seed, tuning, wider)
+        own = mixture(sharing(kept, self.problem), self.space)
+        return importance.kernels(draws.points, weight, own, self.seed, tuning, wider)
 
     def _report(self, kept: list[Optimum], state: LaplaceState, drawn: bool) -> None:
         """Diagnostics of the best optimum, and what is to be said against any that is kept.
@@ -391,9 +352,13 @@ class Laplace(Estimator[LaplaceState]):
         return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open
 
 
-def _looked_around(search: WindowState, optimum: WindowOptimum) -> WindowState:
+def _looked_around(search: WindowState, optimum: Optimum) -> WindowState:
     """The search where an optimum's normal stands: its budget left no room for a look around, and this was one."""
-    if optimum.finding is None or optimum.finding.code is not Code.NOT_LOOKED_AROUND:
+    if (
+        not isinstance(optimum, WindowOptimum)
+        or optimum.finding is None
+        or optimum.finding.code is not Code.NOT_LOOKED_AROUND
+    ):
         return search
     optima = tuple(replace(one, finding=None) if one is optimum else one for one in search.optima)
     return replace(search, optima=optima)

@@ -1,0 +1,118 @@
+"""Draws in the place of windows' normals: where one is not the posterior, or where several optima share it.
+
+A single optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``) and looked
+beyond (``inference.stretches``). Where it stands and nothing lies beyond, it is the posterior. Several optima are
+always drawn from, unless all but one have hardly any mass, or starts are estimated, which follow one optimum alone: how
+mass is shared between them the curvatures at their tops tell only of normals.
+
+The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
+normals with the moments of what was drawn around an optimum (``importance.draw``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sipe_bayes.inference import importance
+from sipe_bayes.inference.importance import Draws
+from sipe_bayes.inference.laplace.pattern_search import SHORTEST
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, merged, mixture
+from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.stretches import look_size, proposals, stretches
+from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood.windows import Windows
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What is known of the posterior around the optima of a search that has ended.
+
+    Args:
+        draws: those that take the normals' place; None where these stand or nothing was asked.
+        given: batches of them whose proposals the draws did not make.
+        judged: whether the budget sufficed for what was asked.
+        stands: whether the normal was seen to be the posterior.
+    """
+
+    draws: Draws | None = None
+    given: int = 0
+    judged: bool = True
+    stands: bool = False
+
+
+def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
+    """The optima, best first, that have a share of the mass; as one where slopes are noise, which makes several of one.
+
+    kept: the distinct ones, best first.
+    """
+    if len(kept) > 1 and isinstance(kept[0], WindowOptimum) and kept[0].unsmooth:
+        return [merged(kept)]
+    least = kept[0].evidence + np.log(problem.options.tuning.stretches.unseen)
+    return [one for one in kept if one.evidence >= least]
+
+
+def draw_size(problem: SearchProblem, windows: Windows) -> int:
+    """Simulations of the logs that one more batch of draws takes, with an optimum's linearisation and value."""
+    values = importance.batch_size(len(problem.space), problem.options.tuning.importance) + 1
+    return value_cost(windows) * values + windows.num_start + 1
+
+
+def target_at(problem: SearchProblem, windows: Windows, optimum: Optimum) -> WindowTarget:
+    """The log posterior, with starts that follow theta from an optimum."""
+    assert isinstance(optimum, WindowOptimum)
+    return WindowTarget(problem.prior, windows, WindowFit.at(windows, optimum))
+
+
+def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> Probe:
+    """Ask whether the optima's normals are the posterior, and draw first batches where they are not.
+
+    kept: the distinct ones, best first.
+    """
+    best, tuning, n = kept[0], problem.options.tuning.importance, len(problem.space)
+    if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
+        return Probe()
+    shared = sharing(kept, problem)
+    if len(shared) > 1 and windows.num_start:
+        return Probe()
+    if min(np.sqrt(np.diag(one.covariance)).min() for one in shared) < 10 * SHORTEST:
+        return Probe()  # an sd that the look around the optimum may have set
+    probes = 0 if windows.num_start else importance.probe_size(n)
+    if not windows.has_room(windows.num_start + probes + value_cost(windows) * look_size(n, near=False)):
+        return Probe(judged=False)
+    target = target_at(problem, windows, best)
+    if target.silent:
+        return Probe()
+    stands = not best.unsmooth and not best.heavier and len(shared) == 1
+    if stands and probes:
+        stands = importance.is_normal(target, best.theta, best.mean, best.covariance, tuning)
+    try:
+        beyond = stretches(target, best.theta, best.mean, best.covariance, problem.options.tuning.stretches, False)
+    except BudgetExhausted:
+        windows.short = True
+        return Probe(judged=False)
+    if stands and not beyond:
+        return Probe(stands=True)
+    wider = tuning.first_wider if len(shared) == 1 else 1 + tuning.wider / np.sqrt(n)
+    around = [best] if len(shared) == 1 else shared
+    first = [(one.mean, wider**2 * one.covariance) for one in around]
+    first += proposals(beyond, best.covariance)
+    draws = Draws.none(n)
+    for mean, covariance in first:
+        if not windows.has_room(draw_size(problem, windows)):
+            break
+        share = tuning.share if draws.batches else tuning.first_share
+        draws = importance.drawn_from(draws, target, mean, covariance, share, problem.prior, problem.seed, tuning)
+    return Probe(draws, draws.batches, judged=draws.batches == len(first))
+
+
+def more(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum], draws: Draws) -> tuple[Draws, bool]:
+    """One more batch, and whether a draw is so much better than all optima that these are none."""
+    shared, tuning = sharing(kept, problem), problem.options.tuning.importance
+    normals, target = mixture(shared, problem.space), target_at(problem, windows, kept[0])
+    draws = importance.draw(draws, target, normals, problem.prior, problem.seed, tuning)
+    highest = target(np.stack([one.theta for one in shared])).max()
+    return draws, bool(draws.values.max() > highest + tuning.elsewhere)
