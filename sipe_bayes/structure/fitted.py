@@ -19,7 +19,7 @@ from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
@@ -177,7 +177,9 @@ class Fitting:
             optimum = self._optimum(simulator, prior, self.holdout, one.theta, most, progress)
             windows, best = Windows(self.likelihood, simulator, self.holdout), optimum.best
             both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
-        except ValueError:  # LinAlgError and BudgetTooSmall are ones
+        except BudgetTooSmall:
+            return None, most
+        except ValueError:  # LinAlgError is one
             return -np.inf, 0
         short = best.finding is not None and best.finding.code is Code.SEARCH_CUT_SHORT
         return None if short else both.evidence, optimum.rollouts + windows.rollouts

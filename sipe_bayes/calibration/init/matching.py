@@ -334,7 +334,10 @@ def _turns(label: Label, stem: str) -> bool:
 
 
 def _spins(label: Label, stem: str) -> bool:
-    return label.kind == Kind.VELOCITY and (_speaks(stem, "ang", "omega", "gyro") or "w" in pieces_of(stem))
+    if label.kind != Kind.VELOCITY:
+        return False
+    world = _speaks(stem, "vel", "lin")  # beside such a word a `w` is the frame
+    return _speaks(stem, "ang", "omega", "gyro") or ("w" in pieces_of(stem) and not world)
 
 
 def _sensor(name: str, stem: str) -> tuple[str, float]:

@@ -108,6 +108,17 @@ def test_columns_of_a_free_body_with_their_units_in_their_names(units: tuple[str
     assert not matches.left
 
 
+@pytest.mark.parametrize(
+    ("linear", "turning"), [("lin_vel_w_", "ang_vel_w_"), ("vel_w_", "w_"), ("vel_body_", "w_body_")]
+)
+def test_a_w_beside_a_velocity_is_the_world(linear: str, turning: str) -> None:
+    model = mujoco.MjModel.from_xml_string(PUSHED.format(pusher=PUSHER, motor=MOTOR))
+    names = {q: [f"puck_{stem}{axis}" for axis in "xyz"] for q, stem in (("linear", linear), ("angular", turning))}
+    table = dict.fromkeys([*names["linear"], *names["angular"], "stroke_m"], np.arange(30.0))
+    read = {match.target: list(match.columns) for match in match_columns(Machine.of(model), table).vectors}
+    assert read == {f"body:puck.{quantity}_velocity": columns for quantity, columns in names.items()}
+
+
 @pytest.mark.parametrize(("geom", "said"), [("box", "ball.position, ball.orientation"), ("sphere", "ball.position")])
 def test_a_pose_without_columns_is_told(tmp_path: Path, geom: str, said: str) -> None:
     """A ball's orientation is not missed: it moves alike however it is turned."""
