@@ -179,7 +179,8 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
         if sd < (1 - THRESHOLDS.not_determined) / np.sqrt(12):  # of the uniform prior's
             inside = float(np.clip(theta, 0.0, 1.0))
             slope = float(parameter.value(inside + 1e-6) - parameter.value(inside - 1e-6)) / 2e-6
-            value = float(parameter.value(inside)) + slope * (float(theta) - inside)  # beyond a bound to first order
+            within = float(np.clip(theta, -1.0, 2.0)) if parameter.scale == "log" else float(theta)  # else 1e99
+            value = float(parameter.value(within))  # perhaps beyond a bound
             per_log.append((log.name, value, float(sd) * slope))
     left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)

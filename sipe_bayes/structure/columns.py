@@ -50,9 +50,13 @@ class Column:
 
 
 def moving(windows: Windows) -> BoolArray:
-    """The channels (C,) that show more than noise: what rests has neither sign nor unit."""
+    """The channels (C,) that show more than noise: what rests has neither sign nor unit.
+
+    By five standard errors of a variance of white noise, and at least by a fifth, for the noise is an estimate.
+    """
     noise = noise_level(windows.trajectories, windows.settings, windows.simulator)[windows.channels]
-    return np.asarray(windows.spread > 2 * noise)
+    chance = 5 * np.sqrt(2 / np.maximum(windows.observed.sum(axis=(0, 1)), 1))
+    return np.asarray(windows.spread**2 > noise**2 * (1 + np.maximum(chance, 0.2)))
 
 
 def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> float:

@@ -201,9 +201,9 @@ class StructureSearch:
         if plain is None and not tried:
             given.fit([], None, self.options.fit_budget)  # raises what keeps the plain model from being fitted
         best = max(tried, key=lambda item: item[0], default=None)
-        if best is None or (plain is not None and best[0] < plain.evidence + self.options.column_gain):
-            return state
         rollouts = sum(one.rollouts for _, _, one in tried) + (0 if plain is None else plain.rollouts)
+        if best is None or (plain is not None and best[0] < plain.evidence + self.options.column_gain):
+            return state if plain is None else replace(state, fitted=(replace(plain, rollouts=rollouts),))
         self._placed = {}
         # evidences are in the corrected logs' units from here on
         return replace(state, fitted=(replace(best[2], rollouts=rollouts),), columns=(best[1],))

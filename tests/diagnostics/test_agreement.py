@@ -116,6 +116,9 @@ def test_what_a_log_asks_for_beyond_a_bound_is_shown_there() -> None:
     assert found is not None
     assert [value for _, value, _ in found.per_log] == pytest.approx([0.1, -0.4, 0.1])
     assert "1 says -0.4" in found.text
+    mass = disagreement(ParameterSpace([Parameter("mass", 0.1, 10.0, scale="log")]), logs)
+    assert mass is not None
+    assert [value for _, value, _ in mass.per_log] == pytest.approx([0.1 * 100**0.05, 0.1 * 100**-0.2, 0.1 * 100**0.05])
 
 
 def test_the_odd_log_is_named() -> None:

@@ -135,8 +135,10 @@ class Bias(Extension):
 def test_what_rests_has_neither_sign_nor_unit() -> None:
     """A channel of noise alone is left unexplained by every model, and no reason to try columns."""
     simulator, moves = pendulum(), log(pendulum(), [0.6, 0.08], 4)
-    rests = replace(moves, observations=0.01 * np.random.default_rng(0).standard_normal(moves.observations.shape))
-    for trajectory, expected in ((moves, True), (rests, False)):
+    noise = np.random.default_rng(0).standard_normal(moves.observations.shape)
+    rests = replace(moves, observations=0.01 * noise)
+    rough = replace(moves, observations=moves.observations + 0.7 * moves.observations.std() * noise)
+    for trajectory, expected in ((moves, True), (rests, False), (rough, True)):
         windows = Windows(Segments(0.5), simulator, Trajectories.stack([trajectory]))
         assert moving(windows).tolist() == [expected] * len(windows.channels)
         assert (unexplained(windows, windows.spread, moving(windows)) > 0) == expected

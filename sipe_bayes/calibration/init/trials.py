@@ -125,7 +125,8 @@ class Trial:
         measured = np.stack([flight.measured for flight in flights])
         seen = self.seen(flights, np.tile(theta, (len(flights), 1)))
         left, whole = self.bent(measured - seen), self.bent(measured)
-        return np.clip(spread_of(left) / np.maximum(spread_of(whole), 1e-12), _BEST, _WORST)
+        misses = np.clip(spread_of(left) / np.maximum(spread_of(whole), 1e-12), _BEST, _WORST)
+        return np.where(np.isfinite(seen).any(axis=(1, 2)), misses, _WORST)  # a line explains what was not simulated
 
     def flight(self, assumption: Assumption) -> Flight:
         """What windows start from, are driven by and measured as."""
