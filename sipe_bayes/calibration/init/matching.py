@@ -221,11 +221,14 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> list[Lab
     known = {x.column: x for x in labels}
     joints = len(machine.joints)
     have = sum(x.kind == Kind.POSITION for x in labels)
+    driven = any(x.kind in fits for x in labels for fits in _FITS.values())
     for stem, family in families.items():
         family = sorted(family, key=lambda x: x.number or 0)
         kinds = [Kind.OTHER] * len(family)
         if stem and joints and not have and len(family) in (joints, 2 * joints):
             kinds = _kinds(family, table, joints)
+        elif stem and not driven and len(family) == len(machine.actuators) > 1:
+            kinds = [Kind.COMMAND] * len(family)
         elif not stem:
             kinds = _by_slopes(family, labels, table)
         for label, kind in zip(family, kinds, strict=True):
@@ -322,11 +325,11 @@ def _speaks(stem: str, *words: str) -> bool:
 
 
 def _of_gyro(label: Label, stem: str) -> bool:
-    return label.kind == Kind.VELOCITY and _speaks(stem, "gyro", "omega", "ang")
+    return label.kind == Kind.VELOCITY and (_speaks(stem, "gyro", "omega", "ang") or pieces_of(stem)[-1:] == ["g"])
 
 
 def _of_accelerometer(label: Label, stem: str) -> bool:
-    return label.kind == Kind.ACCELERATION and _speaks(stem, "acc", "linear")
+    return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or pieces_of(stem)[-1:] == ["a"])
 
 
 def _turns(label: Label, stem: str) -> bool:
@@ -337,7 +340,7 @@ def _spins(label: Label, stem: str) -> bool:
     if label.kind != Kind.VELOCITY:
         return False
     world = _speaks(stem, "vel", "lin")  # beside such a word a `w` is the frame
-    return _speaks(stem, "ang", "omega", "gyro") or ("w" in pieces_of(stem) and not world)
+    return _speaks(stem, "ang", "omega", "gyro") or (bool({"w", "g"} & {*pieces_of(stem)}) and not world)
 
 
 def _sensor(name: str, stem: str) -> tuple[str, float]:

@@ -65,7 +65,7 @@ _ANGLES = {"angle", "angles", "theta", "phi", "alpha", "beta", "gamma", "psi", "
 _LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel", "extension", "height"}
 _PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
 _POSITIONS = _ANGLES | _LENGTHS | _PLACES
-_ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz"}  # velocities of a body
+_ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # velocities of a body
 _SPEEDS = {
     "velocity",
     "velocities",
@@ -81,7 +81,9 @@ _SPEEDS = {
     "av",
     "angvel",
 } | (_ALONG | _ABOUT)
-_ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"}
+_ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"} | {
+    "ax", "ay", "az",
+}  # fmt: skip
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
     "input", "drive", "applied", "a",
@@ -278,7 +280,7 @@ def _axis(words: list[str]) -> str:
     last = words[-1] if words else ""
     if last in ("x", "y", "z", "w"):
         return last
-    return last[-1] if len(last) == 2 and last[-1] in "xyzw" and last[0] in "qprvw" else ""
+    return last[-1] if len(last) == 2 and last[-1] in "xyzw" and last[0] in "qprvwga" else ""
 
 
 def _without_axis(column: str, last: str) -> str:

@@ -87,12 +87,14 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     gains = [unknown for a, r in _driven(machine, readings) for unknown in _of_actuator(model, a, r)]
     open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
-    free = [] if open_scale else [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
+    bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
+    free = [] if open_scale else bodies
     masses, attached = _masses(model, [*behind, *free])
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
-    return gains + masses + of_joints + attached + _contacts(model, machine)
+    proposed = gains + masses + of_joints + attached + _contacts(model, machine)
+    return proposed or _masses(model, bodies)[0]
 
 
 def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:

@@ -14,6 +14,7 @@ from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.windows import rough_unknowns
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.cli.app import app
 
@@ -117,6 +118,38 @@ def test_a_w_beside_a_velocity_is_the_world(linear: str, turning: str) -> None:
     table = dict.fromkeys([*names["linear"], *names["angular"], "stroke_m"], np.arange(30.0))
     read = {match.target: list(match.columns) for match in match_columns(Machine.of(model), table).vectors}
     assert read == {f"body:puck.{quantity}_velocity": columns for quantity, columns in names.items()}
+
+
+def drone(motors: bool) -> Machine:
+    """Four thrusts on a free body, and a gyro."""
+    places = [(0.2, 0.15), (0.2, -0.15), (-0.2, 0.15), (-0.2, -0.15)]
+    sites = "".join(f'<site name="t{k}" pos="{x} {y} 0"/>' for k, (x, y) in enumerate(places))
+    thrusts = "".join(f'<motor name="thrust{k}" site="t{k}" gear="0 0 6 0 0 0"/>' for k in range(4))
+    return Machine.of(
+        mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody><body name="base"><freejoint/><geom size=".1" mass="1" contype="0"/>{sites}</body>
+            </worldbody><actuator>{thrusts if motors else ""}</actuator>
+            <sensor><gyro name="gyro" site="t0"/></sensor></mujoco>"""
+        )
+    )
+
+
+def test_as_many_numbered_columns_as_actuators_are_their_commands() -> None:
+    """Their name says nothing: m1 to m4; with a command that says so beside them they are none. And gx is a gyro's."""
+    table = dict.fromkeys(["m1", "m2", "m3", "m4", "px", "py", "pz", "qw", "qx", "qy", "qz"], np.arange(30.0))
+    table |= dict.fromkeys(["gx", "gy", "gz"], np.arange(30.0))
+    matches = match_columns(drone(motors=True), table)
+    assert [(m.column, m.target) for m in matches.commands] == [(f"m{k + 1}", f"actuator:thrust{k}") for k in range(4)]
+    assert {m.target: m.columns[0] for m in matches.vectors}["sensor:gyro"] == "gx"
+    beside = match_columns(drone(motors=True), table | dict.fromkeys([f"cmd{k}" for k in range(4)], np.arange(30.0)))
+    assert [m.column for m in beside.commands] == ["cmd0", "cmd1", "cmd2", "cmd3"]
+
+
+def test_where_nothing_else_may_be_unknown_the_mass_is_proposed() -> None:
+    """A body that nothing drives or touches: a configuration needs an unknown."""
+    model = mujoco.MjModel.from_xml_string(PUSHED.format(pusher="", motor=""))
+    model.geom_contype[:] = model.geom_conaffinity[:] = 0
+    assert [one.name for one in rough_unknowns(model, Machine.of(model), [])] == ["puck_mass"]
 
 
 @pytest.mark.parametrize(("geom", "said"), [("box", "ball.position, ball.orientation"), ("sphere", "ball.position")])
