@@ -13,6 +13,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.internal.closed_chains import close, known_joints, told_by_chains
 from sipe_bayes.envs.internal.states import joints_at_rest
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
@@ -28,7 +29,7 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
     the slopes of the positions. Orientations are smoothed likewise, in rotation vectors from each sample; the joint's
     body is where the measured frame tells. What no channel measures stays at the model's reset state. The search starts
-    here, and so do the windows of held-out logs.
+    here, and so do the windows of held-out logs. Joints of closed chains follow those that are measured.
 
     Args:
         simulator: of the model.
@@ -57,6 +58,9 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
     for joint in inertial_joints(model, readings):
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
+    told = told_by_chains(model, known_joints(model, measured))
+    if told:
+        close(model, states, simulator.default_state(), told)
     return states
 
 
@@ -163,7 +167,8 @@ def _parents(model: mujoco.MjModel, joint: int, states: FloatArray) -> FloatArra
 def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
     """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state.
 
-    Not those of which the model itself says how far from rest they start; a ball's orientation does not matter.
+    Not those of which the model itself says how far from rest they start, or that a closed chain tells; a ball's
+    orientation does not matter.
     """
     model, environment = simulator.model, simulator.environment
     if are_states(simulator, trajectories.states):
@@ -172,7 +177,8 @@ def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[
     columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
     known_poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
     placed = {r.joint for r in environment.poses if r.quantity == "position" and r.at_origin}
-    missing, resting = [], {*joints_at_rest(model), *inertial_joints(model, environment.poses)}
+    chained = told_by_chains(model, known_joints(model, columns))
+    missing, resting = [], {*joints_at_rest(model), *inertial_joints(model, environment.poses), *chained}
     for joint in (joint for joint in range(model.njnt) if joint not in resting):
         if has_pose(model, joint):
             known = (joint, "orientation") in known_poses or (is_round(model, joint) and joint in placed)

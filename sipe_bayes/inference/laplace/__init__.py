@@ -33,9 +33,9 @@ mean lies beyond it, and the truncated density is right up to the bound.
    (``scouting``).
 6. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
-7. Probe whether a single optimum's normal is the posterior (``inference.importance``), and whether that goes on beyond
-   it (``inference.stretches``); where it does not stand, and where several optima share the posterior, importance draws
-   and kernels on them take the normals' place (``window_draws``).
+7. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
+   single one (``inference.stretches``); where they do not stand, importance draws and kernels on them take the normals'
+   place, each optimum's on its own draws (``window_draws``).
 
 **Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::
 

@@ -185,7 +185,7 @@ class Laplace(Estimator[LaplaceState]):
             assert isinstance(state.search, WindowState)
             return replace(ended, search=_looked_around(state.search, kept[0]))
         state = replace(ended, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
-        return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows)))
+        return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows, kept)))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where windows of the logs lead."""
@@ -238,13 +238,14 @@ class Laplace(Estimator[LaplaceState]):
     def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
         """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
         assert isinstance(state.search, WindowState)
-        draws, elsewhere = more(self.problem, windows, distinct(state.search.optima), draws)
+        kept = distinct(state.search.optima)
+        draws, elsewhere = more(self.problem, windows, kept, draws)
         if elsewhere:
             search = WindowSearch(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
             if search is not None:
                 return replace(state, search=search, draws=None)
         done = importance.ended(draws, self.prior, self.options.tuning.importance, state.given)
-        return replace(state, draws=draws, done=done or not windows.has_room(draw_size(self.problem, windows)))
+        return replace(state, draws=draws, done=done or not windows.has_room(draw_size(self.problem, windows, kept)))
 
     def posterior(self, state: LaplaceState, trajectories: Trajectories) -> GaussianMixture:
         """The optima's normals, or kernels on the draws that take their place.

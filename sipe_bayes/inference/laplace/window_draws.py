@@ -1,9 +1,9 @@
 """Draws in the place of windows' normals: where one is not the posterior, or where several optima share it.
 
-A single optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``) and looked
-beyond (``inference.stretches``). Where it stands and nothing lies beyond, it is the posterior. Several optima are
-always drawn from, unless all but one have hardly any mass, or starts are estimated, which follow one optimum alone: how
-mass is shared between them the curvatures at their tops tell only of normals.
+Each optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``), and that of a
+single one looked beyond (``inference.stretches``). Where all stand and nothing lies beyond, they are the posterior,
+shared by their evidence. Optima with hardly any mass are left out of this, and several are not asked about where starts
+are estimated, which follow one optimum alone.
 
 The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
 normals with the moments of what was drawn around an optimum (``importance.draw``).
@@ -22,7 +22,7 @@ from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, merged, mixture
 from sipe_bayes.inference.laplace.window_state import WindowOptimum
 from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget, value_cost
-from sipe_bayes.inference.stretches import look_size, proposals, stretches
+from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
@@ -35,7 +35,7 @@ class Probe:
         draws: those that take the normals' place; None where these stand or nothing was asked.
         given: batches of them whose proposals the draws did not make.
         judged: whether the budget sufficed for what was asked.
-        stands: whether the normal was seen to be the posterior.
+        stands: whether the normals were seen to be the posterior.
     """
 
     draws: Draws | None = None
@@ -55,9 +55,9 @@ def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
     return [one for one in kept if one.evidence >= least]
 
 
-def draw_size(problem: SearchProblem, windows: Windows) -> int:
-    """Simulations of the logs that one more batch of draws takes, with an optimum's linearisation and value."""
-    values = importance.batch_size(len(problem.space), problem.options.tuning.importance) + 1
+def draw_size(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> int:
+    """Simulations of the logs that one more batch of draws takes, with a linearisation and the optima's values."""
+    values = importance.batch_size(len(problem.space), problem.options.tuning.importance) + len(sharing(kept, problem))
     return value_cost(windows) * values + windows.num_start + 1
 
 
@@ -80,20 +80,23 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
         return Probe()
     if min(np.sqrt(np.diag(one.covariance)).min() for one in shared) < 10 * SHORTEST:
         return Probe()  # an sd that the look around the optimum may have set
-    probes = 0 if windows.num_start else importance.probe_size(n)
-    if not windows.has_room(windows.num_start + probes + value_cost(windows) * look_size(n, near=False)):
+    probes = 0 if windows.num_start else len(shared) * importance.probe_size(n)
+    look = value_cost(windows) * look_size(n, near=False) if len(shared) == 1 else 0
+    if not windows.has_room(windows.num_start + probes + look):
         return Probe(judged=False)
     target = target_at(problem, windows, best)
     if target.silent:
         return Probe()
-    stands = not best.unsmooth and not best.heavier and len(shared) == 1
+    stands = not best.unsmooth and (len(shared) > 1 or not best.heavier)  # heavier: for another optimum, perhaps
     if stands and probes:
-        stands = importance.is_normal(target, best.theta, best.mean, best.covariance, tuning)
-    try:
-        beyond = stretches(target, best.theta, best.mean, best.covariance, problem.options.tuning.stretches, False)
-    except BudgetExhausted:
-        windows.short = True
-        return Probe(judged=False)
+        stands = all(importance.is_normal(target, one.theta, one.mean, one.covariance, tuning) for one in shared)
+    beyond: list[Stretch] = []
+    if len(shared) == 1:
+        try:
+            beyond = stretches(target, best.theta, best.mean, best.covariance, problem.options.tuning.stretches, False)
+        except BudgetExhausted:
+            windows.short = True
+            return Probe(judged=False)
     if stands and not beyond:
         return Probe(stands=True)
     wider = tuning.first_wider if len(shared) == 1 else 1 + tuning.wider / np.sqrt(n)
@@ -102,7 +105,7 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     first += proposals(beyond, best.covariance)
     draws = Draws.none(n)
     for mean, covariance in first:
-        if not windows.has_room(draw_size(problem, windows)):
+        if not windows.has_room(draw_size(problem, windows, kept)):
             break
         share = tuning.share if draws.batches else tuning.first_share
         draws = importance.drawn_from(draws, target, mean, covariance, share, problem.prior, problem.seed, tuning)
