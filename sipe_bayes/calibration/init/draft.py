@@ -247,9 +247,9 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
 
 
 def questions(draft: Draft, machine: Machine) -> list[Question]:
-    """What the names leave open: one unit for alike columns without one, one sign for each scalar."""
+    """What the names leave open: one unit for alike columns without one, a sign for each scalar that may have both."""
     groups: dict[tuple[str, tuple[Scale, ...]], list[int]] = {}
-    signs = []
+    signs, one_way = [], {f"actuator:{actuator.name}" for actuator in machine.actuators if actuator.one_way}
     for k, reading in enumerate(draft.readings):
         if not is_tried(draft, reading):
             continue
@@ -257,7 +257,7 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
         if not reading.match.label.unit and len(scales) > 1 and (reading.factor == 1 or reading.scales):
             own = "command" if reading.commanded else "measured"
             groups.setdefault((own, scales), []).append(k)
-        if len(reading.match.columns) == 1:
+        if len(reading.match.columns) == 1 and reading.match.target not in one_way:
             signs.append(Question((k,), (reading.sign, turned(reading.sign))))
     return [Question(tuple(members), scales) for (_, scales), members in groups.items()] + signs
 

@@ -41,6 +41,7 @@ class Actuator:
     """An actuator with one control, what it is given, and the joint that it moves; full: what a whole duty stands for.
 
     That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
+    one_way: whether that range lies on one side of zero, so that a command of the other sign does nothing.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Actuator:
     joint: Joint | None
     rank: int
     full: float | None = None
+    one_way: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,14 @@ class Machine:
         ]
         by_id = dict(zip(named, joints, strict=True))
         actuators = [
-            Actuator(model.actuator(i).name, drive_of(model, i), by_id.get(_joint_of(model, i)), k, full_of(model, i))
+            Actuator(
+                model.actuator(i).name,
+                drive_of(model, i),
+                by_id.get(_joint_of(model, i)),
+                k,
+                full_of(model, i),
+                bool(model.actuator_ctrllimited[i]) and bool(model.actuator_ctrlrange[i].prod() >= 0),
+            )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
         free = [i for i in range(model.njnt) if int(model.jnt_type[i]) not in scalar]

@@ -10,10 +10,11 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from sipe_bayes.calibration.init.draft import Draft
+from sipe_bayes.calibration.init.draft import Draft, questions
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.windows import rough_unknowns
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.cli.app import app
@@ -143,6 +144,20 @@ def test_as_many_numbered_columns_as_actuators_are_their_commands() -> None:
     assert {m.target: m.columns[0] for m in matches.vectors}["sensor:gyro"] == "gx"
     beside = match_columns(drone(motors=True), table | dict.fromkeys([f"cmd{k}" for k in range(4)], np.arange(30.0)))
     assert [m.column for m in beside.commands] == ["cmd0", "cmd1", "cmd2", "cmd3"]
+
+
+def test_a_thrust_that_can_not_push_back_has_no_sign_to_try() -> None:
+    """Turned round, commands of a ctrlrange from 0 to 1 would do nothing, and a body that falls be followed as well."""
+    for limits, tried in (("", True), (' ctrlrange="0 1"', False), (' ctrlrange="-1 1"', True)):
+        motor = MOTOR.replace(' joint="stroke"', f' joint="stroke"{limits}')
+        model = mujoco.MjModel.from_xml_string(PUSHED.format(pusher=PUSHER, motor=motor))
+        time = 0.01 * np.arange(200)
+        table = {"stroke": np.sin(time), "force": np.abs(np.sin(3 * time))}
+        machine = Machine.of(model)
+        readings = first_readings(machine, match_columns(machine, table), table, {}, None)
+        draft = Draft("m.xml", None, None, readings[1], readings[0], (), 1e-3)
+        asked = [draft.readings[k].match.target for q in questions(draft, machine) if q.of_sign for k in q.readings]
+        assert ("actuator:push" in asked) == tried
 
 
 def test_where_nothing_else_may_be_unknown_the_mass_is_proposed() -> None:
