@@ -38,7 +38,7 @@ from sipe_bayes.likelihood.starts import (
     with_history,
 )
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.contacts import contacts_change
+from sipe_bayes.simulation.contacts import contacts_along
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -146,7 +146,7 @@ class Windows:
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
         guesses = {k: estimate_states(simulator, trajectories[k]) for k in np.unique(self.log).tolist()}
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
-        self.strikes = contacts_change(simulator, list(guesses.values()))
+        self.contacts = contacts_along(simulator, list(guesses.values()))
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt, self.start)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -16,10 +17,23 @@ _LOOKS = 1000  # samples that are looked at, spread evenly: a bouncing ball touc
 _APART = 0.05  # of the smaller geom's size, that two are apart beyond what noise makes of one that rests on the other
 
 
-def contacts_change(simulator: Simulator | CallableSimulator, logs: Sequence[FloatArray]) -> bool:
-    """Whether two geoms touch in some of the states (T+1, S) along logs and are clearly apart in others."""
+@dataclass(frozen=True)
+class Contacts:
+    """What the states along logs have of contact.
+
+    Args:
+        touch: whether any two geoms touch.
+        change: whether two touch in some of the states and are clearly apart in others.
+    """
+
+    touch: bool = False
+    change: bool = False
+
+
+def contacts_along(simulator: Simulator | CallableSimulator, logs: Sequence[FloatArray]) -> Contacts:
+    """Of the states (T+1, S) along logs."""
     if isinstance(simulator, CallableSimulator) or not may_touch(simulator.model):
-        return False
+        return Contacts()
     model, states = simulator.model, np.concatenate(list(logs))
     looks = states[np.linspace(0, len(states) - 1, min(_LOOKS, len(states))).astype(int)]
     looks, data, seen = looks[np.isfinite(looks).all(1)], mujoco.MjData(model), Counter[tuple[int, int]]()
@@ -28,7 +42,8 @@ def contacts_change(simulator: Simulator | CallableSimulator, logs: Sequence[Flo
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         seen.update({(int(a), int(b)) for a, b in data.contact.geom[data.contact.exclude == 0]})
-    return any(_part(model, data, pair, looks) for pair, count in seen.items() if count < len(looks))
+    change = any(_part(model, data, pair, looks) for pair, count in seen.items() if count < len(looks))
+    return Contacts(bool(seen), change)
 
 
 def _part(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int], looks: FloatArray) -> bool:

@@ -69,9 +69,12 @@ class ManyStarts(LinearisedWindows):
 
 
 def grows(windows: Windows) -> bool:
-    """Whether windows are searched by their beginnings: bodies that tumble or strike something, starts to estimate."""
-    moves = bool(windows.num_start and windows.starts_measured)
-    return moves and (windows.strikes or bool(windows.simulator.environment.poses))
+    """Whether windows are searched by their beginnings: bodies that tumble or strike something, starts to estimate.
+
+    A body that flies and touches nothing moves as smoothly as joints do.
+    """
+    moves, contacts = bool(windows.num_start and windows.starts_measured), windows.contacts
+    return moves and (contacts.change or (contacts.touch and bool(windows.simulator.environment.poses)))
 
 
 def first_horizon(windows: Windows, tuning: GrowingTuning) -> int:

@@ -14,7 +14,7 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.simulation.contacts import contacts_change, may_touch
+from sipe_bayes.simulation.contacts import contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 BOUNCE = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
@@ -43,17 +43,17 @@ def test_a_contact_that_comes_and_goes_is_seen(simulator: Simulator) -> None:
     """Not one that always is, and none where nothing may touch."""
     high, low = (np.tile(simulator.default_state(), (50, 1)) for _ in range(2))
     high[:, 1], low[:, 1] = 0.2, 0.02
-    assert contacts_change(simulator, [high, low])
-    assert not contacts_change(simulator, [high])
-    assert not contacts_change(simulator, [low])
+    assert contacts_along(simulator, [high, low]).change
+    assert not contacts_along(simulator, [high]).touch
+    assert not contacts_along(simulator, [low]).change
     resting = low.copy()
     resting[:, 1] = 0.03 + 0.0005 * np.random.default_rng(2).standard_normal(50)  # noise of what lies on the floor
-    assert not contacts_change(simulator, [resting])
+    assert not contacts_along(simulator, [resting]).change
     off = BOUNCE.replace('cone="elliptic"/>', 'cone="elliptic"><flag contact="disable"/></option>')
     assert not may_touch(mujoco.MjModel.from_xml_string(off))
     free = BOUNCE.replace('type="sphere"', 'type="sphere" contype="0" conaffinity="0"')
     apart = Simulator(MjcfEnvironment.build(free, [DAMPRATIO], [], ["joint:z.position"]), num_threads=1)
-    assert not contacts_change(apart, [high, low])
+    assert not contacts_along(apart, [high, low]).change
 
 
 def test_a_ball_on_a_slide_that_bounces(simulator: Simulator) -> None:
