@@ -8,7 +8,6 @@ import pytest
 from sipe_bayes.core.rotations import between, quaternions
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.starts import estimate_states, smoothed, smoothed_rotations, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
@@ -118,7 +117,7 @@ def test_how_a_ball_is_turned_does_not_matter(measured: tuple[str, ...], joints:
     simulator = Simulator(environment, num_threads=1)
     logs, _ = tosses(simulator, 1, 5, seed=0)
     assert unmeasured_joints(simulator, logs) == joints
-    assert grows(Windows(Segments(None), simulator, logs)) is not bool(joints)
+    assert Windows(Segments(None), simulator, logs).starts_measured is not bool(joints)
 
 
 def test_the_sensors_that_read_bodies_are_the_models() -> None:

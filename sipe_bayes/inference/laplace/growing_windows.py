@@ -73,8 +73,9 @@ def grows(windows: Windows) -> bool:
 
     A body that flies and touches nothing moves as smoothly as joints do.
     """
-    moves, contacts = bool(windows.num_start and windows.starts_measured), windows.contacts
-    return moves and (contacts.change or (contacts.touch and bool(windows.simulator.environment.poses)))
+    if not (windows.num_start and windows.starts_measured):
+        return False
+    return windows.contacts.change or (windows.contacts.touch and bool(windows.simulator.environment.poses))
 
 
 def first_horizon(windows: Windows, tuning: GrowingTuning) -> int:
