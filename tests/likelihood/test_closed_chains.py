@@ -22,7 +22,7 @@ LINKAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldb
   <geom type="capsule" fromto="0 0 0 .25 0 .15" size=".01" mass=".2" contype="0" conaffinity="0"/></body></body>
 <body name="rocker" pos=".35 0 -.05"><joint name="rocker" axis="0 1 0"/>
  <geom type="capsule" fromto="0 0 0 0 0 .2" size=".012" mass=".4" contype="0" conaffinity="0"/></body>
-</worldbody><equality>{equality}</equality>
+<body name="hand" mocap="true" pos=".35 0 -.05"/></worldbody><equality>{equality}</equality>
 <actuator><motor name="motor" joint="crank" gear=".1"/></actuator></mujoco>"""
 LOOP = '<connect body1="coupler" body2="rocker" anchor=".25 0 .15"/>'
 DAMPING = Parameter("damping", 0.0, 0.05, targets=("joint:crank.damping",))
@@ -86,6 +86,8 @@ def test_a_fit_from_the_crank_alone() -> None:
         (LOOP, set(), []),  # nothing says where the crank is
         (LOOP, {0, 1, 2}, []),
         ("", {0}, []),
+        ('<weld body1="hand" body2="rocker"/>', {0}, []),  # a mocap body goes where no state says
+        ('<weld body1="rocker"/>', {0}, [2]),
         ('<joint joint1="rocker" joint2="crank" polycoef="0 .5 0 0 0"/>', {0}, [2]),
     ],
 )

@@ -40,6 +40,7 @@ class _Chain:
         for kind in kinds:
             self.model.opt.disableflags |= int(kind)
         self.data = mujoco.MjData(self.model)
+        self.data.eq_active[[k for k in range(model.neq) if _of_mocap(model, k)]] = 0  # what it follows no state tells
 
     def at(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (E,) and Jacobian (E, nv) at positions (nq,)."""
@@ -58,6 +59,17 @@ class _Chain:
             if np.abs(step).max() < _TOLERANCE:
                 break
         return out
+
+
+def _of_mocap(model: mujoco.MjModel, equality: int) -> bool:
+    """Whether a constraint ties something to a mocap body."""
+    ids = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
+    kind = int(model.eq_objtype[equality])
+    if kind == int(mujoco.mjtObj.mjOBJ_SITE):
+        ids = [int(model.site_bodyid[i]) for i in ids]
+    elif kind != int(mujoco.mjtObj.mjOBJ_BODY):
+        return False
+    return bool((model.body_mocapid[ids] >= 0).any())
 
 
 def told_by_chains(model: mujoco.MjModel, known: Collection[int]) -> list[int]:
