@@ -64,6 +64,10 @@ class ImportanceTuning(Options):
     kernels: int = option(60, "kernels of the posterior", least=2)
     narrower: float = option(0.5, "width of kernels over Silverman's rule, for the bounds' sake", above=0, below=1)
 
+    def width(self, size: int) -> float:
+        """Of later proposals over the draws' in ``size`` dimensions."""
+        return float(1 + self.wider / np.sqrt(size))
+
 
 @dataclass(frozen=True)
 class Draws:
@@ -185,12 +189,8 @@ def draw(
 
     Of several normals it is about the one whose draws have the most mass each.
     """
-    if draws.batches:
-        share, (mean, covariance) = tuning.share, _moments(draws, normals, prior, tuning)
-    else:
-        share, mean = tuning.first_share, normals.means.numpy()[0]
-        covariance = tuning.first_wider**2 * normals.covariances.numpy()[0]
-    return drawn_from(draws, target, mean, covariance, share, prior, seed, tuning)
+    mean, covariance = _moments(draws, normals, prior, tuning)
+    return drawn_from(draws, target, mean, covariance, tuning.share, prior, seed, tuning)
 
 
 def drawn_from(
@@ -313,5 +313,4 @@ def _moments(
     number, mean = effective(weight), weight @ points
     trust = number / (number + 2 * points.shape[1])
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
-    width = 1 + tuning.wider / np.sqrt(points.shape[1])
-    return mean, width**2 * (trust * covariance + (1 - trust) * base)
+    return mean, tuning.width(points.shape[1]) ** 2 * (trust * covariance + (1 - trust) * base)

@@ -13,7 +13,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.internal.closed_chains import close, known_joints, told_by_chains
+from sipe_bayes.envs.internal.closed_chains import close, dependent_joints, known_joints
 from sipe_bayes.envs.internal.states import joints_at_rest
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
@@ -58,9 +58,9 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
     for joint in inertial_joints(model, readings):
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
-    told = told_by_chains(model, known_joints(model, measured))
-    if told:
-        close(model, states, simulator.default_state(), told)
+    dependent = dependent_joints(model, known_joints(model, measured))
+    if dependent:
+        close(model, states, simulator.default_state(), dependent)
     return states
 
 
@@ -177,7 +177,7 @@ def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[
     columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
     known_poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
     placed = {r.joint for r in environment.poses if r.quantity == "position" and r.at_origin}
-    chained = told_by_chains(model, known_joints(model, columns))
+    chained = dependent_joints(model, known_joints(model, columns))
     missing, resting = [], {*joints_at_rest(model), *inertial_joints(model, environment.poses), *chained}
     for joint in (joint for joint in range(model.njnt) if joint not in resting):
         if has_pose(model, joint):

@@ -178,7 +178,7 @@ class Fitting:
             windows, best = Windows(self.likelihood, simulator, self.holdout), optimum.best
             both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         except BudgetTooSmall:
-            return None, most
+            return None, most  # so many at most
         except ValueError:  # LinAlgError is one
             return -np.inf, 0
         short = best.finding is not None and best.finding.code is Code.SEARCH_CUT_SHORT

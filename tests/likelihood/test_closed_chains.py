@@ -8,7 +8,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.internal.closed_chains import told_by_chains
+from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments
@@ -80,7 +80,7 @@ def test_a_fit_from_the_crank_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("equality", "known", "told"),
+    ("equality", "known", "dependent"),
     [
         (LOOP, {0}, [1, 2]),
         (LOOP, set(), []),  # nothing says where the crank is
@@ -91,6 +91,6 @@ def test_a_fit_from_the_crank_alone() -> None:
         ('<joint joint1="rocker" joint2="crank" polycoef="0 .5 0 0 0"/>', {0}, [2]),
     ],
 )
-def test_which_joints_a_chain_tells(equality: str, known: set[int], told: list[int]) -> None:
+def test_which_joints_follow_from_the_known_ones(equality: str, known: set[int], dependent: list[int]) -> None:
     model = mujoco.MjModel.from_xml_string(LINKAGE.format(equality=equality))
-    assert told_by_chains(model, known) == told
+    assert dependent_joints(model, known) == dependent

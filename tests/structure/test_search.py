@@ -144,6 +144,22 @@ def test_what_rests_has_neither_sign_nor_unit() -> None:
         assert (unexplained(windows, windows.spread, moving(windows)) > 0) == expected
 
 
+def test_columns_that_are_tried_in_vain_count() -> None:
+    """A log of which no unit or sign explains enough: rollouts go on from what the trials took."""
+    moves, done = log(pendulum(), [0.6, 0.08], 4), list[int]()
+    noise = 0.5 * np.sin(7 * moves.dt * np.arange(len(moves.observations)))[:, None]
+    structures = discover(
+        pendulum(),
+        Trajectories.stack([replace(moves, observations=noise)]),
+        restriction=Restriction(only=("delay",)),
+        options=DiscoverOptions(column_gain=1e9),
+        progress=lambda _, rollouts, __: done.append(rollouts),
+    )
+    assert not structures.state.columns
+    assert done == sorted(done)
+    assert structures.rollouts >= done[-1] > 500
+
+
 @pytest.mark.parametrize("same", [True, False])
 def test_held_out_logs_speak_against_what_only_one_log_has(same: bool) -> None:
     """A machine that rubbed on one day and not on the other: friction is no part of it."""

@@ -274,7 +274,7 @@ def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[floa
     """
     left = fit(trial, assumption, _FIRST_DELAYS, rounds)
     misses = trial.misses([replace(assumption, delay=left.best)], left.theta)
-    return float(followed(misses).sum()), left.theta
+    return float(followed(misses[0])), left.theta
 
 
 def _with_evidence(

@@ -66,21 +66,9 @@ _LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel
 _PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
 _POSITIONS = _ANGLES | _LENGTHS | _PLACES
 _ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # velocities of a body
-_SPEEDS = {
-    "velocity",
-    "velocities",
-    "vel",
-    "speed",
-    "omega",
-    "w",
-    "qvel",
-    "rate",
-    "gyro",
-    "v",
-    "xv",
-    "av",
+_SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
     "angvel",
-} | (_ALONG | _ABOUT)
+} | _ALONG | _ABOUT  # fmt: skip
 _ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"} | {
     "ax", "ay", "az",
 }  # fmt: skip

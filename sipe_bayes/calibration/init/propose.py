@@ -46,7 +46,7 @@ from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
-from sipe_bayes.envs.internal.closed_chains import told_by_chains
+from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.likelihood.starts import estimate_states
 
@@ -169,7 +169,7 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
     measured = {m.target for m in (*matches.positions, *matches.velocities, *matches.vectors)}
     owners = {target.rpartition(".")[0] for target in measured}
     known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}" in owners}
-    chained = {model.joint(joint).name for joint in told_by_chains(model, known)}
+    chained = {model.joint(joint).name for joint in dependent_joints(model, known)}
     blind = [j.name for j in machine.joints if f"joint:{j.name}" not in owners and j.name not in chained]
     posed = [] if _is_felt(machine, matches) else [j for j in range(model.njnt) if has_pose(model, j)]
     blind += [pose for j in posed for pose in _poses(model, j) if f"body:{pose}" not in measured]

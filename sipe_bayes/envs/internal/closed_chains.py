@@ -1,14 +1,14 @@
-"""Joints that nothing measures and that a closed chain tells: a four-bar linkage's rocker, a gripper's second finger.
+"""Dependent joints of closed chains, which nothing measures: a four-bar linkage's rocker, a gripper's second finger.
 
 Where equality constraints (connect, weld, joint, tendon) tie hinges and slides to measured ones, their positions are
 solved from sample to sample by Gauss-Newton steps of the constraints' residuals, and their velocities by the
 constraints' Jacobian,
 
-    J_o dq_o = -r,    J_o v_o = -J_m v_m,    with o the open joints and m all others.
+    J_o dq_o = -r,    J_o v_o = -J_m v_m,    with o the dependent joints and m all others.
 
 The first sample is come to from the reset state, where the chain is assembled, in steps of the measured joints, so that
-the branch of the mechanism is the model's. Which joints a chain tells is asked there: those that no motion with
-the measured ones at rest moves.
+the branch of the mechanism is the model's. Which joints are dependent is asked there: those that no motion with the
+measured ones at rest moves.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class _Chain:
         return self.data.efc_pos[:count].copy(), self.data.efc_J.reshape(-1, self.model.nv)[:count].copy()
 
     def closed(self, position: FloatArray, columns: IntArray, dofs: IntArray) -> FloatArray:
-        """Positions (nq,) of which the open ``columns`` close the chain; ``dofs`` are theirs."""
+        """Positions (nq,) of which the dependent ``columns`` close the chain; ``dofs`` are theirs."""
         out = position.copy()
         for _ in range(_MOST):
             residual, jacobian = self.at(out)
@@ -72,8 +72,8 @@ def _of_mocap(model: mujoco.MjModel, equality: int) -> bool:
     return bool((model.body_mocapid[ids] >= 0).any())
 
 
-def told_by_chains(model: mujoco.MjModel, known: Collection[int]) -> list[int]:
-    """Ids of the hinges and slides that nothing measures and a closed chain tells.
+def dependent_joints(model: mujoco.MjModel, known: Collection[int]) -> list[int]:
+    """Ids of the hinges and slides that nothing measures and that closed chains tie to what is known.
 
     known: ids of the joints that are measured, or of which the model says where they start.
     """
@@ -88,11 +88,11 @@ def told_by_chains(model: mujoco.MjModel, known: Collection[int]) -> list[int]:
 
 
 def narrowed(model: mujoco.MjModel, columns: Collection[int | None], sd: FloatArray) -> FloatArray:
-    """Prior sds (2 nv + na,) of a window's start with those of joints that chains tell.
+    """Prior sds (2 nv + na,) of a window's start with those of dependent joints.
 
     columns: of the state, that channels measure.
     """
-    dofs = model.jnt_dofadr[told_by_chains(model, known_joints(model, columns))]
+    dofs = model.jnt_dofadr[dependent_joints(model, known_joints(model, columns))]
     out = sd.copy()
     out[dofs], out[model.nv + dofs] = SD, 10 * SD
     return out

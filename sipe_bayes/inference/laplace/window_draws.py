@@ -99,10 +99,10 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
             return Probe(judged=False)
     if stands and not beyond:
         return Probe(stands=True)
-    wider = tuning.first_wider if len(shared) == 1 else 1 + tuning.wider / np.sqrt(n)
-    around = [best] if len(shared) == 1 else shared
-    first = [(one.mean, wider**2 * one.covariance) for one in around]
-    first += proposals(beyond, best.covariance)
+    if len(shared) > 1:
+        first = [(one.mean, tuning.width(n) ** 2 * one.covariance) for one in shared]
+    else:
+        first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(beyond, best.covariance)]
     draws = Draws.none(n)
     for mean, covariance in first:
         if not windows.has_room(draw_size(problem, windows, kept)):

@@ -177,6 +177,16 @@ def test_what_can_not_be_matched_is_refused(tmp_path: Path, columns: dict[str, l
     assert not (tmp_path / "calibrate.toml").exists()
 
 
+def test_a_log_too_slow_to_be_simulated_tells_no_unit(tmp_path: Path) -> None:
+    """At 5 Hz, a hundred physics steps a sample, nothing is simulated: names stand, and it says so."""
+    (tmp_path / "model.xml").write_text(PENDULUM.replace('timestep="0.004"', 'timestep="0.002"'))
+    time = 0.2 * np.arange(100)
+    table = {"time": time, "angle": 30 * np.sin(time), "torque": 0.1 * np.cos(time)}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    assert any("stand on names alone" in doubt for doubt in draft.open_doubts), draft.open_doubts
+
+
 def test_angles_that_come_round_are_written_on(tmp_path: Path) -> None:
     time = np.arange(400) * 0.01
     angle = 9.0 * np.sin(0.9 * time)

@@ -14,8 +14,9 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.simulation.contacts import contacts_along, may_touch
+from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.bodies import cube, tosses
 
 BOUNCE = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
   <geom name="floor" type="plane" size="3 3 .1" solref=".012 1"/>
@@ -45,7 +46,7 @@ def test_a_contact_that_comes_and_goes_is_seen(simulator: Simulator) -> None:
     high[:, 1], low[:, 1] = 0.2, 0.02
     assert contacts_along(simulator, [high, low]).change
     assert not contacts_along(simulator, [high]).touch
-    assert not contacts_along(simulator, [low]).change
+    assert contacts_along(simulator, [low]) == Contacts(touch=True, change=False)
     resting = low.copy()
     resting[:, 1] = 0.03 + 0.0005 * np.random.default_rng(2).standard_normal(50)  # noise of what lies on the floor
     assert not contacts_along(simulator, [resting]).change
@@ -54,6 +55,16 @@ def test_a_contact_that_comes_and_goes_is_seen(simulator: Simulator) -> None:
     free = BOUNCE.replace('type="sphere"', 'type="sphere" contype="0" conaffinity="0"')
     apart = Simulator(MjcfEnvironment.build(free, [DAMPRATIO], [], ["joint:z.position"]), num_threads=1)
     assert not contacts_along(apart, [high, low]).change
+
+
+def test_a_free_body_that_touches_nothing_has_no_impacts() -> None:
+    """A cube's flight is searched as joints' motions are; the same cube's landing by beginnings that grow."""
+    flying = cube()
+    for steps, landed in ((20, False), (120, True)):
+        logs, _ = tosses(flying, 2, steps, seed=1)
+        windows = Windows(Segments(None), flying, logs)
+        assert windows.contacts.touch == landed
+        assert grows(windows) == landed
 
 
 def test_a_ball_on_a_slide_that_bounces(simulator: Simulator) -> None:
