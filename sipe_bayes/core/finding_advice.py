@@ -75,6 +75,11 @@ ADVICE: dict[Code, str] = {
         "Two searches ended in trajectories that exclude each other. Give `search.restarts` and a larger `budget`, cut "
         "the logs shorter, measure velocities, or begin near a value that you trust."
     ),
+    Code.NOISE_EXCEEDS_SCATTER: (
+        "White noise scatters from one sample to the next as much as in all; this does not. Look at the channel's "
+        "residuals. Of a model that is right: give `search.restarts` and a larger `budget`, or cut the logs shorter. "
+        "Else see what `sipe discover` finds."
+    ),
     Code.NOT_JUDGED: "Raise `budget`: simulating 120 draws from the posterior takes as many rollouts of each log.",
     Code.SEARCHED_ON_PARTS: (
         "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "

@@ -141,6 +141,11 @@ class Code(Enum):
         "another start of the search ended {distance:.0f} sds away, where process noise explains so much of the logs "
         "that it may be as right: do not rely on the intervals"
     )
+    NOISE_EXCEEDS_SCATTER = blocking(
+        "what is taken for noise of {channel} is {ratio:.1f} times as large as its scatter from sample to sample: the "
+        "fit does not follow it, as in a wrong valley between contacts or where the model lacks something: do not rely "
+        "on the intervals"
+    )
     NOT_JUDGED = blocking(
         "the budget left no room to see whether the posterior is the normal that the intervals are taken from: raise it"
     )

@@ -132,6 +132,10 @@ class Thresholds(Options):
         1e-3, "below it two starts of a search that ended as far apart would contradict each other", "probability"
     )
 
+    noise_excess: float = option(
+        2.0, "fitted noise that is so much larger than a channel's scatter from sample to sample is none", "of that"
+    )
+
     # searches
     search_wide: float = option(
         0.15, "a search whose distribution is wider was cut short: half of a uniform prior's sd", "sd, of the range"

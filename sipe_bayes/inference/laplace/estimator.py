@@ -12,6 +12,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
@@ -19,8 +20,10 @@ from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
+from sipe_bayes.inference.laplace.state_space.noise import excess
 from sipe_bayes.inference.laplace.state_space.noise_average import averaged
 from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
+from sipe_bayes.inference.laplace.state_space.several_linearisations import linearisations_cost, scattered
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
@@ -90,7 +93,7 @@ class Laplace(Estimator[LaplaceState]):
         """So many that each starting point may be followed to the end: it grows with logs and unknowns."""
         each = _STEPS * (len(self.space) + self._num_start + _TRIALS)
         if isinstance(self.likelihood, StateSpace):
-            each += draws_size(len(self.space), self.problem)
+            each += draws_size(len(self.space), self.problem) + linearisations_cost(self.problem, self._num_start)
             each += self.options.tuning.state_space.shooting.all_room if self._num_start else 0
         return max(self.default_budget, each * len(trajectories))
 
@@ -159,7 +162,8 @@ class Laplace(Estimator[LaplaceState]):
         linearised = 2 * (windows.num_theta + windows.num_start) + 1
         each = self.options.tuning.importance.judges + linearised
         judges, logs = each * len(distinct(state.search.optima)), len(windows.trajectories)
-        shares = [(judges + draws_size(len(self.space), self.problem)) * logs, judges * logs]
+        later = linearisations_cost(self.problem, windows.num_start) + draws_size(len(self.space), self.problem)
+        shares = [(judges + later) * logs, judges * logs]
         return next((one for one in shares if one < self.options.tuning.importance.most_share * self.budget), 0)
 
     def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
@@ -211,8 +215,9 @@ class Laplace(Estimator[LaplaceState]):
             assert isinstance(optimum, ChainOptimum)
             try:
                 fit = ChainFit.at(chain, optimum)
-                search = search.with_optimum(replace(optimum, averaged=averaged(self.problem, chain, fit)))
-                held = mixture([replace(optimum, averaged=None)], self.space)
+                whole = replace(optimum, averaged=averaged(self.problem, chain, fit))
+                search = search.with_optimum(whole.beside_scatter(excess(chain, optimum.sd), chain.fitted))
+                held = mixture([optimum.as_linearised], self.space)
                 target = ChainTarget(self.prior, chain, fit)
                 judgements.append(importance.judged(target, held, self.seed, tuning, steps))
                 targets.append(target)
@@ -222,16 +227,24 @@ class Laplace(Estimator[LaplaceState]):
         return replace(state, search=search, judgements=tuple(judgements)), targets[0] if targets else None
 
     def _looked_beyond(self, chain: Chain, state: LaplaceState, target: ChainTarget | None) -> LaplaceState:
-        """The end of a fit of a chain: with draws where the normal of its only optimum is not the posterior."""
-        kept, ended = distinct(state.search.optima), replace(state, done=True, looked=True)
-        if len(kept) > 1 or not state.judgements:
-            return ended
-        assert isinstance(kept[0], ChainOptimum)
+        """The end of a fit of a chain: by several linearisations, and with draws where an only normal does not stand.
+
+        target: the best optimum's, where it is at hand.
+        """
+        assert not isinstance(state.search, WindowState)
+        search, kept, ended = state.search, distinct(state.search.optima), replace(state, done=True, looked=True)
         try:
-            target = target or ChainTarget(self.prior, chain, ChainFit.at(chain, kept[0]))
+            for one in kept[: len(state.judgements)]:
+                assert isinstance(one, ChainOptimum)
+                if target is None or one is not kept[0]:
+                    target = ChainTarget(self.prior, chain, ChainFit.at(chain, one))
+                search = search.with_optimum(scattered(self.problem, target, one))
         except BudgetExhausted:
             chain.short = True
-            return replace(ended, unjudged=True)
+            return replace(ended, search=search, unjudged=True)
+        ended = replace(ended, search=search)
+        if target is None or len(kept) > 1:
+            return ended
         look = looked_beyond(self.problem, target, state.judgements[0].normal)
         return replace(ended, draws=look.draws, unjudged=not look.judged)
 
@@ -280,7 +293,8 @@ class Laplace(Estimator[LaplaceState]):
             return normals
         wider = blur(kept[0].covariance, kept[0].spread) if isinstance(kept[0], ChainOptimum) else 0.0
         own = mixture(sharing(kept, self.problem), self.space)
-        return importance.kernels(draws.points, weight, own, self.seed, tuning, wider)
+        points = np.clip(draws.points + kept[0].centre - kept[0].mean, 0.0, 1.0)
+        return importance.kernels(points, weight, own, self.seed, tuning, wider)
 
     def _report(self, kept: list[Optimum], state: LaplaceState, drawn: bool) -> None:
         """Diagnostics of the best optimum, and what is to be said against any that is kept.
@@ -293,6 +307,8 @@ class Laplace(Estimator[LaplaceState]):
             self.diagnostics |= best.diagnostics()
             if not best.settled:
                 self.find(Code.PROCESS_NOISE_UNSETTLED)
+            if best.excess > THRESHOLDS.noise_excess:
+                self.find(Code.NOISE_EXCEEDS_SCATTER, channel=best.noisiest, ratio=best.excess)
             self.diagnostics["pareto_k"] = [one.pareto_k for one in state.judgements]
             for one in state.judgements:
                 if not one.normal and not drawn:
@@ -345,7 +361,7 @@ class Laplace(Estimator[LaplaceState]):
         kept = [] if self.state is None else distinct(self.state.search.optima)
         if not kept:
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        prior, mean, total = QuadraticPrior.of(self.prior), kept[0].mean, np.linalg.inv(kept[0].spread)
+        prior, mean, total = QuadraticPrior.of(self.prior), kept[0].centre, np.linalg.inv(kept[0].spread)
         flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T

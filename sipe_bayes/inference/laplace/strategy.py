@@ -46,6 +46,11 @@ class Optimum:
     tau: FloatArray
 
     @property
+    def centre(self) -> FloatArray:
+        """Mean (N,) of the posterior, before truncation."""
+        return self.mean
+
+    @property
     def spread(self) -> FloatArray:
         """Covariance (N, N) of the posterior, before truncation."""
         return self.covariance
@@ -192,7 +197,7 @@ def mixture(optima: Sequence[Optimum], space: ParameterSpace) -> GaussianMixture
     """The optima's normals truncated to the cube, weighted by their evidence."""
     evidence = np.array([one.evidence for one in optima])
     weights = torch.from_numpy(evidence - evidence.max())
-    means, covariances = np.stack([o.mean for o in optima]), np.stack([o.spread for o in optima])
+    means, covariances = np.stack([o.centre for o in optima]), np.stack([o.spread for o in optima])
     return GaussianMixture(weights, means, covariances, space)
 
 

@@ -88,8 +88,12 @@ class ChainOptimum(Optimum):
         point: number of the starting point.
         absorbed: squares of the jumps over their variance: numbers of the log that process noise explains.
         rough: whether some step jumps by more than its process noise within the differences.
+        excess: the largest of ``sd`` over a channel's scatter from sample to sample, which is that of ``noisiest``;
+            zero before the judges.
         averaged: covariance (N, N) with the noise integrated out; ``covariance`` holds it, as the judges of the normal
             do. None before the judges.
+        shift: (N,), of the mean by several linearisations; None where they are not asked.
+        scatter: (N, N), what they add to its covariance.
     """
 
     states: FloatArray
@@ -103,12 +107,32 @@ class ChainOptimum(Optimum):
     point: int
     absorbed: float = 0.0
     rough: bool = False
+    excess: float = 0.0
+    noisiest: str = ""
     averaged: FloatArray | None = None
+    shift: FloatArray | None = None
+    scatter: FloatArray | None = None
+
+    @property
+    def centre(self) -> FloatArray:
+        """By several linearisations, where they scatter."""
+        return self.mean if self.shift is None else self.mean + self.shift
 
     @property
     def spread(self) -> FloatArray:
-        """Averaged over the noise, once it is."""
-        return self.covariance if self.averaged is None else self.averaged
+        """Averaged over the noise, once it is, and with the scatter of linearisations."""
+        narrow = self.covariance if self.averaged is None else self.averaged
+        return narrow if self.scatter is None else narrow + self.scatter
+
+    @property
+    def as_linearised(self) -> ChainOptimum:
+        """By its own linearisation and noise alone, which draws are held against."""
+        return replace(self, averaged=None, shift=None, scatter=None)
+
+    def beside_scatter(self, excess: FloatArray, channels: Sequence[str]) -> Self:
+        """With the largest of the channels' excesses (C,), and its name."""
+        worst = int(excess.argmax())
+        return replace(self, excess=float(excess[worst]), noisiest=channels[worst])
 
     @property
     def noise(self) -> ChainNoise:

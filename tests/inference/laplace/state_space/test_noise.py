@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.findings import Code
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace import estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, first_noise, infer_noise
+from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, excess, first_noise, infer_noise
 from sipe_bayes.inference.laplace.state_space.options import ChainTuning, NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.likelihood.binding import bind
@@ -50,6 +51,38 @@ def test_what_no_noise_makes_solvable_is_an_error() -> None:
     negative = replace(linear, precision=np.full_like(linear.precision, -1e12))
     with pytest.raises(np.linalg.LinAlgError):
         solvable(negative, ChainNoise(np.array([0.01]), np.full(4, 1e-4)))
+
+
+def test_noise_is_held_against_the_scatter_of_its_channel() -> None:
+    """One of white noise, within a third; ten where a wave is taken for noise; none of one that was given."""
+    rng, clean = np.random.default_rng(0), np.zeros((200, 1))
+    noisy = Trajectory(clean + 0.02 * rng.standard_normal(clean.shape), np.zeros((199, 1)), 0.02)
+    chain = bind(StateSpace(), spring(), Trajectories.stack(noisy))
+    assert excess(chain, np.array([0.02]))[0] == pytest.approx(1.0, rel=0.33)
+    assert excess(chain, np.array([0.2]))[0] == pytest.approx(10.0, rel=0.33)
+    given = bind(StateSpace(noise_sd=(0.02,)), spring(), Trajectories.stack(noisy))
+    assert excess(given, np.array([0.2]))[0] == 0.0
+
+
+def test_a_channel_that_mostly_rests_scatters_by_its_steps() -> None:
+    """An encoder that counts now and then has no median step; its noise is what its steps show."""
+    counts = np.floor(np.arange(200) / 25.0)[:, None] / 100
+    chain = bind(StateSpace(), spring(), Trajectories.stack(Trajectory(counts, np.zeros((199, 1)), 0.02)))
+    assert 0.3 < excess(chain, np.array([0.01 / np.sqrt(12)]))[0] < 3.0
+
+
+def test_a_fit_that_takes_much_else_for_noise_is_blocked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the noise is four times the scatter, and not where it is the scatter."""
+    logs = spring_logs()
+
+    def codes() -> set[Code]:
+        fit = Laplace(spring(), likelihood=StateSpace(), restarts=1, candidates=0)
+        fit.fit(logs)
+        return {one.code for one in fit.findings}
+
+    assert Code.NOISE_EXCEEDS_SCATTER not in codes()
+    monkeypatch.setattr(estimator, "excess", lambda chain, sd: 4.0 * excess(chain, sd))
+    assert Code.NOISE_EXCEEDS_SCATTER in codes()
 
 
 def test_given_noise_is_kept_and_process_noise_shrinks_where_the_model_is_right() -> None:
