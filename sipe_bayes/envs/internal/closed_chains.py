@@ -22,7 +22,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.envs.internal.states import joints_at_rest
 
-SD = 0.01  # rad or m, and ten times as much a second: how far from closed a window may start
+SD = 0.1  # rad or m, and ten times as much a second: how far from closed a window may start, a noisy crank included
 _STEP, _MOST, _TOLERANCE, _APART, _HARDLY = 0.05, 30, 1e-10, 1e-6, 1e-3
 
 
