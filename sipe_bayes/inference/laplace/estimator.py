@@ -93,14 +93,19 @@ class Laplace(Estimator[LaplaceState]):
         """So many that each starting point may be followed to the end: it grows with logs and unknowns."""
         each = _STEPS * (len(self.space) + self._num_start + _TRIALS)
         if isinstance(self.likelihood, StateSpace):
-            each += draws_size(len(self.space), self.problem) + linearisations_cost(self.problem, self._num_start)
+            each += draws_size(len(self.space), self.problem) + linearisations_cost(self.problem, self._coordinates)
             each += self.options.tuning.state_space.shooting.all_room if self._num_start else 0
         return max(self.default_budget, each * len(trajectories))
 
     @property
     def _num_start(self) -> int:
         """D, unknowns of a start."""
-        if not isinstance(self.simulator, Simulator) or self.likelihood.starts == "recorded":
+        return 0 if self.likelihood.starts == "recorded" else self._coordinates
+
+    @property
+    def _coordinates(self) -> int:
+        """D, of a state; of a callable's none."""
+        if not isinstance(self.simulator, Simulator):
             return 0
         return len(self.simulator.environment.start_sd(self.simulator.model))
 

@@ -215,16 +215,14 @@ def likeliest_share(
 def excess(chain: Chain, sd: FloatArray) -> FloatArray:
     """Fitted noise sds (C,) over each channel's scatter from sample to sample; zero where they were given.
 
-    Of a channel that rests for more than half of the log, its steps count too.
+    A channel that rests for more than half of the log, as a slow encoder does, scatters by its usual step: a count's
+    error is even over that.
     """
     scatter = roughness(chain)
-    resting = scatter <= chain.least[0]
-    series = np.where(chain.observed, chain.measured, np.nan)[:, resting]
-    within = chain.linked[2:] & chain.linked[1:-1] & chain.linked[:-2]
-    third = np.diff(series, n=3, axis=0)[within]
-    if third.size:
-        steps = np.where(np.isfinite(third), third, 0.0)
-        scatter[resting] = np.sqrt((steps**2).sum(0) / np.maximum(np.isfinite(third).sum(0), 1) / 20)
+    steps = np.abs(np.diff(np.where(chain.observed, chain.measured, np.nan), axis=0)[chain.linked])
+    for c in np.flatnonzero(scatter <= chain.least[0]):
+        moved = steps[steps[:, c] > chain.least[0][c], c]
+        scatter[c] = np.median(moved) / np.sqrt(12) if len(moved) else 0.0
     return np.where(np.isnan(chain.fixed_sd), sd / np.maximum(scatter, chain.least[0]), 0.0)
 
 

@@ -79,8 +79,8 @@ class WideTuning(Options):
     least_theta_step: float = option(1e-4, "shortest difference by theta: rounding", "of the cube", above=0)
     most_theta_step: float = option(0.1, "longest one: a line is none across the cube", "of the cube", above=0)
     least_state_step: float = option(1e-6, "shortest difference by states: rounding", "rad or m, and a second", above=0)
-    linearisations: int = option(10, "taken about an optimum through contact, for the scatter of its mean", least=0)
     most_state_step: float = option(0.3, "longest one: a line is none across a step", "of the movement", above=0)
+    linearisations: int = option(10, "taken about an optimum through contact, for the scatter of its mean", least=0)
 
 
 @dataclass(frozen=True)
