@@ -17,17 +17,25 @@ SMALL = {**quick.SMALL, "bayessim": {"components": 2, "calibration": 0.0}}
 
 @pytest.mark.parametrize("name", ["laplace", "mcmc", "npe", "bayessim"])
 def test_the_linear_gaussian_posterior(name: str) -> None:
-    """Mean to 0.4 sd, sds to 25 %, the correlation to 0.15, of 2,000 simulations or rollouts."""
-    problem = carts_problem if name in ("laplace", "mcmc") else function_problem
+    """Mean to 0.4 sd, sds to 25 %, the correlation to 0.15, of 2,000 simulations or rollouts.
+
+    Of a trained method the average over three trainings: the means of one scatter by 0.2 sd (twelve seeds of npe) and
+    differ from processor to processor, so that one alone fails in a sixth of all cases, the average in one of 400.
+    """
+    seeds, problem = (1, carts_problem) if name in ("laplace", "mcmc") else (3, function_problem)
     simulator, log, exact, likelihood = problem()
-    estimator = get_estimator(simulator, name, budget=2000, seed=0, likelihood=likelihood, **SMALL.get(name, {}))
-    posterior = estimator.fit(log)
-    sd, found = exact.stddev.numpy(), posterior.covariance.numpy()
-    true = exact.covariance.numpy()
-    print(name, (posterior.mean - exact.mean).numpy() / sd, posterior.stddev.numpy() / sd)
-    np.testing.assert_array_less(np.abs((posterior.mean - exact.mean).numpy()), 0.4 * sd)
-    np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=0.25)
-    correlation = found[0, 1] / np.sqrt(found[0, 0] * found[1, 1]), true[0, 1] / np.sqrt(true[0, 0] * true[1, 1])
+    settings = SMALL.get(name, {})
+    posteriors = [
+        get_estimator(simulator, name, budget=2000, seed=seed, likelihood=likelihood, **settings).fit(log)
+        for seed in range(seeds)
+    ]
+    away = np.mean([(one.mean - exact.mean).numpy() for one in posteriors], axis=0)
+    stddev = np.mean([one.stddev.numpy() for one in posteriors], axis=0)
+    own, sd, true = posteriors[0].covariance.numpy(), exact.stddev.numpy(), exact.covariance.numpy()
+    print(name, away / sd, stddev / sd)
+    np.testing.assert_array_less(np.abs(away), 0.4 * sd)
+    np.testing.assert_allclose(stddev, sd, rtol=0.25)
+    correlation = own[0, 1] / np.sqrt(own[0, 0] * own[1, 1]), true[0, 1] / np.sqrt(true[0, 0] * true[1, 1])
     assert abs(true[0, 1]) / np.sqrt(true[0, 0] * true[1, 1]) > 0.6
     assert abs(correlation[0] - correlation[1]) < 0.15, correlation
 
