@@ -38,7 +38,7 @@ from sipe_bayes.likelihood.starts import (
     with_history,
 )
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.contacts import contacts_along
+from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -146,12 +146,20 @@ class Windows:
         self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
         guesses = {k: estimate_states(simulator, trajectories[k]) for k in np.unique(self.log).tolist()}
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
-        self.contacts = contacts_along(simulator, list(guesses.values()))
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt, self.start)
         free = environment.start_sd(simulator.model) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
+
+    @cached_property
+    def contacts(self) -> Contacts:
+        """What bodies touch along the logs."""
+        simulator, logs = self.simulator, [self.trajectories[k] for k in np.unique(self.log).tolist()]
+        if not may_touch(simulator.model):
+            return Contacts()
+        smooth, sampled = ([estimate_states(simulator, log, raw) for log in logs] for raw in (False, True))
+        return contacts_along(simulator, smooth, sampled)
 
     def every_other(self) -> Windows:
         """Every other window, for a rough search; the windows themselves where a log has fewer than four.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +11,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
-_LOOKS = 1000  # samples that are looked at, spread evenly: a bouncing ball touches in one of twenty
+_LOOKS = 2000  # samples that are looked at, spread evenly
 _APART = 0.05  # of the smaller geom's size, that two are apart beyond what noise makes of one that rests on the other
 
 
@@ -30,20 +32,82 @@ class Contacts:
     change: bool = False
 
 
-def contacts_along(simulator: Simulator | CallableSimulator, logs: Sequence[FloatArray]) -> Contacts:
-    """Of the states (T+1, S) along logs."""
+def contacts_along(
+    simulator: Simulator | CallableSimulator, logs: Sequence[FloatArray], sampled: Sequence[FloatArray] | None = None
+) -> Contacts:
+    """Of the states (T+1, S) along logs.
+
+    A body that bounces is seldom seen to touch: between two samples it comes down and goes up again. So two geoms touch
+    as well where they would by the next sample if they went on as they came since the last one.
+
+    Args:
+        simulator: of the model.
+        logs: states by which bodies are apart, smoothed.
+        sampled: the same states not smoothed, by which they touch: smoothing lifts a bounce off the floor.
+    """
     if isinstance(simulator, CallableSimulator) or not may_touch(simulator.model):
         return Contacts()
-    model, states = simulator.model, np.concatenate(list(logs))
-    looks = states[np.linspace(0, len(states) - 1, min(_LOOKS, len(states))).astype(int)]
-    looks, data, seen = looks[np.isfinite(looks).all(1)], mujoco.MjData(model), Counter[tuple[int, int]]()
-    for state in looks:
-        data.qpos[:] = state[1 : 1 + model.nq]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        seen.update({(int(a), int(b)) for a, b in data.contact.geom[data.contact.exclude == 0]})
-    change = any(_part(model, data, pair, looks) for pair, count in seen.items() if count < len(looks))
+    model, data = simulator.model, mujoco.MjData(simulator.model)
+    looks = np.concatenate(list(logs))
+    looks = looks[_spread(len(looks))]
+    looks = looks[np.isfinite(looks).all(1)]
+    seen, count = _touching(model, logs if sampled is None else sampled)
+    change = any(_part(model, data, pair, looks) for pair, number in seen.items() if number < count)
     return Contacts(bool(seen), change)
+
+
+def _spread(count: int) -> IntArray:
+    """Numbers of the samples that are looked at, of ``count``."""
+    return np.linspace(0, count - 1, min(_LOOKS, count)).astype(int)
+
+
+def _touching(model: mujoco.MjModel, logs: Sequence[FloatArray]) -> tuple[Counter[tuple[int, int]], int]:
+    """In how many states each pair of geoms touches, and of how many."""
+    place = np.concatenate([np.maximum(np.arange(len(states)) - 1, 0) for states in logs])
+    first = np.repeat(np.cumsum([0, *map(len, logs[:-1])]), [len(states) for states in logs])
+    states = np.concatenate(list(logs))[:, 1 : 1 + model.nq]
+    now = _spread(len(states))
+    before = (first + place)[now]
+    finite = np.isfinite(states[now]).all(1) & np.isfinite(states[before]).all(1)
+    now, before = now[finite], before[finite]
+    near, data, seen = copy.copy(model), mujoco.MjData(model), Counter[tuple[int, int]]()
+    reach = 2 * max((_step(model, data, states[b], states[n]) for b, n in zip(before, now, strict=True)), default=0.0)
+    near.geom_margin[:], near.geom_gap[:] = model.geom_margin + reach, 0.0
+    near.pair_margin[:], near.pair_gap[:] = model.pair_margin + reach, 0.0
+    last, distances = -1, dict[tuple[int, int], float]()
+    for b, n in zip(before.tolist(), now.tolist(), strict=True):
+        earlier = distances if b == last else _distances(near, data, states[b])
+        last, distances = n, _distances(near, data, states[n])
+        for pair, distance in distances.items():
+            margin = float(model.geom_margin[list(pair)].max())
+            ahead = 2 * distance - earlier.get(pair, math.inf) if b < n else distance
+            if distance <= margin or (math.isfinite(ahead) and ahead <= 0):
+                seen[pair] += 1
+    return seen, len(now)
+
+
+def _step(model: mujoco.MjModel, data: mujoco.MjData, before: FloatArray, now: FloatArray) -> float:
+    """How far any geom's surface moves between two positions (nq,), at most."""
+    places, turns = [], []
+    for position in (before, now):
+        data.qpos[:] = position
+        mujoco.mj_kinematics(model, data)
+        places.append(data.geom_xpos.copy())
+        turns.append(data.geom_xmat.copy())
+    moved = np.linalg.norm(places[1] - places[0], axis=1)
+    turned = np.linalg.norm(turns[1] - turns[0], axis=1) / math.sqrt(2)  # a small angle; of a large one, less
+    return float((moved + turned * model.geom_rbound).max(initial=0.0))
+
+
+def _distances(near: mujoco.MjModel, data: mujoco.MjData, position: FloatArray) -> dict[tuple[int, int], float]:
+    """Least distance of each pair of geoms that is nearer than the model's margins, at positions (nq,)."""
+    data.qpos[:] = position
+    mujoco.mj_kinematics(near, data)
+    mujoco.mj_collision(near, data)
+    out: dict[tuple[int, int], float] = {}
+    for (a, b), distance in zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True):
+        out[a, b] = min(distance, out.get((a, b), math.inf))
+    return out
 
 
 def _part(model: mujoco.MjModel, data: mujoco.MjData, pair: tuple[int, int], looks: FloatArray) -> bool:

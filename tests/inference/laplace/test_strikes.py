@@ -16,7 +16,7 @@ from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
-from tests.problems.bodies import cube, tosses
+from tests.problems.bodies import FRICTION, POSE, ROUND, cube, tosses, with_noise
 
 BOUNCE = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
   <geom name="floor" type="plane" size="3 3 .1" solref=".012 1"/>
@@ -65,6 +65,24 @@ def test_a_free_body_that_touches_nothing_has_no_impacts() -> None:
         windows = Windows(Segments(None), flying, logs)
         assert windows.contacts.touch == landed
         assert grows(windows) == landed
+
+
+def test_a_bounce_between_two_samples_is_a_touch() -> None:
+    """Smoothing over 60 ms lifts a bounce off the floor, and samples 10 ms apart step over it: none of 24 is missed."""
+    stiff = ROUND.replace('friction=".3"/>', 'friction=".3" solref="-100000 -10"/>')
+    body = Simulator(MjcfEnvironment.build(stiff, [FRICTION], [], POSE), num_threads=1)
+    rng, missed = np.random.default_rng(3), 0
+    for _ in range(24):
+        state = body.default_state()
+        state[3], state[8:11] = rng.uniform(0.4, 0.5), [*rng.normal(size=2), rng.uniform(-3, -1)]
+        made = body.rollout(np.full((1, 1), 0.5), np.zeros((1, 30, 0)), state[None], 0.01)
+        height = made.observations[0][:, 2]
+        assert np.ptp(height[height.argmin() :]) > 0.1  # it went up again
+        seen = with_noise(made.observations[0], body.environment.rotations, 1e-3, rng)
+        missed += not grows(
+            Windows(Segments(None), body, Trajectories.stack([Trajectory(seen, np.zeros((30, 0)), 0.01)]))
+        )
+    assert not missed
 
 
 def test_a_ball_on_a_slide_that_bounces(simulator: Simulator) -> None:
