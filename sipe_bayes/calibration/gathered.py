@@ -22,7 +22,7 @@ from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.poses import has_pose
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import unmeasured_joints
+from sipe_bayes.likelihood.starts import tied_joints, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
@@ -153,14 +153,17 @@ def unmeasured_starts(
 ) -> list[Finding]:
     """Free and ball joints whose pose no channel tells, so that windows start them where the model has them.
 
+    And joints of closed chains that do not follow from what is measured.
+
     With a ``StateSpace`` these are those of the logs in ``holdout`` alone.
     """
     if isinstance(likelihood, StateSpace) and not holdout:
         return []
-    model = simulator.model
-    joints = [joint for joint in unmeasured_joints(simulator, logs) if has_pose(model, joint)]
-    findings = []
-    for joint in joints:
+    model, findings = simulator.model, []
+    unmeasured = unmeasured_joints(simulator, logs)
+    for joint in set(unmeasured) & set(tied_joints(simulator, logs)):
+        findings.append(finding(Code.CHAIN_NOT_FOLLOWED, joint=model.joint(joint).name or f"joint {joint}"))
+    for joint in (joint for joint in unmeasured if has_pose(model, joint)):
         body = model.body(int(model.jnt_bodyid[joint])).name or f"body {int(model.jnt_bodyid[joint])}"
         name = model.joint(joint).name or f"of {body}"
         wanted = ("position", "orientation") if int(model.jnt_type[joint]) == _FREE else ("orientation",)

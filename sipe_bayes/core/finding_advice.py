@@ -96,6 +96,9 @@ ADVICE: dict[Code, str] = {
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
         "likelihood that infers states."
     ),
+    Code.CHAIN_NOT_FOLLOWED: (
+        "Beyond a dead centre what is measured tells two places of the mechanism. Measure the joint that goes round."
+    ),
     Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
     Code.SCATTER: (
         "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."

@@ -168,6 +168,10 @@ class Code(Enum):
         "the measurements do not tell the whole pose of joint {joint}: every window starts the rest of it where the "
         "model has it; measure {needed}, or use likelihood = 'state_space'"
     )
+    CHAIN_NOT_FOLLOWED = blocking(
+        "joint {joint} of a closed chain does not follow from what is measured all along: the mechanism passes a dead "
+        "centre, or its loop does not close; measure joint:{joint}.position"
+    )
     HELD_OUT_AT_REST = caution(
         "the measurements do not tell the whole pose of joint {joint}: simulations of held-out logs start the rest of "
         "it where the model has it; measure {needed} to believe their errors"

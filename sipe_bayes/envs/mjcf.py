@@ -33,7 +33,6 @@ from sipe_bayes.envs.channels import (
 )
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
-from sipe_bayes.envs.internal.closed_chains import narrowed
 from sipe_bayes.envs.internal.states import filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of, moving_on
@@ -236,8 +235,7 @@ class MjcfEnvironment(Environment):
 
     def start_sd(self, model: mujoco.MjModel) -> FloatArray:
         """What the model says of its internal states, and else any state's."""
-        wide = narrowed(model, self.state_columns(model), super().start_sd(model))
-        return start_sd(model, felt_sd(model, self.poses, wide))
+        return start_sd(model, felt_sd(model, self.poses, super().start_sd(model)))
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Two physics steps of a delay, as far as they lie in the cube."""

@@ -6,18 +6,21 @@ A tangent is (dq (nv), dv (nv), dact (na)).
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.internal.closed_chains import close, dependent_joints, known_joints
-from sipe_bayes.envs.internal.states import joints_at_rest
+from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
+from sipe_bayes.envs.internal.states import activations_at_rest, joints_at_rest
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
@@ -58,9 +61,12 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
     for joint in inertial_joints(model, readings):
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
-    dependent = dependent_joints(model, known_joints(model, measured))
-    if dependent:
-        close(model, states, simulator.default_state(), dependent)
+    close(
+        model,
+        states,
+        simulator.default_state(),
+        measured_joints(simulator, np.isfinite(trajectory.observations).any(0)),
+    )
     return states
 
 
@@ -164,31 +170,73 @@ def _parents(model: mujoco.MjModel, joint: int, states: FloatArray) -> FloatArra
     return np.broadcast_to(product(out, model.body_quat[body]), (len(states), 4))
 
 
+def measured_joints(simulator: Simulator, seen: BoolArray) -> set[int]:
+    """Ids of the joints whose position a channel tells, or of which the model itself says how far from rest they start.
+
+    A ball's orientation does not matter. seen: which channels (O,) have a sample.
+    """
+    model, environment = simulator.model, simulator.environment
+    columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
+    poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
+    placed = {r.joint for r in environment.poses if r.quantity == "position" and r.at_origin}
+    out = {*joints_at_rest(model), *inertial_joints(model, environment.poses)}
+    for joint in range(model.njnt):
+        if has_pose(model, joint):
+            known = (joint, "orientation") in poses or (is_round(model, joint) and joint in placed)
+            if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+                known &= (joint, "position") in poses
+        else:
+            known = 1 + int(model.jnt_qposadr[joint]) in columns
+        if known:
+            out.add(joint)
+    return out
+
+
 def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
     """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state.
 
-    Not those of which the model itself says how far from rest they start, or that a closed chain tells; a ball's
-    orientation does not matter.
+    Not those that a closed chain tells all along.
     """
-    model, environment = simulator.model, simulator.environment
     if are_states(simulator, trajectories.states):
         return []
-    seen = np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
-    columns = {c for c, has in zip(environment.state_columns(model), seen, strict=True) if has}
-    known_poses = {(r.joint, r.quantity) for r in environment.poses if seen[list(r.channels)].all()}
-    placed = {r.joint for r in environment.poses if r.quantity == "position" and r.at_origin}
-    chained = dependent_joints(model, known_joints(model, columns))
-    missing, resting = [], {*joints_at_rest(model), *inertial_joints(model, environment.poses), *chained}
-    for joint in (joint for joint in range(model.njnt) if joint not in resting):
-        if has_pose(model, joint):
-            known = (joint, "orientation") in known_poses or (is_round(model, joint) and joint in placed)
-            if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
-                known &= (joint, "position") in known_poses
-        else:
-            known = 1 + int(model.jnt_qposadr[joint]) in columns
-        if not known:
-            missing.append(joint)
-    return missing
+    known = measured_joints(simulator, _seen_in(trajectories)) | followed_joints(simulator, trajectories)
+    return [joint for joint in range(simulator.model.njnt) if joint not in known]
+
+
+def all_starts_measured(simulator: Simulator, trajectories: Trajectories) -> bool:
+    """Whether logs tell of every state where it is: recorded ones, or a measured position of each joint."""
+    if are_states(simulator, trajectories.states):
+        return True
+    known = activations_at_rest(simulator.model) == simulator.model.na
+    return known and not unmeasured_joints(simulator, trajectories)
+
+
+def followed_joints(simulator: Simulator, trajectories: Trajectories) -> set[int]:
+    """Ids of the joints that nothing measures and that follow measured ones through closed chains, in every log."""
+    if not simulator.model.neq:
+        return set()
+    known, reset = measured_joints(simulator, _seen_in(trajectories)), simulator.default_state()
+    states = [estimate_states(simulator, replace(trajectory, states=None)) for trajectory in trajectories]
+    return set.intersection(*(set(close(simulator.model, own, reset, known)) for own in states))
+
+
+def tied_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
+    """Ids of the joints that nothing measures and that closed chains tie to measured ones at the reset state."""
+    known, reset = measured_joints(simulator, _seen_in(trajectories)), simulator.default_state()
+    return dependent_joints(simulator.model, known, reset[1 : 1 + simulator.model.nq])
+
+
+def _seen_in(trajectories: Trajectories) -> BoolArray:
+    return np.asarray(np.isfinite(trajectories.observations).any(axis=(0, 1)))
+
+
+def start_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArray:
+    """Prior sds (2 nv + na,) of where windows of logs start: narrow of joints that follow through closed chains."""
+    model, out = simulator.model, simulator.environment.start_sd(simulator.model).copy()
+    for joint in followed_joints(simulator, trajectories):
+        dofs = dofs_of(model, joint)
+        out[dofs], out[model.nv + dofs] = SD, 10 * SD
+    return out
 
 
 def first_states(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:
@@ -196,6 +244,14 @@ def first_states(simulator: Simulator | CallableSimulator, trajectories: Traject
     if isinstance(simulator, CallableSimulator):
         return np.empty((len(trajectories), 0))
     return np.stack([estimate_states(simulator, t)[0] for t in trajectories])
+
+
+def contacts_of(simulator: Simulator, logs: Sequence[Trajectory]) -> Contacts:
+    """What bodies touch along logs, apart by smoothed states and in touch by those of the samples."""
+    if not may_touch(simulator.model):
+        return Contacts()
+    smooth, sampled = ([estimate_states(simulator, log, raw) for log in logs] for raw in (False, True))
+    return contacts_along(simulator, smooth, sampled)
 
 
 def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:

@@ -23,22 +23,23 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.envs.internal.states import activations_at_rest
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, fitted_channels, fitted_rotations
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
+    all_starts_measured,
     are_states,
+    contacts_of,
     estimate_states,
     moved,
     past_commands,
-    unmeasured_joints,
+    start_sd,
     with_history,
 )
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
+from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -149,17 +150,13 @@ class Windows:
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt, self.start)
-        free = environment.start_sd(simulator.model) if self.settings.starts == "estimated" else np.zeros(0)
+        free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
 
     @cached_property
     def contacts(self) -> Contacts:
         """What bodies touch along the logs."""
-        simulator, logs = self.simulator, [self.trajectories[k] for k in np.unique(self.log).tolist()]
-        if not may_touch(simulator.model):
-            return Contacts()
-        smooth, sampled = ([estimate_states(simulator, log, raw) for log in logs] for raw in (False, True))
-        return contacts_along(simulator, smooth, sampled)
+        return contacts_of(self.simulator, [self.trajectories[k] for k in np.unique(self.log).tolist()])
 
     def every_other(self) -> Windows:
         """Every other window, for a rough search; the windows themselves where a log has fewer than four.
@@ -320,14 +317,10 @@ class Windows:
             residual = np.where(self.observed, self.measured - predicted, 0.0)
         return np.where(valid[:, None, None, None], residual, 0.0), valid
 
-    @property
+    @cached_property
     def starts_measured(self) -> bool:
         """Whether the log tells where every window starts: recorded states, or a measured position of each joint."""
-        if are_states(self.simulator, self.trajectories.states):
-            return True
-        model = self.simulator.model
-        known = activations_at_rest(model) == model.na
-        return known and not unmeasured_joints(self.simulator, self.trajectories)
+        return all_starts_measured(self.simulator, self.trajectories)
 
     def linearise(
         self,

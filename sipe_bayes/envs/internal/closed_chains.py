@@ -1,14 +1,17 @@
 """Dependent joints of closed chains, which nothing measures: a four-bar linkage's rocker, a gripper's second finger.
 
-Where equality constraints (connect, weld, joint, tendon) tie hinges and slides to measured ones, their positions are
-solved from sample to sample by Gauss-Newton steps of the constraints' residuals, and their velocities by the
-constraints' Jacobian,
+Where equality constraints (connect, weld, joint, tendon) tie joints to measured ones, their positions are solved from
+sample to sample by Gauss-Newton steps of the constraints' residuals, and their velocities by the constraints' Jacobian,
 
-    J_o dq_o = -r,    J_o v_o = -J_m v_m,    with o the dependent joints and m all others.
+    J_o dq_o = -r,    J_o v_o = -J_m v_m,    with o the joints that nothing measures and m all others.
 
 The first sample is come to from the reset state, where the chain is assembled, in steps of the measured joints, so that
 the branch of the mechanism is the model's. Which joints are dependent is asked there: those that no motion with the
 measured ones at rest moves.
+
+Where J_o loses rank on the way the mechanism folds: a rocker turns back where its crank goes on, and beyond such a dead
+centre what is measured tells two places. Joints that are moved by the motion that opens there do not follow, nor do
+those of a loop that does not close.
 """
 
 from __future__ import annotations
@@ -20,16 +23,22 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.envs.internal.states import joints_at_rest
 
 SD = 0.1  # rad or m, and ten times as much a second: how far from closed a window may start, a noisy crank included
 _STEP, _MOST, _TOLERANCE, _APART, _HARDLY = 0.05, 30, 1e-10, 1e-6, 1e-3
+_FOLDED = 0.02  # of the largest singular value
 
 
 class _Chain:
-    """A model's equality constraints alone, and their residuals and Jacobian at a place."""
+    """A model's equality constraints alone, and what they say of joints that nothing measures.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    Args:
+        model: the model.
+        known: ids of the joints that are measured, or of which the model says where they start.
+        position: (nq,) where the chain is assembled; it is closed from there.
+    """
+
+    def __init__(self, model: mujoco.MjModel, known: Collection[int], position: FloatArray) -> None:
         self.model = copy.copy(model)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         kinds = (
@@ -41,6 +50,16 @@ class _Chain:
             self.model.opt.disableflags |= int(kind)
         self.data = mujoco.MjData(self.model)
         self.data.eq_active[[k for k in range(model.neq) if _of_mocap(model, k)]] = 0  # what it follows no state tells
+        unknown = [j for j in range(model.njnt) if j not in known]
+        self.dofs = np.array([d for j in unknown for d in dofs_of(model, j)], int)
+        self.position = self.closed(position)
+        jacobian = self.at(self.position)[1][:, self.dofs]
+        self.scale = np.linalg.norm(jacobian, axis=0)  # of radians and metres
+        self.scale[self.scale == 0] = 1.0
+        sizes, ways = np.linalg.svd(jacobian / self.scale)[1:]
+        self.rank = int((sizes > _APART * sizes.max(initial=0.0)).sum())
+        moves = np.abs(ways[self.rank :]).max(axis=0, initial=0.0) > _HARDLY
+        self.joints = [j for j in unknown if not moves[np.isin(self.dofs, dofs_of(model, j))].any()]
 
     def at(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (E,) and Jacobian (E, nv) at positions (nq,)."""
@@ -49,80 +68,117 @@ class _Chain:
         count = int(self.data.nefc)
         return self.data.efc_pos[:count].copy(), self.data.efc_J.reshape(-1, self.model.nv)[:count].copy()
 
-    def closed(self, position: FloatArray, columns: IntArray, dofs: IntArray) -> FloatArray:
-        """Positions (nq,) of which the dependent ``columns`` close the chain; ``dofs`` are theirs."""
-        out = position.copy()
-        for _ in range(_MOST):
+    def closed(self, position: FloatArray) -> FloatArray:
+        """Positions (nq,) at which joints that nothing measures are moved so that the chain closes."""
+        out, way = position.copy(), np.zeros(self.model.nv)
+        for _ in range(_MOST if len(self.dofs) else 0):
             residual, jacobian = self.at(out)
-            step = -np.linalg.lstsq(jacobian[:, dofs], residual, rcond=_APART)[0]
-            out[columns] += np.clip(step, -0.3, 0.3)
+            step = -np.linalg.lstsq(jacobian[:, self.dofs], residual, rcond=_APART)[0]
+            way[self.dofs] = np.clip(step, -0.3, 0.3)
+            mujoco.mj_integratePos(self.model, out, way, 1.0)
             if np.abs(step).max() < _TOLERANCE:
                 break
         return out
 
+    def opening(self, position: FloatArray) -> tuple[float, set[int]]:
+        """How far from a dead centre, as a share, and the joints that are loose there: all where a loop is open."""
+        residual, jacobian = self.at(position)
+        own = jacobian[:, self.dofs] / self.scale
+        sizes, ways = np.linalg.svd(own)[1:]
+        if np.abs(residual).max(initial=0.0) > SD * np.abs(jacobian).max(initial=1e-12):
+            return 0.0, set(self.joints)
+        loose = np.abs(ways[self.rank - 1]) > _HARDLY
+        moved = {j for j in self.joints if loose[np.isin(self.dofs, dofs_of(self.model, j))].any()}
+        return float(sizes[self.rank - 1] / sizes[0]), moved
+
+
+def dofs_of(model: mujoco.MjModel, joint: int) -> IntArray:
+    """Of a joint: one, three of a ball, six of a free joint."""
+    sizes = {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}
+    return int(model.jnt_dofadr[joint]) + np.arange(sizes.get(int(model.jnt_type[joint]), 1))
+
 
 def _of_mocap(model: mujoco.MjModel, equality: int) -> bool:
-    """Whether a constraint ties something to a mocap body."""
+    """Whether a constraint ties something to what a mocap body carries."""
     ids = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
     kind = int(model.eq_objtype[equality])
     if kind == int(mujoco.mjtObj.mjOBJ_SITE):
-        ids = [int(model.site_bodyid[i]) for i in ids]
-    elif kind != int(mujoco.mjtObj.mjOBJ_BODY):
+        bodies = [int(model.site_bodyid[i]) for i in ids]
+    elif kind == int(mujoco.mjtObj.mjOBJ_TENDON):
+        bodies = [body for i in ids if i >= 0 for body in _bodies_of(model, i)]
+    elif kind == int(mujoco.mjtObj.mjOBJ_BODY):
+        bodies = ids
+    else:
         return False
-    return bool((model.body_mocapid[ids] >= 0).any())
+    roots = model.body_rootid[bodies]
+    return bool((model.body_mocapid[roots] >= 0).any() and len(set(roots.tolist())) > 1)
 
 
-def dependent_joints(model: mujoco.MjModel, known: Collection[int]) -> list[int]:
-    """Ids of the hinges and slides that nothing measures and that closed chains tie to what is known.
+def _bodies_of(model: mujoco.MjModel, tendon: int) -> list[int]:
+    """Bodies whose sites and geoms a spatial tendon runs along."""
+    first = int(model.tendon_adr[tendon])
+    owners = {int(mujoco.mjtWrap.mjWRAP_SITE): model.site_bodyid}
+    owners |= dict.fromkeys((int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)), model.geom_bodyid)
+    wraps = range(first, first + int(model.tendon_num[tendon]))
+    kinds = [(int(model.wrap_type[w]), int(model.wrap_objid[w])) for w in wraps]
+    return [int(owners[kind][index]) for kind, index in kinds if kind in owners]
 
-    known: ids of the joints that are measured, or of which the model says where they start.
+
+def dependent_joints(model: mujoco.MjModel, known: Collection[int], reset: FloatArray | None = None) -> list[int]:
+    """Ids of the joints that nothing measures and that closed chains tie to what is known.
+
+    Args:
+        model: the model.
+        known: ids of the joints that are measured, or of which the model says where they start.
+        reset: positions (nq,) where the chain is assembled; default those of the model.
     """
-    kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    joints = [j for j in range(model.njnt) if j not in known and int(model.jnt_type[j]) in kinds]
-    if not model.neq or not joints:
+    if not model.neq or len(set(known)) == model.njnt:
         return []
-    jacobian = _Chain(model).at(model.qpos0)[1][:, model.jnt_dofadr[joints]]
-    sizes, ways = np.linalg.svd(jacobian)[1:]
-    free = ways[int((sizes > _APART * sizes.max(initial=0.0)).sum()) :]  # motions that the chain allows
-    return [j for j, own in zip(joints, np.abs(free).max(axis=0, initial=0.0), strict=True) if own < _HARDLY]
+    return _Chain(model, known, model.qpos0 if reset is None else reset).joints
 
 
-def narrowed(model: mujoco.MjModel, columns: Collection[int | None], sd: FloatArray) -> FloatArray:
-    """Prior sds (2 nv + na,) of a window's start with those of dependent joints.
+def close(model: mujoco.MjModel, states: FloatArray, reset: FloatArray, known: Collection[int]) -> list[int]:
+    """Write positions and velocities of what nothing measures into states (T+1, S) along a log.
 
-    columns: of the state, that channels measure.
+    Args:
+        model: the model.
+        states: of which the known joints are right.
+        reset: a state (S,) in which the chain is assembled.
+        known: ids of the joints that are measured, or of which the model says where they start.
+
+    Returns:
+        Ids of the joints that follow the known ones all along.
     """
-    dofs = model.jnt_dofadr[dependent_joints(model, known_joints(model, columns))]
-    out = sd.copy()
-    out[dofs], out[model.nv + dofs] = SD, 10 * SD
-    return out
+    if not model.neq or len(set(known)) == model.njnt:
+        return []
+    nq, nv = model.nq, model.nv
+    chain = _Chain(model, known, reset[1 : 1 + nq])
+    if not chain.joints:
+        return []
+    others = np.setdiff1d(np.arange(nv), chain.dofs)
+    follows, position, last = set(chain.joints), chain.position, 0.0
 
+    def go(goal: FloatArray) -> FloatArray:
+        """The positions (nq,) at which the known joints are at their goal, from where the last ones were."""
+        nonlocal follows, last
+        way = np.zeros(nv)
+        mujoco.mj_differentiatePos(model, way, 1.0, position, goal)
+        way[chain.dofs] = 0
+        ahead, count = position.copy(), max(1, int(np.ceil(np.abs(way).max() / _STEP)))
+        for _ in range(count):
+            mujoco.mj_integratePos(model, ahead, way, 1.0 / count)
+            ahead = chain.closed(ahead)
+            opening, loose = chain.opening(ahead)
+            if min(opening, 2 * opening - last) < _FOLDED:
+                follows -= loose
+            last = opening
+        return ahead
 
-def known_joints(model: mujoco.MjModel, columns: Collection[int | None]) -> set[int]:
-    """Ids of the joints whose column of the state is measured, or of which the model says where they start."""
-    return {j for j in range(model.njnt) if 1 + int(model.jnt_qposadr[j]) in columns} | joints_at_rest(model)
-
-
-def close(model: mujoco.MjModel, states: FloatArray, reset: FloatArray, joints: Collection[int]) -> None:
-    """Write positions and velocities of ``joints`` into states (T+1, S) along a log; reset: a state (S,)."""
-    chain, nq, nv = _Chain(model), model.nq, model.nv
-    columns, dofs = model.jnt_qposadr[list(joints)], model.jnt_dofadr[list(joints)]
-    others = np.setdiff1d(np.arange(nv), dofs)
-    position = reset[1 : 1 + nq].copy()
-    first = states[0, 1 : 1 + nq].copy()
-    first[columns] = position[columns]
-    way = np.zeros(nv)
-    mujoco.mj_differentiatePos(model, way, 1.0, position, first)
-    steps = max(1, int(np.ceil(np.abs(way).max() / _STEP)))
-    for _ in range(steps):
-        mujoco.mj_integratePos(model, position, way, 1.0 / steps)
-        position = chain.closed(position, columns, dofs)
     for state in states:
-        measured = state[1 : 1 + nq].copy()
-        measured[columns] = position[columns]
-        position = chain.closed(measured, columns, dofs)
-        state[1 : 1 + nq][columns] = position[columns]
+        position = go(state[1 : 1 + nq])
+        state[1 : 1 + nq] = position
         jacobian = chain.at(position)[1]
         velocity = state[1 + nq : 1 + nq + nv]
         moved = jacobian[:, others] @ velocity[others]
-        velocity[dofs] = -np.linalg.lstsq(jacobian[:, dofs], moved, rcond=_APART)[0]
+        velocity[chain.dofs] = -np.linalg.lstsq(jacobian[:, chain.dofs], moved, rcond=_APART)[0]
+    return sorted(follows)

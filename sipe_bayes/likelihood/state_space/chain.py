@@ -35,7 +35,7 @@ from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace, check_seen, fitted_rotations
-from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, with_history
+from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, start_sd, with_history
 from sipe_bayes.likelihood.windows import chosen_channels
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -87,8 +87,8 @@ class Chain:
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt)
         self.reference = with_history(simulator, reference, past, self.dt, self.sample)
         self.sizes = (model.nv, model.nv, model.na)
-        start_sd = np.repeat(KNOWN_SD, self.sizes) if known else environment.start_sd(model)
-        self.prior_precision = np.where(self.first[:, None], start_sd**-2.0, 0.0)
+        sd = np.repeat(KNOWN_SD, self.sizes) if known else start_sd(simulator, trajectories)
+        self.prior_precision = np.where(self.first[:, None], sd**-2.0, 0.0)
 
     def _measure(self, trajectories: Trajectories) -> None:
         """Assign to each state what the simulation that starts there predicts."""
