@@ -257,7 +257,7 @@ def kernels(
 ) -> GaussianMixture:
     """The posterior that draws (M, N) with weights (M,) stand for; of normals each with its own draws.
 
-    Around one of several that has too few of them, that normal with their mass.
+    Around one of several that has too few of them, a normal of their moments as far as these tell, else its own.
 
     blur: covariance (N, N) that each kernel has in addition.
     """
@@ -266,7 +266,8 @@ def kernels(
         own = nearest == k
         mass = weight[own].sum()
         if len(normals.means) > 1 and effective(weight[own] / mass) < tuning.least:
-            parts.append((np.array([mass]), normals.means[k][None].numpy(), normals.covariances[k][None].numpy()))
+            mean, spread = _blended(points[own], weight[own] / mass, normals, k)
+            parts.append((np.array([mass]), mean[None], (spread + blur)[None]))
         else:
             parts.append(_kernels(points[own], weight[own] / mass, mass, seed, tuning, blur))
     shares, means, spreads = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
@@ -277,7 +278,7 @@ def _kernels(
     points: FloatArray, weight: FloatArray, mass: float, seed: int, tuning: ImportanceTuning, blur: FloatArray | float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Shares (K,) of the mass, means (K, N) and covariances (K, N, N) of the kernels of draws (M, N)."""
-    n, number = points.shape[1], max(1, round(tuning.kernels * mass))
+    n, number = points.shape[1], tuning.kernels
     mean = weight @ points
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
     silverman = (4 / (effective(weight) * (n + 2))) ** (1 / (n + 4))  # of the sds
@@ -306,11 +307,17 @@ def _moments(
     count = np.bincount(nearest, minlength=len(normals.means))
     chosen = int(np.argmax(np.bincount(nearest, weight, len(count)) / np.maximum(count, 1)))
     own = (nearest == chosen) & (weight > 0)
-    base = normals.covariances.numpy()[chosen]
     if not own.any():
-        return normals.means.numpy()[chosen], base
-    weight, points = weight[own] / weight[own].sum(), draws.points[own]
+        return normals.means.numpy()[chosen], normals.covariances.numpy()[chosen]
+    mean, covariance = _blended(draws.points[own], weight[own] / weight[own].sum(), normals, chosen)
+    return mean, tuning.width(len(mean)) ** 2 * covariance
+
+
+def _blended(
+    points: FloatArray, weight: FloatArray, normals: GaussianMixture, which: int
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (N,) of draws (M, N), and their covariance (N, N), the fewer the more that of the normal ``which``."""
     number, mean = effective(weight), weight @ points
     trust = number / (number + 2 * points.shape[1])
     covariance = (points - mean).T @ ((points - mean) * weight[:, None])
-    return mean, tuning.width(points.shape[1]) ** 2 * (trust * covariance + (1 - trust) * base)
+    return mean, trust * covariance + (1 - trust) * normals.covariances.numpy()[which]

@@ -129,6 +129,25 @@ def test_kernels_at_a_bound_keep_the_draws_mean() -> None:
     assert (np.abs(np.mean(ratios, axis=0) - 1) < [0.01, 0.1, 0.1, 0.1]).all()
 
 
+def test_a_small_optimum_with_few_draws_is_not_its_rejected_normal() -> None:
+    """An eighth of the mass about an optimum whose normal is half as wide and an sd off, from twelve draws of it."""
+    space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
+    normals = GaussianMixture(np.log([7.0, 1.0]), np.array([[0.3], [0.72]]), np.full((2, 1, 1), 0.02**2), space)
+    means, sds = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        draws = np.concatenate([rng.normal(0.3, 0.02, 84), rng.normal(0.7, 0.04, 12)])[:, None]
+        mixture = importance.kernels(draws, np.full(96, 1 / 96), normals, seed, TUNING)
+        points = mixture.sample((4000,), generator=torch.Generator().manual_seed(seed))[:, 0]
+        own = points[points > 0.5]
+        assert len(own) / 4000 == pytest.approx(1 / 8, abs=0.03)
+        means.append(float(own.mean()))
+        sds.append(float(own.std()))
+    print(np.mean(means), np.mean(sds))
+    assert np.mean(means) == pytest.approx(0.7, abs=0.008)  # four standard errors
+    assert 0.034 < np.mean(sds) < 0.044
+
+
 def test_a_given_noise_is_not_made_larger() -> None:
     """Stated sds of 1e-8 beside outputs of 1, less than what is taken for rounding where noise is estimated.
 
