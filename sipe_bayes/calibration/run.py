@@ -110,7 +110,7 @@ def calibrate(
         *(look.finding for look in (*outside, lacks) if look is not None and look.alarm),
         *problem.findings,
         *unmeasured_starts(problem.simulator, logs, problem.likelihood, problem.holdout is not None),
-        *_own(method),
+        *_own(method, lacks is not None),
         *unknown,
         *uneven_targets(problem.environment),
         *([] if conflict is None else [conflict.finding]),
@@ -266,10 +266,14 @@ def _mixing(method: Estimator) -> Mixing | None:
     return Mixing.of(measured, method.space.names) if measured else None
 
 
-def _own(method: Estimator) -> list[Finding]:
-    """What the estimator noticed itself; bounds are told by parameter, with their values."""
+def _own(method: Estimator, asked: bool) -> list[Finding]:
+    """What the estimator noticed itself; bounds are told by parameter, with their values.
+
+    asked: whether what the model lacks is asked for, so that nothing else need say that a channel is not followed.
+    """
+    elsewhere = {Code.AT_BOUND, Code.NOISE_EXCEEDS_SCATTER} if asked else {Code.AT_BOUND}
     spread = [] if method.uncertain else [finding(Code.SEARCH_SPREAD, method=method.name)]
-    return [item for item in method.findings if item.code is not Code.AT_BOUND] + spread
+    return [item for item in method.findings if item.code not in elsewhere] + spread
 
 
 def _channel_noise(fitted: Windows, noise: Noise) -> dict[str, ChannelNoise]:

@@ -136,6 +136,8 @@ class Thresholds(Options):
         2.0, "fitted noise that is so much larger than a channel's scatter from sample to sample is none", "of that"
     )
 
+    gross: float = option(0.25, "from which residuals are a good part of what a channel does", "of its spread")
+
     # searches
     search_wide: float = option(
         0.15, "a search whose distribution is wider was cut short: half of a uniform prior's sd", "sd, of the range"

@@ -6,7 +6,7 @@ A tangent is (dq (nv), dv (nv), dact (na)).
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import mujoco
@@ -18,6 +18,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
 from sipe_bayes.envs.internal.states import activations_at_rest, joints_at_rest
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
+from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
@@ -31,8 +32,9 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
 
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
     the slopes of the positions. Orientations are smoothed likewise, in rotation vectors from each sample; the joint's
-    body is where the measured frame tells. What no channel measures stays at the model's reset state. The search starts
-    here, and so do the windows of held-out logs. Joints of closed chains follow those that are measured.
+    body is where the measured frame tells. Positions that channels tell without measuring them are where these fit best
+    (``indirect_positions``), and joints of closed chains follow. What no channel tells stays at the model's reset
+    state. The search starts here, and so do the windows of held-out logs.
 
     Args:
         simulator: of the model.
@@ -41,6 +43,11 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
     """
     if trajectory.states is not None and are_states(simulator, trajectory.states):
         return trajectory.states
+    return _estimated(simulator, trajectory, raw)[0]
+
+
+def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple[FloatArray, set[int], list[int]]:
+    """States (T+1, S) along a log; and ids of the joints that channels tell indirectly, and of those that follow."""
     model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
     columns = simulator.environment.state_columns(model)
     measured: dict[int, FloatArray] = {}
@@ -61,13 +68,42 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
     for joint in inertial_joints(model, readings):
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
-    close(
-        model,
-        states,
-        simulator.default_state(),
-        measured_joints(simulator, np.isfinite(trajectory.observations).any(0)),
+    known = measured_joints(simulator, np.asarray(np.isfinite(trajectory.observations).any(0)))
+    indirect = _put_indirect(simulator, trajectory, states, known, measured, raw)
+    return states, indirect, close(model, states, simulator.default_state(), known | indirect)
+
+
+def _put_indirect(
+    simulator: Simulator,
+    trajectory: Trajectory,
+    states: FloatArray,
+    known: set[int],
+    measured: Collection[int],
+    raw: bool,
+) -> set[int]:
+    """Write the positions of hinges and slides that channels tell indirectly into states (T+1, S); ids of these joints.
+
+    measured: columns of the states.
+    """
+    model, columns = simulator.model, simulator.environment.state_columns(simulator.model)
+    derived = [c is None for c in columns]
+    hidden = [j for j in range(model.njnt) if j not in known and not has_pose(model, j)]
+    tell = np.isfinite(trajectory.observations[:, derived]).any()
+    if not hidden or not tell or simulator.environment.memory_size or len(trajectory) < 2:
+        return set()
+    direct = np.isin(
+        np.arange(2 * model.nv + model.na), [c - 1 - model.nq + model.nv for c in measured if c > model.nq]
     )
-    return states
+    direct[[d for j in known for d in dofs_of(model, j)]] = True
+    places, indirect, _ = indirect_positions(LogSamples(simulator, trajectory), states, direct)
+    out = {j for j in hidden if indirect[model.jnt_dofadr[j]]}
+    for joint in out:
+        position = 1 + int(model.jnt_qposadr[joint])
+        velocity = 1 + model.nq + int(model.jnt_dofadr[joint])
+        states[:, position] = places[:, position] if raw else smoothed(places[:, position], trajectory.dt)
+        if velocity not in measured:
+            states[:, velocity] = smoothed(places[:, position], trajectory.dt, 1)
+    return out
 
 
 def are_states(simulator: Simulator, states: FloatArray | None) -> bool:
@@ -193,13 +229,15 @@ def measured_joints(simulator: Simulator, seen: BoolArray) -> set[int]:
 
 
 def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
-    """Ids of the joints whose position no channel with a sample measures: windows start them at the reset state.
+    """Ids of the joints whose position no channel with a sample tells: windows start them at the reset state.
 
-    Not those that a closed chain tells all along.
+    Not those that channels tell indirectly, or a closed chain, all along every log.
     """
     if are_states(simulator, trajectories.states):
         return []
-    known = measured_joints(simulator, _seen_in(trajectories)) | followed_joints(simulator, trajectories)
+    known = measured_joints(simulator, _seen_in(trajectories))
+    if len(known) < simulator.model.njnt:
+        known |= set.intersection(*({*indirect, *follow} for indirect, follow in _inferred(simulator, trajectories)))
     return [joint for joint in range(simulator.model.njnt) if joint not in known]
 
 
@@ -215,9 +253,12 @@ def followed_joints(simulator: Simulator, trajectories: Trajectories) -> set[int
     """Ids of the joints that nothing measures and that follow measured ones through closed chains, in every log."""
     if not simulator.model.neq:
         return set()
-    known, reset = measured_joints(simulator, _seen_in(trajectories)), simulator.default_state()
-    states = [estimate_states(simulator, replace(trajectory, states=None)) for trajectory in trajectories]
-    return set.intersection(*(set(close(simulator.model, own, reset, known)) for own in states))
+    return set.intersection(*(set(follow) for _, follow in _inferred(simulator, trajectories)))
+
+
+def _inferred(simulator: Simulator, trajectories: Trajectories) -> list[tuple[set[int], list[int]]]:
+    """Of each log the ids of the joints that channels tell indirectly, and of those that follow through chains."""
+    return [_estimated(simulator, replace(trajectory, states=None), False)[1:] for trajectory in trajectories]
 
 
 def tied_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:

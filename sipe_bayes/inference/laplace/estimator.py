@@ -28,6 +28,7 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contrad
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.window_draws import draw_size, more, probed, sharing
+from sipe_bayes.inference.laplace.window_optimum import not_followed
 from sipe_bayes.inference.laplace.window_search import WindowSearch
 from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
@@ -286,6 +287,11 @@ class Laplace(Estimator[LaplaceState]):
         if enough and isinstance(kept[0], WindowOptimum) and kept[0].unsmooth:
             kept = [replace(kept[0], finding=None)]  # draws ask for no slope
         self._report(kept, state, enough)
+        windows = self.bound(trajectories)
+        if isinstance(windows, Windows) and isinstance(self.simulator, Simulator):
+            loose = not_followed(windows, kept[0].sd)
+            if loose is not None:
+                self.find(Code.NOISE_EXCEEDS_SCATTER, channel=loose[0], ratio=loose[1])
         if state.draws is not None:
             self.diagnostics["draws"] = {"draws": len(weight), "effective": effective}
             if (

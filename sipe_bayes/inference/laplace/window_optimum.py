@@ -8,7 +8,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.growing_windows import grows
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.inference.laplace.growing_windows import grows, level
 from sipe_bayes.inference.laplace.pattern_search import Surroundings, nearest_points, pattern_search, pattern_size
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.wide_differences import WideDifferences
@@ -219,3 +220,13 @@ def judged(
         optimum, covariance = replace(optimum, mean=ending.theta), covariance + np.outer(refused, refused)
     heavier = around is not None and around.heavier
     return replace(optimum, covariance=covariance, guessed=guessed, heavier=heavier, finding=reason)
+
+
+def not_followed(windows: Windows, sd: FloatArray) -> tuple[str, float] | None:
+    """The channel that a fit with noise sds (C,) does not follow, and its noise over the scatter of its samples.
+
+    Noise that is a good part of what a channel does is none where the samples do not scatter by it, whatever its time.
+    """
+    excess = np.where(sd > THRESHOLDS.gross * windows.spread, sd / level(windows).sd, 0.0)
+    worst = int(excess.argmax())
+    return (windows.fitted[worst], float(excess[worst])) if excess[worst] > THRESHOLDS.noise_excess else None

@@ -10,16 +10,20 @@ unlimited slide is not looked for, nor the turns of a ball or of a free body.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.poses import inertial_joints
-from sipe_bayes.likelihood.starts import STATE_STEP
-from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.envs.task import Task
+from sipe_bayes.simulation.simulator import Simulator
 
+_STEP = 1e-5  # rad or m: finite differences
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -39,13 +43,96 @@ class IndirectOptions(Options):
 OPTIONS = IndirectOptions()
 
 
+class Sampled(Protocol):
+    """K samples of logs, and what is predicted of them from states."""
+
+    simulator: Simulator
+    measured: FloatArray  # (K, C)
+    observed: BoolArray  # (K, C)
+    log: IntArray  # (K,), which one a sample belongs to
+    dt: FloatArray  # (K,)
+
+    @property
+    def least(self) -> tuple[FloatArray, FloatArray]:
+        """Sizes (C,) and (D,) below which rounding rules."""
+
+    def simulate(
+        self, theta: FloatArray, states: FloatArray, at: IntArray | None = None
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Predictions (B, K, C), and two more, of theta (B, N) and states (B, K, S)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogSamples:
+    """The samples of one log, predicted from the states where they are: no window, and no noise.
+
+    What an environment reads a physics step late (``derived_late``) does not count.
+    """
+
+    simulator: Simulator
+    trajectory: Trajectory
+
+    @cached_property
+    def _late(self) -> BoolArray:
+        environment = self.simulator.environment
+        columns = environment.state_columns(self.simulator.model)
+        return np.array([environment.derived_late and column is None for column in columns])
+
+    @property
+    def measured(self) -> FloatArray:
+        """(T+1, O)."""
+        return self.trajectory.observations
+
+    @cached_property
+    def observed(self) -> BoolArray:
+        """(T+1, O)."""
+        return np.asarray(np.isfinite(self.measured) & ~self._late)
+
+    @property
+    def log(self) -> IntArray:
+        """(T+1,)."""
+        return np.zeros(len(self.measured), int)
+
+    @property
+    def dt(self) -> FloatArray:
+        """(T+1,)."""
+        return np.full(len(self.measured), self.trajectory.dt)
+
+    @cached_property
+    def least(self) -> tuple[FloatArray, FloatArray]:
+        """A millionth of the channels' sizes (O,); of states nothing."""
+        size = np.sqrt(np.square(np.where(self.observed, self.measured, 0.0)).mean(0))
+        return np.maximum(1e-6 * size, 1e-12), np.zeros(0)
+
+    def simulate(
+        self, theta: FloatArray, states: FloatArray, at: IntArray | None = None
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Predictions (B, K, O) at theta (B, N) of states (B, K, S), which come back; and whether each is valid."""
+        simulator, batch = self.simulator, len(theta)
+        at = np.arange(len(self.measured)) if at is None else at
+        whole = isinstance(simulator.environment, Task) or bool(simulator.engine.firmware)
+        dt = self.trajectory.dt if whole else float(simulator.model.opt.timestep)
+        goals = simulator.environment.recorded_goals(self.measured[:1])
+        actions = self.trajectory.actions[np.minimum(at, len(self.trajectory) - 1)][:, None]
+        result = simulator.rollout(
+            np.repeat(theta, len(at), axis=0),
+            np.tile(actions, (batch, 1, 1)),
+            states.reshape(batch * len(at), -1),
+            dt,
+            [self.trajectory.name or None] * (batch * len(at)),
+            goals=None if goals is None else np.repeat(goals, batch * len(at), axis=0),
+        )
+        shape = (batch, len(at))
+        return result.observations[:, 0].reshape(*shape, -1), states, result.valid[:, 0].reshape(shape)
+
+
 def indirect_positions(
-    chain: Chain, states: FloatArray, measured: BoolArray
+    chain: Sampled, states: FloatArray, measured: BoolArray
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
     """Look for positions that channels tell without measuring them.
 
     Args:
-        chain: the logs.
+        chain: the logs, as a ``Chain`` has them or ``LogSamples``.
         states: (K, S), a first guess.
         measured: (D,), coordinates that a channel measures directly.
 
@@ -93,17 +180,17 @@ def _values(model: mujoco.MjModel, joint: int) -> FloatArray:
 
 
 def _predicted(
-    chain: Chain, states: FloatArray, column: int, values: FloatArray, at: IntArray | None = None
+    chain: Sampled, states: FloatArray, column: int, values: FloatArray, at: IntArray | None = None
 ) -> FloatArray:
     """Predictions (B, K, C) with values (B, K) in a column of the states (K, S), NaN where they diverge."""
     many = np.repeat(states[None], len(values), axis=0)
     many[..., column] = values
-    middle = np.full((len(values), chain.num_theta), 0.5)
+    middle = np.full((len(values), len(chain.simulator.space)), 0.5)
     predicted, _, _ = chain.simulate(middle, many, at)
     return predicted
 
 
-def _dependent(chain: Chain, states: FloatArray, position: int, values: FloatArray, size: FloatArray) -> BoolArray:
+def _dependent(chain: Sampled, states: FloatArray, position: int, values: FloatArray, size: FloatArray) -> BoolArray:
     """Which channels (C,) depend on a position."""
     at = np.unique(np.linspace(0, len(states) - 1, OPTIONS.samples).astype(int))
     tried = values[np.linspace(0, len(values) - 1, OPTIONS.values).astype(int)]
@@ -112,7 +199,7 @@ def _dependent(chain: Chain, states: FloatArray, position: int, values: FloatArr
     return np.asarray((spread > 1e-6).any(0))  # less is rounding
 
 
-def _best(chain: Chain, states: FloatArray, column: int, values: FloatArray, size: FloatArray) -> FloatArray | None:
+def _best(chain: Sampled, states: FloatArray, column: int, values: FloatArray, size: FloatArray) -> FloatArray | None:
     """Position (K,) of every sample; None where it is not unique, or does not fit.
 
     size (C,): infinite of channels that do not count.
@@ -129,9 +216,9 @@ def _best(chain: Chain, states: FloatArray, column: int, values: FloatArray, siz
     # Gauss-Newton from there
     position = values[misfit.argmin(0)]
     for k in range(OPTIONS.steps):
-        tried = np.stack([position, position + STATE_STEP])
+        tried = np.stack([position, position + _STEP])
         at, moved = _residual(chain, _predicted(chain, states, column, tried), size)
-        slope = np.nan_to_num((at - moved) / STATE_STEP)
+        slope = np.nan_to_num((at - moved) / _STEP)
         steepness = (slope**2).sum(-1)
         step = (slope * np.nan_to_num(at)).sum(-1) / np.maximum(steepness, 1e-12)
         position = position + np.where(seen, np.clip(step, -spacing, spacing) / (1 + (k == 0)), 0.0)
@@ -152,12 +239,12 @@ def _lead(misfit: FloatArray, circle: bool) -> FloatArray:
     return np.asarray(np.where(np.isfinite(values[1]), values[1] - values[0], np.inf))
 
 
-def _residual(chain: Chain, predicted: FloatArray, size: FloatArray) -> FloatArray:
+def _residual(chain: Sampled, predicted: FloatArray, size: FloatArray) -> FloatArray:
     """Residuals (B, K, C) in units of the channels' spread, zero where nothing was observed."""
     return np.where(chain.observed, (chain.measured - predicted) / size, 0.0)
 
 
-def _joined(chain: Chain, position: FloatArray, blind: BoolArray, circle: bool) -> FloatArray:
+def _joined(chain: Sampled, position: FloatArray, blind: BoolArray, circle: bool) -> FloatArray:
     """Log by log without jumps round the circle, and between the samples that tell."""
     joined = position.copy()
     for log in np.unique(chain.log):
@@ -169,7 +256,7 @@ def _joined(chain: Chain, position: FloatArray, blind: BoolArray, circle: bool) 
     return joined
 
 
-def _velocities(chain: Chain, positions: FloatArray) -> FloatArray:
+def _velocities(chain: Sampled, positions: FloatArray) -> FloatArray:
     """Velocities (K,) of positions (K,)."""
     velocities = np.zeros_like(positions)
     for log in np.unique(chain.log):
