@@ -88,14 +88,15 @@ def _put_indirect(
     model, columns = simulator.model, simulator.environment.state_columns(simulator.model)
     derived = [c is None for c in columns]
     hidden = [j for j in range(model.njnt) if j not in known and not has_pose(model, j)]
-    tell = np.isfinite(trajectory.observations[:, derived]).any()
+    samples = LogSamples(simulator, trajectory)
+    tell = samples.observed[:, derived].any()
     if not hidden or not tell or simulator.environment.memory_size or len(trajectory) < 2:
         return set()
     direct = np.isin(
         np.arange(2 * model.nv + model.na), [c - 1 - model.nq + model.nv for c in measured if c > model.nq]
     )
     direct[[d for j in known for d in dofs_of(model, j)]] = True
-    places, indirect, _ = indirect_positions(LogSamples(simulator, trajectory), states, direct)
+    places, indirect, _ = indirect_positions(samples, states, direct)
     out = {j for j in hidden if indirect[model.jnt_dofadr[j]]}
     for joint in out:
         position = 1 + int(model.jnt_qposadr[joint])

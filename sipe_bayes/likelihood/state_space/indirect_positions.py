@@ -46,11 +46,25 @@ OPTIONS = IndirectOptions()
 class Sampled(Protocol):
     """K samples of logs, and what is predicted of them from states."""
 
-    simulator: Simulator
-    measured: FloatArray  # (K, C)
-    observed: BoolArray  # (K, C)
-    log: IntArray  # (K,), which one a sample belongs to
-    dt: FloatArray  # (K,)
+    @property
+    def simulator(self) -> Simulator:
+        """Of the model."""
+
+    @property
+    def measured(self) -> FloatArray:
+        """(K, C)."""
+
+    @property
+    def observed(self) -> BoolArray:
+        """(K, C)."""
+
+    @property
+    def log(self) -> IntArray:
+        """Which one a sample belongs to (K,)."""
+
+    @property
+    def dt(self) -> FloatArray:
+        """(K,), s."""
 
     @property
     def least(self) -> tuple[FloatArray, FloatArray]:
@@ -142,8 +156,9 @@ def indirect_positions(
     """
     model, states = chain.simulator.model, states.copy()
     indirect, irrelevant = np.zeros(model.nv, bool), np.zeros(model.nv, bool)
-    size = np.nanstd(np.where(chain.observed, chain.measured, np.nan), axis=0)
-    size = np.maximum(size, chain.least[0])
+    size, seen = chain.least[0].copy(), chain.observed.any(0)
+    spread = np.nanstd(np.where(chain.observed, chain.measured, np.nan)[:, seen], axis=0)
+    size[seen] = np.maximum(spread, size[seen])
     dependent: dict[int, BoolArray] = {}  # degree of freedom -> channels (C,) that depend on its position
     felt = inertial_joints(model, chain.simulator.environment.poses)
     for j in map(int, np.flatnonzero(~measured[: model.nv])):

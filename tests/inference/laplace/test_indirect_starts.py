@@ -51,7 +51,7 @@ def test_the_angle_is_where_cosine_and_sine_have_it(simulator: Simulator) -> Non
 def test_windows_begin_where_cosine_and_sine_say(simulator: Simulator) -> None:
     """Ten fits of half-second windows: within five sds, and z has a root mean square below 1.6 (each 1 in 1000).
 
-    From an angle of zero that was 3, one value 8 sds off, without a finding.
+    From an angle of zero it was 2.6, one value 8 sds off, without a finding.
     """
     sizes = []
     for seed in range(10):
