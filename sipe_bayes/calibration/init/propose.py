@@ -56,6 +56,7 @@ _HELD = 0.75  # share of a single log that trains
 _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
 _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
+_TURNING = 24  # windows of the fit of what turns freely: contacts take their time
 _SHORT = 2.0  # s: logs as short are one window each
 
 
@@ -282,11 +283,10 @@ def _unknowns(
     sizes = Sizes.of(model, machine, np.concatenate(states), np.concatenate(controls))
     unknowns = candidates(model, machine, draft.readings, sizes)
     beside = springs(model, machine, draft.readings, sizes)
-    trial, _ = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, MANY)
+    windows = _TURNING if trial.simulator.environment.rotations else MANY
+    trial, _ = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, windows)
     names = list(trial.simulator.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
-    if trial.simulator.environment.rotations:
-        return unknowns, 0.0, []
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
     left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
     late, note = delay_of(actuators, left, logs[0].dt)

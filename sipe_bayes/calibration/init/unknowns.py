@@ -88,7 +88,7 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
-    free = [] if open_scale else bodies
+    free = bodies if _driven(machine, readings) else []  # what is only thrown moves alike whatever its mass
     masses, attached = _masses(model, [*behind, *free])
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
