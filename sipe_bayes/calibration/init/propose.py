@@ -85,7 +85,7 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
     lines, sources, dropped = _split(files, opened, measurements, commands, folder)
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
-        doubts=(*dropped, *_unmatched(model, machine, matches, commands)),
+        doubts=(*dropped, *matches.doubts, *_unmatched(model, machine, matches, commands)),
         notes=_unused(matches, commands),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
