@@ -41,7 +41,7 @@ class Actuator:
     """An actuator with one control, what it is given, and the joint that it moves; full: what a whole duty stands for.
 
     That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
-    one_way: whether that range lies on one side of zero, so that a command of the other sign does nothing.
+    limits: its ctrlrange, to which commands are clipped; None where it has none.
     """
 
     name: str
@@ -49,7 +49,12 @@ class Actuator:
     joint: Joint | None
     rank: int
     full: float | None = None
-    one_way: bool = False
+    limits: tuple[float, float] | None = None
+
+    @property
+    def one_way(self) -> bool:
+        """Whether its ctrlrange lies on one side of zero, so that a command of the other sign does nothing."""
+        return self.limits is not None and self.limits[0] * self.limits[1] >= 0
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class Machine:
                 by_id.get(_joint_of(model, i)),
                 k,
                 full_of(model, i),
-                bool(model.actuator_ctrllimited[i]) and bool(model.actuator_ctrlrange[i].prod() >= 0),
+                _limits_of(model, i),
             )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
@@ -115,6 +120,11 @@ def full_of(model: mujoco.MjModel, index: int) -> float | None:
     low, high = model.actuator_ctrlrange[index].tolist()
     even = bool(model.actuator_ctrllimited[index]) and high > 0 and low in (0.0, -high)
     return float(high) if even else None
+
+
+def _limits_of(model: mujoco.MjModel, index: int) -> tuple[float, float] | None:
+    low, high = model.actuator_ctrlrange[index].tolist()
+    return (low, high) if model.actuator_ctrllimited[index] else None
 
 
 def _joint_of(model: mujoco.MjModel, index: int) -> int:
