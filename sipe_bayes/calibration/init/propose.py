@@ -169,7 +169,7 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
         out.append(f"no column drives {', '.join(still)}: it gets zero; name its column under [[commands]]")
     measured = {m.target for m in (*matches.positions, *matches.velocities, *matches.vectors)}
     owners = {target.rpartition(".")[0] for target in measured}
-    known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}" in owners}
+    known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}.position" in measured}
     chained = {model.joint(joint).name for joint in dependent_joints(model, known)}
     blind = [j.name for j in machine.joints if f"joint:{j.name}" not in owners and j.name not in chained]
     posed = [] if _is_felt(machine, matches) else [j for j in range(model.njnt) if has_pose(model, j)]
