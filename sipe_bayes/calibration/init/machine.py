@@ -41,7 +41,8 @@ class Actuator:
     """An actuator with one control, what it is given, and the joint that it moves; full: what a whole duty stands for.
 
     That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
-    limits: its ctrlrange, to which commands are clipped; None where it has none.
+    limits: its ctrlrange, to which commands are clipped; None where it has none. tendon: whether it pulls a tendon,
+    the first of whose joints is its joint where these make it up.
     """
 
     name: str
@@ -50,6 +51,12 @@ class Actuator:
     rank: int
     full: float | None = None
     limits: tuple[float, float] | None = None
+    tendon: bool = False
+
+    @property
+    def turns(self) -> bool:
+        """Whether it moves something about an axis, else along a line."""
+        return not self.tendon if self.joint is None else self.joint.hinge
 
     @property
     def one_way(self) -> bool:
@@ -86,6 +93,7 @@ class Machine:
                 k,
                 full_of(model, i),
                 _limits_of(model, i),
+                int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON),
             )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
@@ -128,8 +136,10 @@ def _limits_of(model: mujoco.MjModel, index: int) -> tuple[float, float] | None:
 
 
 def _joint_of(model: mujoco.MjModel, index: int) -> int:
-    """The joint that an actuator moves, itself or by its tendon's first; -1 for none."""
+    """The joint that an actuator moves, itself or by its tendon's first; -1 for none, and for tendons through sites."""
     kind, at = int(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
     if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-        return int(model.wrap_objid[model.tendon_adr[at]])
+        first = model.tendon_adr[at]
+        by_joints = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
+        return int(model.wrap_objid[first]) if by_joints else -1
     return at if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)) else -1

@@ -157,10 +157,11 @@ def _vector(match: Match, table: Table) -> Reading:
 
 
 def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -> Reading:
-    hinge = actuator.joint is None or actuator.joint.hinge
+    hinge = actuator.turns
     force = "N m" if hinge else "N"
+    of_force = "1" if actuator.tendon and match.label.kind != Kind.TORQUE else force  # a winch's, of what no gear tells
     default = {
-        Drive.FORCE: {Kind.CURRENT: "A", Kind.VOLTAGE: "V"}.get(match.label.kind, force),
+        Drive.FORCE: {Kind.CURRENT: "A", Kind.VOLTAGE: "V"}.get(match.label.kind, of_force),
         Drive.POSITION: "rad" if hinge else "m",
         Drive.VELOCITY: "rad/s" if hinge else "m/s",
         Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(match.label.kind, "V"),

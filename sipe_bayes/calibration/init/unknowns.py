@@ -149,7 +149,7 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
     in_force = reading.match.label.kind == Kind.TORQUE or reading.unit in ("N m", "mN m", "N", "mN")
     if actuator.drive != Drive.FORCE or in_force:
         return []
-    gear = float(model.actuator_gear[index, 0])
+    gear = float(model.actuator_gear[index, 0]) or float(np.linalg.norm(model.actuator_gear[index]))  # at a site
     note = f"gain, {gain:g} in the model, before the gear of {gear:g}: the command is no force"
     return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, note)]
 

@@ -62,3 +62,26 @@ def test_commands_that_a_range_clips_in_part(tmp_path: Path) -> None:
     assert not draft.open_doubts
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
     assert any("% of it lie outside of the ctrlrange [0.0, 1.0] of fan" in doubt for doubt in draft.open_doubts)
+
+
+FINGER = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody><site name="winch" pos=".1 0 0"/>
+  <body name="proximal"><joint name="mcp" axis="0 1 0" damping=".02" stiffness=".3"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".1"/><site name="tip" pos="0.02 0 -.08"/>
+  <body name="distal" pos="0 0 -.1"><joint name="pip" axis="0 1 0" damping=".02" stiffness=".3"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.08" size=".01" mass=".05"/></body></body></worldbody>
+  <tendon>{}</tendon><actuator><motor name="fan" tendon="cable"/></actuator></mujoco>"""
+FIXED = '<fixed name="cable"><joint joint="mcp" coef=".5"/><joint joint="pip" coef=".3"/></fixed>'
+SPATIAL = '<spatial name="cable"><site site="winch"/><site site="tip"/></spatial>'
+
+
+@pytest.mark.parametrize("cable", [FIXED, SPATIAL])
+@pytest.mark.parametrize("column", ["u", "winch_torque", "cable_N"])
+def test_the_gain_of_a_tendon_is_asked_for_unless_its_command_is_a_force(
+    tmp_path: Path, cable: str, column: str
+) -> None:
+    model = FINGER.format(cable) + "<!--{}-->"
+    draft = driven(tmp_path, model, "", 1.0, column)
+    units = {"u": "1", "winch_torque": "N m" if cable == FIXED else "N", "cable_N": "N"}
+    assert [reading.unit for reading in draft.commands] == [units[column]]
+    assert ("fan_gain" in {unknown.name for unknown in draft.proposed}) == (column == "u")
+    assert any("all forces and masses are relative to" in doubt for doubt in draft.open_doubts) == (column == "u")
