@@ -29,6 +29,7 @@ _APART = 0.05  # share of its effect that no other parameter has: less is how ex
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
 _MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
 _TELLING = 0.02  # of the squared miss, from which a delay is asked for
+_LITTLE = 1.1  # times the miss without a delay, below which it is uncertain
 
 
 @dataclass(frozen=True)
@@ -311,8 +312,9 @@ def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknow
         return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
     low, high = dt * max(0, best - max(3, best // 2)), _round(dt * max(2 * best, best + 3))
     targets = tuple(f"actuator:{name}.delay" for name in actuators)
-    note = (
-        f"commands arrive about {1e3 * dt * late:.3g} ms late, {late:.2g} samples: without that, simulated windows "
-        f"miss {np.sqrt(at_zero):.2f} times as much"
-    )
+    times, when = float(np.sqrt(at_zero)), f"{1e3 * dt * late:.3g} ms late, {late:.2g} samples"
+    note = f"commands arrive about {when}: without that, simulated windows miss {times:.2f} times as much"
+    if times < _LITTLE:
+        low, share = 0.0, 100 * (1 - 1 / times)
+        note = f"commands may arrive about {when}: uncertain, for it explains {share:.1g} % of what simulations miss"
     return [Unknown("delay", targets, float(f"{low:.2g}"), high, False, note)], note
