@@ -143,3 +143,33 @@ def _joint_of(model: mujoco.MjModel, index: int) -> int:
         by_joints = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
         return int(model.wrap_objid[first]) if by_joints else -1
     return at if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)) else -1
+
+
+def top_of(model: mujoco.MjModel, geom: int, tops: set[int]) -> int:
+    """The free body that a geom moves with; 0 for none."""
+    body, top = int(model.geom_bodyid[geom]), 0
+    while body:
+        top, body = (body if body in tops else top), int(model.body_parentid[body])
+    return top
+
+
+def touched_by(model: mujoco.MjModel, geom: int) -> list[int]:
+    """The geoms that stand still and that a geom may touch."""
+    kinds, with_kinds = model.geom_contype, model.geom_conaffinity
+    meets = (kinds[geom] & with_kinds) | (kinds & with_kinds[geom])
+    return [g for g in range(model.ngeom) if meets[g] and int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+
+
+def own_friction(model: mujoco.MjModel, geom: int) -> float:
+    """A geom's sliding friction."""
+    return float(model.geom_friction[geom, 0])
+
+
+def counts(model: mujoco.MjModel, geom: int, other: int) -> bool:
+    """Whether a geom's friction counts where it touches another one."""
+    return bool(model.geom_priority[geom] >= model.geom_priority[other])
+
+
+def friction_of(model: mujoco.MjModel, geom: int, other: int) -> float:
+    """The sliding friction of two geoms that touch."""
+    return max(own_friction(model, a) for a, b in ((geom, other), (other, geom)) if counts(model, a, b))

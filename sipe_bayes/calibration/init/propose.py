@@ -24,6 +24,7 @@ from sipe_bayes.calibration.init.unknowns import (
     Sizes,
     candidates,
     delay_of,
+    nameless,
     scale_is_open,
     springs,
     sprung,
@@ -86,7 +87,7 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
         doubts=(*dropped, *matches.doubts, *_unmatched(model, machine, matches, commands)),
-        notes=_unused(matches, commands),
+        notes=(*_unused(matches, commands), *nameless(model, machine)),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     trained = _decided(draft, model, machine, sources, folder) if positions else _undecided(draft, model, machine)
