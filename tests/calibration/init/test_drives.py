@@ -35,7 +35,7 @@ def driven(folder: Path, model: str, limits: str, factor: float, column: str = "
 
 
 @pytest.mark.parametrize(
-    ("limits", "factor", "sign", "told"),
+    ("limits", "factor", "sign", "words"),
     [
         (' ctrlrange="0 1"', -1.0, -1, "and inside with the other sign, which is taken"),
         (' ctrlrange="0 1"', 1.0, 1, ""),
@@ -44,14 +44,14 @@ def driven(folder: Path, model: str, limits: str, factor: float, column: str = "
     ],
 )
 def test_commands_that_a_range_clips_altogether(
-    tmp_path: Path, limits: str, factor: float, sign: int, told: str
+    tmp_path: Path, limits: str, factor: float, sign: int, words: str
 ) -> None:
     draft = driven(tmp_path, PENDULUM, limits, factor)
     (command,) = draft.commands
     about = [doubt for doubt in command.doubts if "ctrlrange" in doubt]
-    assert (command.sign, len(about)) == (sign, bool(told)), command
-    assert all(told in doubt for doubt in about)
-    assert (f"sign = {-sign}" in toml_of(draft, "sipe init")) == bool(told)
+    assert (command.sign, len(about)) == (sign, bool(words)), command
+    assert all(words in doubt for doubt in about)
+    assert (f"sign = {-sign}" in toml_of(draft, "sipe init")) == bool(words)
 
 
 def test_commands_that_a_range_clips_in_part(tmp_path: Path) -> None:
