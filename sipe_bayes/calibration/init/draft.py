@@ -230,7 +230,7 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
             return ("rad", "deg") if joint.hinge else ("m", "mm", "cm")
         return ("rad/s", "deg/s", "rpm") if joint.hinge else ("m/s", "mm/s")
     actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
-    hinge = actuator.joint is None or actuator.joint.hinge
+    hinge = actuator.turns
     if actuator.drive == Drive.POSITION:
         return ("rad", "deg") if hinge else ("m", "mm", "cm")
     if actuator.drive == Drive.VELOCITY:

@@ -41,7 +41,8 @@ class Actuator:
     """An actuator with one control, what it is given, and the joint that it moves; full: what a whole duty stands for.
 
     That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
-    one_way: whether that range lies on one side of zero, so that a command of the other sign does nothing.
+    limits: its ctrlrange, to which commands are clipped; None where it has none. tendon: whether it pulls a tendon,
+    the first of whose joints is its joint where these make it up.
     """
 
     name: str
@@ -49,7 +50,18 @@ class Actuator:
     joint: Joint | None
     rank: int
     full: float | None = None
-    one_way: bool = False
+    limits: tuple[float, float] | None = None
+    tendon: bool = False
+
+    @property
+    def turns(self) -> bool:
+        """Whether it moves something about an axis, else along a line."""
+        return not self.tendon if self.joint is None else self.joint.hinge
+
+    @property
+    def one_way(self) -> bool:
+        """Whether its ctrlrange lies on one side of zero, so that a command of the other sign does nothing."""
+        return self.limits is not None and self.limits[0] * self.limits[1] >= 0
 
 
 @dataclass(frozen=True)
@@ -80,7 +92,8 @@ class Machine:
                 by_id.get(_joint_of(model, i)),
                 k,
                 full_of(model, i),
-                bool(model.actuator_ctrllimited[i]) and bool(model.actuator_ctrlrange[i].prod() >= 0),
+                _limits_of(model, i),
+                int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON),
             )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
@@ -117,9 +130,46 @@ def full_of(model: mujoco.MjModel, index: int) -> float | None:
     return float(high) if even else None
 
 
+def _limits_of(model: mujoco.MjModel, index: int) -> tuple[float, float] | None:
+    low, high = model.actuator_ctrlrange[index].tolist()
+    return (low, high) if model.actuator_ctrllimited[index] else None
+
+
 def _joint_of(model: mujoco.MjModel, index: int) -> int:
-    """The joint that an actuator moves, itself or by its tendon's first; -1 for none."""
+    """The joint that an actuator moves, itself or by its tendon's first; -1 for none, and for tendons through sites."""
     kind, at = int(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
     if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-        return int(model.wrap_objid[model.tendon_adr[at]])
+        first = model.tendon_adr[at]
+        by_joints = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
+        return int(model.wrap_objid[first]) if by_joints else -1
     return at if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)) else -1
+
+
+def top_of(model: mujoco.MjModel, geom: int, tops: set[int]) -> int:
+    """The free body that a geom moves with; 0 for none."""
+    body, top = int(model.geom_bodyid[geom]), 0
+    while body:
+        top, body = (body if body in tops else top), int(model.body_parentid[body])
+    return top
+
+
+def touched_by(model: mujoco.MjModel, geom: int) -> list[int]:
+    """The geoms that stand still and that a geom may touch."""
+    kinds, with_kinds = model.geom_contype, model.geom_conaffinity
+    meets = (kinds[geom] & with_kinds) | (kinds & with_kinds[geom])
+    return [g for g in range(model.ngeom) if meets[g] and int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+
+
+def own_friction(model: mujoco.MjModel, geom: int) -> float:
+    """A geom's sliding friction."""
+    return float(model.geom_friction[geom, 0])
+
+
+def counts(model: mujoco.MjModel, geom: int, other: int) -> bool:
+    """Whether a geom's friction counts where it touches another one."""
+    return bool(model.geom_priority[geom] >= model.geom_priority[other])
+
+
+def friction_of(model: mujoco.MjModel, geom: int, other: int) -> float:
+    """The sliding friction of two geoms that touch."""
+    return max(own_friction(model, a) for a, b in ((geom, other), (other, geom)) if counts(model, a, b))

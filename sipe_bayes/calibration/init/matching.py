@@ -11,11 +11,25 @@ import numpy as np
 import scipy.optimize
 
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
-from sipe_bayes.calibration.init.names import Kind, Label, alike, number_of, pieces_of, read_name
+from sipe_bayes.calibration.init.names import (
+    OF_BODIES,
+    Kind,
+    Label,
+    alike,
+    is_accelerometer,
+    is_gyro,
+    is_spin,
+    is_turn,
+    number_of,
+    pieces_of,
+    read_name,
+    two_ways,
+)
 from sipe_bayes.calibration.init.signals import slope_of
 from sipe_bayes.core.arrays import FloatArray
 
 Table = Mapping[str, FloatArray]
+Families = Mapping[str, list[Label]]
 
 _SURE = 1.0  # a score from which names alone decide
 _NEVER = -2.0
@@ -46,7 +60,7 @@ class Match:
 
 @dataclass(frozen=True)
 class Matches:
-    """Every quantity of the model that has a column; rivals: commands that would have done as well."""
+    """Every quantity of the model that has a column; rivals: commands that would do as well; doubts: of all columns."""
 
     positions: tuple[Match, ...]
     velocities: tuple[Match, ...]
@@ -54,21 +68,38 @@ class Matches:
     vectors: tuple[Match, ...]
     rivals: tuple[Match, ...]
     left: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
 
 def match_columns(machine: Machine, table: Table) -> Matches:
     """Match varying columns to a model; table: column -> (n,) numbers of one log, without its clocks."""
-    labels = [read_name(name) for name in table]
+    own = _own_words(machine)
+    labels = [read_name(name, own) for name in table]
     labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
     vectors, labels = _vectors(machine, labels)
-    labels = _unravelled(machine, _called_as_joints(machine, labels), table)
+    vectors, open_vectors = _held_open(vectors)
+    labels, open_commands = _unravelled(machine, _called_as_joints(machine, labels), table)
     offsets = _ordinals(labels)
     positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
     velocities = _by_position(positions, _assigned(machine.joints, labels, Kind.VELOCITY, offsets), table)
     commands, rivals = _commands(machine, labels, offsets)
     used = {c for m in (*positions, *velocities, *commands, *vectors) for c in m.columns}
     left = tuple(name for name in table if name not in used)
-    return Matches(tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left)
+    doubts = (*open_vectors, *open_commands)
+    return Matches(tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts)
+
+
+def _own_words(machine: Machine) -> set[str]:
+    """Words of velocities and accelerations that are none here: a joint is called so, or nothing has an inertial unit.
+
+    Of these ``gx`` and ``ax`` are short enough to be anything.
+    """
+    own = {piece for joint in machine.joints for piece in pieces_of(joint.name)} & OF_BODIES
+    sensors = {kind for _, kind in machine.sensors}
+    for kind, letter in (("gyro", "g"), ("accelerometer", "a")):
+        if not machine.bodies and kind not in sensors:
+            own |= {letter + axis for axis in "xyz"}
+    return own
 
 
 def _ordinals(labels: Sequence[Label]) -> dict[str, int]:
@@ -156,6 +187,7 @@ def _by_position(positions: Sequence[Match], velocities: Sequence[Match], table:
 _FORCE = {Kind.TORQUE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 2.0, Kind.VOLTAGE: 1.8, Kind.DUTY: 1.7, Kind.SETPOINT: 0.3}
 _VOLTS = {Kind.VOLTAGE: 3.0, Kind.DUTY: 2.8, Kind.COMMAND: 2.6, Kind.CURRENT: 0.5, Kind.TORQUE: 0.3, Kind.SETPOINT: 0.2}
 _ANY = {Kind.COMMAND: 3.0, Kind.DUTY: 2.8, Kind.SETPOINT: 2.4, Kind.TORQUE: 2.0, Kind.VOLTAGE: 2.0, Kind.CURRENT: 1.5}
+_DRIVING = {Kind.COMMAND, Kind.SETPOINT, Kind.SPEED_SETPOINT, Kind.TORQUE, Kind.DUTY}
 _FITS: dict[Drive, dict[Kind, float]] = {
     Drive.FORCE: _FORCE,
     Drive.POSITION: {Kind.SETPOINT: 3.0, Kind.COMMAND: 2.6},
@@ -212,8 +244,8 @@ def _called_as_joints(machine: Machine, labels: list[Label]) -> list[Label]:
     ]
 
 
-def _unravelled(machine: Machine, labels: list[Label], table: Table) -> list[Label]:
-    """Labels with kinds for columns whose names say none: by how many they are, and what is the slope of what."""
+def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[list[Label], list[str]]:
+    """Labels with kinds for columns whose names say none, by their number and by what is whose slope; and doubts."""
     unknown = [x for x in labels if x.kind == Kind.UNKNOWN]
     families: dict[str, list[Label]] = defaultdict(list)
     for label in unknown:
@@ -221,13 +253,14 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> list[Lab
     known = {x.column: x for x in labels}
     joints = len(machine.joints)
     have = sum(x.kind == Kind.POSITION for x in labels)
-    driven = any(x.kind in fits for x in labels for fits in _FITS.values())
+    states = {s for s, family in families.items() if s and joints and not have and len(family) in (joints, 2 * joints)}
+    driving, doubts = _by_number(machine, {s: f for s, f in families.items() if s and s not in states}, labels)
     for stem, family in families.items():
         family = sorted(family, key=lambda x: x.number or 0)
         kinds = [Kind.OTHER] * len(family)
-        if stem and joints and not have and len(family) in (joints, 2 * joints):
+        if stem in states:
             kinds = _kinds(family, table, joints)
-        elif stem and not driven and len(family) == len(machine.actuators) > 1:
+        elif stem == driving:
             kinds = [Kind.COMMAND] * len(family)
         elif not stem:
             kinds = _by_slopes(family, labels, table)
@@ -235,7 +268,26 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> list[Lab
             place = None if kind == Kind.OTHER or not stem else [k for k in kinds[: family.index(label)]].count(kind)
             number = label.number if place is None else place
             known[label.column] = replace(label, kind=kind, number=number, stem=f"{label.stem}{kind.name}")
-    return list(known.values())
+    return list(known.values()), doubts
+
+
+def _by_number(machine: Machine, families: Families, labels: list[Label]) -> tuple[str | None, list[str]]:
+    """The stem of the family that is taken for commands, since it has a column for each actuator; and doubts."""
+    count, kinds = len(machine.actuators), [x.kind for x in labels]
+    felt = sum(kind in (Kind.CURRENT, Kind.VOLTAGE) for kind in kinds)  # one may be the battery's
+    as_many = {stem: family for stem, family in families.items() if len(family) == count > 1}
+    if not as_many or felt >= count or any(kind in _DRIVING for kind in kinds):
+        return None, []
+
+    def likeness(stem: str) -> float:
+        return max(alike(as_many[stem][0].words, actuator.name) for actuator in machine.actuators)
+
+    chosen, *others = sorted(as_many, key=likeness, reverse=True)
+    names = {stem: ", ".join(repr(x.column) for x in family) for stem, family in as_many.items()}
+    rivals = "".join(f"; or are these: {names[stem]}?" for stem in others)
+    driven = ", ".join(actuator.name for actuator in machine.actuators)
+    text = f"{names[chosen]} are taken for the commands of {driven} since they are as many: their names do not say so"
+    return chosen, [f"{text}{rivals or '; check it'}"]
 
 
 def _kinds(family: Sequence[Label], table: Table, joints: int) -> list[Kind]:
@@ -308,39 +360,32 @@ Wanted = tuple[Callable[[Label, str], bool], int, Callable[[str], tuple[str, flo
 def _wanted(machine: Machine) -> list[Wanted]:
     """What vectors a model may have: whether a column is one of them, how many, and the target of a stem."""
     out: list[Wanted] = [
-        (_of_gyro if kind == "gyro" else _of_accelerometer, 3, partial(_sensor, name)) for name, kind in machine.sensors
+        (is_gyro if kind == "gyro" else is_accelerometer, 3, partial(_sensor, name)) for name, kind in machine.sensors
     ]
     if machine.bodies:
-        out.append((_turns, 4, partial(_body, machine, "orientation")))
-        out.append((lambda x, s: x.kind == Kind.POSITION and not _turns(x, s), 3, partial(_body, machine, "position")))
-        out.append((_spins, 3, partial(_body, machine, "angular_velocity")))
+        out.append((is_turn, 4, partial(_body, machine, "orientation")))
+        out.append((lambda x, s: x.kind == Kind.POSITION and not is_turn(x, s), 3, partial(_body, machine, "position")))
+        out.append((is_spin, 3, partial(_body, machine, "angular_velocity")))
         out.append(
-            (lambda x, s: x.kind == Kind.VELOCITY and not _spins(x, s), 3, partial(_body, machine, "linear_velocity"))
+            (lambda x, s: x.kind == Kind.VELOCITY and not is_spin(x, s), 3, partial(_body, machine, "linear_velocity"))
         )
     return out
 
 
-def _speaks(stem: str, *words: str) -> bool:
-    return any(word in stem.lower() for word in words)
-
-
-def _of_gyro(label: Label, stem: str) -> bool:
-    return label.kind == Kind.VELOCITY and (_speaks(stem, "gyro", "omega", "ang") or pieces_of(stem)[-1:] == ["g"])
-
-
-def _of_accelerometer(label: Label, stem: str) -> bool:
-    return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or pieces_of(stem)[-1:] == ["a"])
-
-
-def _turns(label: Label, stem: str) -> bool:
-    return label.kind == Kind.QUATERNION or (label.number is not None and _speaks(stem, "quat", "orientation"))
-
-
-def _spins(label: Label, stem: str) -> bool:
-    if label.kind != Kind.VELOCITY:
-        return False
-    world = _speaks(stem, "vel", "lin")  # beside such a word a `w` is the frame
-    return _speaks(stem, "ang", "omega", "gyro") or (bool({"w", "g"} & {*pieces_of(stem)}) and not world)
+def _held_open(vectors: list[Match]) -> tuple[list[Match], list[str]]:
+    """Vectors, of which none that may be another one is sure unless that one is there; and what is to be said."""
+    reasons = [two_ways(m.label, m.target) if m.target.startswith("body:") else "" for m in vectors]
+    clear = {match.target for match, why in zip(vectors, reasons, strict=True) if not why}
+    other = {"linear_velocity": "angular_velocity", "angular_velocity": "linear_velocity"}
+    out, doubts = [], []
+    for match, why in zip(vectors, reasons, strict=True):
+        body, _, quantity = match.target.rpartition(".")
+        if why and ("<gyro>" in why or f"{body}.{other[quantity]}" not in clear):
+            names = ", ".join(map(repr, match.columns))
+            doubts.append(f"{names} are taken for {match.target}: {why}")
+            match = replace(match, score=0.0)
+        out.append(match)
+    return out, doubts
 
 
 def _sensor(name: str, stem: str) -> tuple[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -66,12 +67,23 @@ _LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel
 _PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
 _POSITIONS = _ANGLES | _LENGTHS | _PLACES
 _ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # velocities of a body
+_PUSHED = {"ax", "ay", "az"}  # accelerations of a body
+OF_BODIES = _ALONG | _ABOUT | _PUSHED
+"""Words with an axis, of velocities and accelerations."""
 _SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
     "angvel",
 } | _ALONG | _ABOUT  # fmt: skip
-_ACCELERATIONS = {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot", "accelerometer"} | {
-    "ax", "ay", "az",
-}  # fmt: skip
+_ACCELERATIONS = {
+    "acceleration",
+    "accelerations",
+    "acc",
+    "accel",
+    "qacc",
+    "ddq",
+    "qdd",
+    "ddot",
+    "accelerometer",
+} | _PUSHED
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
     "input", "drive", "applied", "a",
@@ -102,7 +114,9 @@ _TIMES = {"time", "t", "timestamp", "timestamps", "stamp", "clock", "elapsed", "
 _EPISODES = {"episode", "trial", "rollout", "demo", "toss", "experiment", "ep", "traj", "trajectory"}
 _OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "index", "frame", "id", "reward"} | {
     "done", "task", "count", "seq", "step", "contact", "success", "residual", "power", "energy", "noise",
+    "humidity", "pressure", "rssi", "sonar", "lidar", "ultrasonic", "fault", "warning", "health",
 }  # fmt: skip
+_CELLS = {"cell", "cells"}  # of a battery: their voltages drive nothing
 _UNITS = {
     "rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degs": "deg", "degree": "deg",
     "degrees": "deg", "mrad": "mrad", "rev": "rev", "revs": "rev", "turns": "rev", "rpm": "rpm", "dps": "deg/s",
@@ -118,8 +132,8 @@ _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
 
 
-def read_name(column: str) -> Label:
-    """What a name says."""
+def read_name(column: str, own: Collection[str] = ()) -> Label:
+    """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
     plain = column.translate(_GREEK)
     unit = ""
     for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
@@ -139,7 +153,9 @@ def read_name(column: str) -> Label:
                 break
     if len(words) == 1 and words[0] in ("us", "ms", "ns"):
         return Label(column, Kind.TIME, (), None, column, words[0])
+    named, words = [word for word in words if word in own], [word for word in words if word not in own]
     flags, rest = _flags(words)
+    rest += named
     flags |= {"length"} if words and words[-1] in _ALONG | {"px", "py", "pz"} else set()
     flags |= {"angle"} if words and words[-1] in _ABOUT else set()
     kind = _kind(flags, unit, words)
@@ -210,6 +226,8 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
     drive = _driven(flags, place)
     if words and words[-1] in ("time", "stamp", "timestamp"):
         return Kind.TIME
+    if _CELLS & {*words} and "load" not in words:
+        return Kind.OTHER
     if "supply" in flags and not place and not flags & {"current", "torque", "other"} and unit not in ("A", "mA", "%"):
         return Kind.SUPPLY
     if "duty" in flags and not place:
@@ -311,3 +329,49 @@ def number_of(name: str) -> int | None:
     """The last number in a name of the model."""
     numbers = re.findall(r"\d+", name)
     return int(numbers[-1]) if numbers else None
+
+
+def _speaks(stem: str, *words: str) -> bool:
+    return any(word in stem.lower() for word in words)
+
+
+def is_gyro(label: Label, stem: str) -> bool:
+    """Whether a component of a vector with this name is a gyro's."""
+    return label.kind == Kind.VELOCITY and (_speaks(stem, "gyro", "omega", "ang") or pieces_of(stem)[-1:] == ["g"])
+
+
+def is_accelerometer(label: Label, stem: str) -> bool:
+    """Whether it is an accelerometer's."""
+    return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or pieces_of(stem)[-1:] == ["a"])
+
+
+def is_turn(label: Label, stem: str) -> bool:
+    """Whether it is a quaternion's."""
+    return label.kind == Kind.QUATERNION or (label.number is not None and _speaks(stem, "quat", "orientation"))
+
+
+def is_spin(label: Label, stem: str) -> bool:
+    """Whether it is an angular velocity's."""
+    if label.kind != Kind.VELOCITY:
+        return False
+    if label.unit.startswith(("rad", "deg", "rev", "rpm")) or label.unit in ("m", "mm", "cm", "m/s", "mm/s", "cm/s"):
+        return not label.unit.startswith(("m", "cm"))
+    if _speaks(stem, "ang", "omega", "gyro"):
+        return True
+    if _ABOUT & {*pieces_of(label.column)}:
+        return not _speaks(stem, "lin")
+    return bool({"w", "g"} & {*pieces_of(stem)}) and not _speaks(stem, "vel", "lin")  # beside these `w` is the frame
+
+
+def two_ways(label: Label, target: str) -> str:
+    """Why the velocity of a body that a component's name was taken for may be another one; "" where it is clear."""
+    pieces = {*pieces_of(label.column)}
+    if label.kind != Kind.VELOCITY or _speaks(label.vector, "ang", "omega"):
+        return ""
+    if {"gx", "gy", "gz"} & pieces:
+        return "a gyro tells it in the body's own axes: if it is one, give the model a <gyro>"
+    glued, linear = bool(_ABOUT & pieces), _speaks(label.vector, "lin")
+    if label.unit or not (linear or _speaks(label.vector, "vel")) or not (glued or ("w" in pieces and not linear)):
+        return ""
+    other = "linear" if target.endswith("angular_velocity") else "angular"
+    return f"or are they its {other} velocity, since `w` is the world as well as a rate?"

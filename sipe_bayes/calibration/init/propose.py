@@ -24,6 +24,7 @@ from sipe_bayes.calibration.init.unknowns import (
     Sizes,
     candidates,
     delay_of,
+    nameless,
     scale_is_open,
     springs,
     sprung,
@@ -56,6 +57,7 @@ _HELD = 0.75  # share of a single log that trains
 _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
 _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
+_TURNING = 24  # windows of the fit of what turns freely: contacts take their time
 _SHORT = 2.0  # s: logs as short are one window each
 
 
@@ -84,8 +86,8 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
     lines, sources, dropped = _split(files, opened, measurements, commands, folder)
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
-        doubts=(*dropped, *_unmatched(model, machine, matches, commands)),
-        notes=_unused(matches, commands),
+        doubts=(*dropped, *matches.doubts, *_unmatched(model, machine, matches, commands)),
+        notes=(*_unused(matches, commands), *nameless(model, machine)),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     trained = _decided(draft, model, machine, sources, folder) if positions else _undecided(draft, model, machine)
@@ -168,7 +170,7 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
         out.append(f"no column drives {', '.join(still)}: it gets zero; name its column under [[commands]]")
     measured = {m.target for m in (*matches.positions, *matches.velocities, *matches.vectors)}
     owners = {target.rpartition(".")[0] for target in measured}
-    known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}" in owners}
+    known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}.position" in measured}
     chained = {model.joint(joint).name for joint in dependent_joints(model, known)}
     blind = [j.name for j in machine.joints if f"joint:{j.name}" not in owners and j.name not in chained]
     posed = [] if _is_felt(machine, matches) else [j for j in range(model.njnt) if has_pose(model, j)]
@@ -282,11 +284,10 @@ def _unknowns(
     sizes = Sizes.of(model, machine, np.concatenate(states), np.concatenate(controls))
     unknowns = candidates(model, machine, draft.readings, sizes)
     beside = springs(model, machine, draft.readings, sizes)
-    trial, _ = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, MANY)
+    windows = _TURNING if trial.simulator.environment.rotations else MANY
+    trial, _ = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, windows)
     names = list(trial.simulator.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
-    if trial.simulator.environment.rotations:
-        return unknowns, 0.0, []
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
     left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
     late, note = delay_of(actuators, left, logs[0].dt)

@@ -30,6 +30,10 @@ _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
 _SHARES = (1.0, 100.0)  # that need not be whole numbers
 _FULL_DUTIES = (1.0, 100.0, 127.0, 255.0, 400.0, 511.0, 1000.0, 1023.0, 2047.0, 4095.0, 32767.0, 65535.0)
 _MILLIVOLTS = 200.0
+_NOISE, _FEW = (
+    0.01,
+    0.05,
+)  # of the largest command, what is about zero; of the samples, what is none of a command's side
 _TURNS = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}
 
 
@@ -59,7 +63,9 @@ def first_readings(
     positions = [_by_velocity(reading, matches, table, clock) for reading in positions]
     vectors = [_vector(m, table) for m in matches.vectors]
     velocities = [Reading(m, _unit(m, _joint_unit(machine, m, "/s"))) for m in matches.velocities]
-    commands = [_command(machine, m, matches, table) for m in matches.commands]
+    drives = {f"actuator:{actuator.name}": actuator for actuator in machine.actuators}
+    commands = [_command(drives[m.target], m, matches, table) for m in matches.commands]
+    commands = [_on_its_side(reading, drives[reading.match.target], table) for reading in commands]
     return (*positions, *velocities, *vectors), tuple(commands)
 
 
@@ -150,12 +156,12 @@ def _vector(match: Match, table: Table) -> Reading:
     return Reading(match, _unit(match, "m"), notes=_matched(match))
 
 
-def _command(machine: Machine, match: Match, matches: Matches, table: Table) -> Reading:
-    actuator = next(a for a in machine.actuators if match.target == f"actuator:{a.name}")
-    hinge = actuator.joint is None or actuator.joint.hinge
+def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -> Reading:
+    hinge = actuator.turns
     force = "N m" if hinge else "N"
+    of_force = "1" if actuator.tendon and match.label.kind != Kind.TORQUE else force  # a winch's, of what no gear tells
     default = {
-        Drive.FORCE: {Kind.CURRENT: "A", Kind.VOLTAGE: "V"}.get(match.label.kind, force),
+        Drive.FORCE: {Kind.CURRENT: "A", Kind.VOLTAGE: "V"}.get(match.label.kind, of_force),
         Drive.POSITION: "rad" if hinge else "m",
         Drive.VELOCITY: "rad/s" if hinge else "m/s",
         Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(match.label.kind, "V"),
@@ -203,6 +209,28 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
         return replace(reading, notes=(*reading.notes, note))
     doubt = f"a share of which voltage? no column tells; multiply `factor` by the supply's volts for {actuator.name}"
     return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
+
+
+def _on_its_side(reading: Reading, actuator: Actuator, table: Table) -> Reading:
+    """A command with the sign that the actuator's ctrlrange leaves it, where that lies on one side of zero."""
+    if actuator.limits is None or not actuator.one_way:
+        return reading
+    values = table[reading.match.column] * reading.factor * find_unit(reading.unit).factor
+    values = values[np.isfinite(values)] * (1 if max(actuator.limits) > 0 else -1)
+    least, most = np.sort(np.abs(actuator.limits))
+    lost = float((values < -_NOISE * np.abs(values).max()).mean())
+    text = f"outside of the ctrlrange {list(actuator.limits)} of {actuator.name}, which makes nothing of it"
+    if lost <= _FEW:
+        return reading
+    if lost < 1 - _FEW and (values > _NOISE * np.abs(values).max()).mean() > _FEW:
+        doubt = f"{100 * lost:.0f} % of it lie {text}: look at the range, and at where the command has its zero"
+        return replace(reading, doubts=(*reading.doubts, doubt))
+    turned = -values[values < 0]
+    if reading.supply or np.mean((turned > (1 + _NEAR) * most) | (turned < (1 - _NEAR) * least)) < _FEW:
+        doubt = f"all of it lies {text}, and inside with the other sign, which is taken; check it"
+        return replace(reading, sign=-1, doubts=(*reading.doubts, doubt), instead=(*reading.instead, "sign = 1"))
+    doubt = f"all of it lies {text}, and with the other sign too: look at the range and at the unit"
+    return replace(reading, doubts=(*reading.doubts, doubt), instead=(*reading.instead, "sign = -1"))
 
 
 def _looked_through(reading: Reading, actuator: Actuator, matches: Matches, table: Table) -> Reading:

@@ -5,13 +5,24 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.draft import Reading, Unknown
 from sipe_bayes.calibration.init.fits import Fit
-from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
+from sipe_bayes.calibration.init.machine import (
+    Actuator,
+    Drive,
+    Joint,
+    Machine,
+    counts,
+    friction_of,
+    own_friction,
+    top_of,
+    touched_by,
+)
 from sipe_bayes.calibration.init.names import Kind
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
@@ -28,7 +39,9 @@ _WEAK = 3.0  # of the noise, what a parameter has to move over its range
 _APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
 _MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
+_SLIPPERY = 0.02  # the least friction
 _TELLING = 0.02  # of the squared miss, from which a delay is asked for
+_LITTLE = 1.1  # times the miss without a delay, below which it is uncertain
 
 
 @dataclass(frozen=True)
@@ -88,7 +101,7 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
-    free = [] if open_scale else bodies
+    free = bodies if _driven(machine, readings) else []  # what is only thrown moves alike whatever its mass
     masses, attached = _masses(model, [*behind, *free])
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
@@ -149,7 +162,7 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
     in_force = reading.match.label.kind == Kind.TORQUE or reading.unit in ("N m", "mN m", "N", "mN")
     if actuator.drive != Drive.FORCE or in_force:
         return []
-    gear = float(model.actuator_gear[index, 0])
+    gear = float(model.actuator_gear[index, 0]) or float(np.linalg.norm(model.actuator_gear[index]))  # at a site
     note = f"gain, {gain:g} in the model, before the gear of {gear:g}: the command is no force"
     return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, note)]
 
@@ -197,28 +210,90 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
 
 
 def _contacts(model: mujoco.MjModel, machine: Machine) -> list[Unknown]:
-    """Friction and bounce of free bodies with what they touch."""
-    out = []
-    for body in machine.bodies:
-        own = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) == model.body(body).id]
-        still = [g for g in range(model.ngeom) if int(model.body_weldid[model.geom_bodyid[g]]) == 0]
-        touching = [g for g in own if model.geom_contype[g] or model.geom_conaffinity[g]]
-        names = [model.geom(g).name for g in (*touching, *still) if model.geom(g).name]
-        if not touching or not still or len(names) < 2:
-            continue
-        word, step = _word(body), float(model.opt.timestep)
-        for field, low, high, what in (
-            ("friction", 0.02, 1.5, "sliding friction; name both geoms, MuJoCo takes the larger one"),
-            (
-                "solref_timeconst",
-                _round(2 * step),
-                max(0.05, _round(10 * step)),
-                "of the contact: the shorter the harder",
-            ),
-            ("solref_dampratio", 0.1, 1.5, "of the contact: below 1 it bounces"),
-        ):
-            out.append(Unknown(f"{word}_{field}", tuple(f"geom:{n}.{field}" for n in names), low, high, False, what))
+    """Friction and bounce of free bodies, and of what moves with them, with what stands still.
+
+    Geoms whose friction with it is one number share a parameter: wheels, feet.
+    """
+    tops = {model.body(body).id for body in machine.bodies}
+    touching = {g: s for g in range(model.ngeom) if top_of(model, g, tops) and (s := touched_by(model, g))}
+    groups: dict[tuple[float, ...], list[int]] = {}
+    for geom, still in touching.items():
+        groups.setdefault(tuple(friction_of(model, geom, s) for s in still), []).append(geom)
+    leaning: list[set[int]] = [
+        {s for g in group for s in touching[g] if counts(model, s, g)} for group in groups.values()
+    ]
+    out: list[Unknown] = []
+    taken: set[int] = set()
+    for k, group in enumerate(groups.values()):
+        others = taken.union(*leaning[:k], *leaning[k + 1 :])
+        decides = {s for s in leaning[k] - taken if friction_of(model, group[0], s) <= own_friction(model, s)}
+        still = sorted(decides | (leaning[k] - others))
+        taken |= {*still}
+        own = [g for g in group if any(counts(model, g, s) for s in touching[g])]
+        least = max((own_friction(model, s) for s in leaning[k] - {*still}), default=_SLIPPERY)
+        bodies = {int(model.geom_bodyid[g]) for g in group}
+        above = [top_of(model, g, tops) for g in group] if bodies & tops or len(groups) == 1 else sorted(bodies)
+        name = f"{_shared(model, above)}_friction"
+        name += f"_{k + 1}" * any(unknown.name == name for unknown in out)
+        span, what = (least, max(1.5, 2 * least)), _mixed(own, still, least)
+        out += _of_geoms(model, name, "friction", (own, still), span, what)
+    if touching:
+        every = (sorted(touching), sorted({s for still in touching.values() for s in still}))
+        word, step = _shared(model, [top_of(model, g, tops) for g in touching]), float(model.opt.timestep)
+        spans = {"timeconst": (_round(2 * step), max(0.05, _round(10 * step))), "dampratio": (0.1, 1.5)}
+        says = {
+            "timeconst": "of the contact: the shorter the harder",
+            "dampratio": "of the contact: below 1 it bounces",
+        }
+        for key, span in spans.items():
+            out += _of_geoms(model, f"{word}_solref_{key}", f"solref_{key}", every, span, says[key])
     return out
+
+
+def nameless(model: mujoco.MjModel, machine: Machine) -> list[str]:
+    """What is to be said of free bodies of which no geom that may touch what stands still has a name."""
+    tops = {model.body(body).id for body in machine.bodies}
+    named: dict[int, bool] = {}
+    for geom in range(model.ngeom):
+        if (top := top_of(model, geom, tops)) and touched_by(model, geom):
+            named[top] = named.get(top, False) or bool(model.geom(geom).name)
+    names = ", ".join(model.body(top).name for top, any_named in named.items() if not any_named)
+    return [f"friction of {names} is not asked for: no geom of it that may touch something has a name"] if names else []
+
+
+def _of_geoms(
+    model: mujoco.MjModel,
+    name: str,
+    field: str,
+    geoms: tuple[Sequence[int], Sequence[int]],
+    span: tuple[float, float],
+    what: str,
+) -> list[Unknown]:
+    """One number of geoms that move and of those that stand still; nothing where all of one sort have no name."""
+    named = [[model.geom(g).name for g in part if model.geom(g).name] for part in geoms]
+    if any(part and not names for part, names in zip(geoms, named, strict=True)):
+        return []
+    missing = sum(map(len, geoms)) - sum(map(len, named))
+    what += f"; {missing} geoms are left out that have no name" if missing else ""
+    return [Unknown(name, tuple(f"geom:{n}.{field}" for part in named for n in part), *span, False, what)]
+
+
+def _mixed(own: Sequence[int], still: Sequence[int], least: float) -> str:
+    """Whose friction MuJoCo takes of geoms that touch: that of the higher priority, else the larger."""
+    if own and still:
+        return "sliding friction; both sides are named: MuJoCo takes the larger one where their priority is the same"
+    if own and least > _SLIPPERY:
+        return (
+            f"sliding friction, of which MuJoCo takes the larger one: no less than the {least:g} of what stands still"
+        )
+    return "sliding friction; the other side has a lower priority and does not count"
+
+
+def _shared(model: mujoco.MjModel, bodies: Sequence[int]) -> str:
+    """What the names of bodies begin with, or the first of them."""
+    names = [model.body(body).name for body in bodies]
+    begin = "".join(letters[0] for letters in takewhile(lambda x: len(set(x)) == 1, zip(*names, strict=False)))
+    return _word((begin.rstrip("_-. 0123456789") if len(set(names)) > 1 else begin) or next(filter(None, names), ""))
 
 
 def _round(value: float) -> float:
@@ -311,8 +386,9 @@ def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknow
         return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
     low, high = dt * max(0, best - max(3, best // 2)), _round(dt * max(2 * best, best + 3))
     targets = tuple(f"actuator:{name}.delay" for name in actuators)
-    note = (
-        f"commands arrive about {1e3 * dt * late:.3g} ms late, {late:.2g} samples: without that, simulated windows "
-        f"miss {np.sqrt(at_zero):.2f} times as much"
-    )
+    times, when = float(np.sqrt(at_zero)), f"{1e3 * dt * late:.3g} ms late, {late:.2g} samples"
+    note = f"commands arrive about {when}: without that, simulated windows miss {times:.2f} times as much"
+    if times < _LITTLE:
+        low, share = 0.0, 100 * (1 - 1 / times)
+        note = f"commands may arrive about {when}: uncertain, for it explains {share:.1g} % of what simulations miss"
     return [Unknown("delay", targets, float(f"{low:.2g}"), high, False, note)], note

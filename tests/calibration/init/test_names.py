@@ -36,6 +36,8 @@ from sipe_bayes.calibration.init.names import Kind, alike, read_name
         ("px", Kind.POSITION, "", None),
         ("θ1", Kind.POSITION, "", 1),
         ("temp_C", Kind.OTHER, "", None),
+        ("cell_voltage_2", Kind.OTHER, "", 2),
+        ("load_cell_N", Kind.TORQUE, "N", None),
         ("pwm_left", Kind.DUTY, "", None),
         ("duty [%]", Kind.DUTY, "%", None),
         ("battery_voltage", Kind.SUPPLY, "", None),

@@ -207,3 +207,24 @@ def test_small_motions_of_a_real_machine_are_not_taken_for_degrees(tmp_path: Pat
     units = {reading.match.target: reading.unit for reading in draft.readings}
     expected = {"joint:arm.position": "rad", "joint:pole.position": "rad", "actuator:motor": "V"}
     assert units == expected | {"joint:arm.velocity": "rad/s", "joint:pole.velocity": "rad/s"}
+
+
+TIED = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="hinge" axis="0 1 0" damping=".05"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02"/></body>
+  <body pos="1 0 0"><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/></body>
+  <body pos="2 0 0"><joint name="rocker" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/></body>
+  </worldbody><equality><joint joint1="crank" joint2="rocker"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize(("measured", "blind"), [("position", False), ("velocity", True)])
+def test_what_a_chain_ties_to_a_velocity_alone_starts_where_the_model_does(
+    tmp_path: Path, measured: str, blind: bool
+) -> None:
+    (tmp_path / "model.xml").write_text(TIED)
+    time = 0.01 * np.arange(300)
+    columns = {"time": time, "hinge_position": 0.3 * np.cos(4 * time), f"crank_{measured}": 0.2 * np.sin(4 * time)}
+    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    assert [doubt for doubt in draft.open_doubts if "rocker" in doubt] == [
+        "no column measures rocker: windows start it where the model does"
+    ] * blind

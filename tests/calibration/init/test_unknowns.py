@@ -46,3 +46,13 @@ def test_a_late_delay_is_searched_from_where_it_shows() -> None:
     fit = Fit((0, 9, 10, 11), np.array([1.6, 1.1, 1.0, 1.1]), np.zeros(0), np.zeros((400, 0)), np.ones(1))
     (delay,), _ = delay_of(["motor"], fit, 0.002)
     assert 0 < delay.low < 0.018 < 0.022 < delay.high
+
+
+@pytest.mark.parametrize(("times", "clear"), [(1.03, False), (1.3, True)])
+def test_a_delay_that_explains_little_is_called_uncertain(times: float, clear: bool) -> None:
+    fit = Fit((0, 3, 4, 5), np.array([times, 1.01, 1.0, 1.01]), np.zeros(0), np.zeros((400, 0)), np.ones(1))
+    (delay,), note = delay_of(["motor"], fit, 0.01)
+    assert delay.note == note
+    assert ("uncertain, for it explains 3 % of what simulations miss" in note) is not clear
+    assert note.startswith("commands arrive about 40 ms late" if clear else "commands may arrive about 40 ms late")
+    assert (delay.low > 0) is clear  # none at all stays possible

@@ -1,0 +1,130 @@
+"""Which columns are taken for what, by names that may mean several things."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Matches, match_columns
+
+POSE = ["px", "py", "pz", "qw", "qx", "qy", "qz"]
+
+
+def matched(machine: Machine, columns: list[str]) -> Matches:
+    return match_columns(machine, dict.fromkeys(columns, np.arange(30.0)))
+
+
+def flying(sensors: str = "", joint: str = "") -> Machine:
+    """A free body with four thrusts."""
+    sites = "".join(f'<site name="t{k}"/>' for k in range(4))
+    thrusts = "".join(f'<motor name="thrust{k}" site="t{k}" gear="0 0 6 0 0 0"/>' for k in range(4))
+    arm = f'<body><joint name="{joint}"/><geom size=".1" mass="1"/></body>' if joint else ""
+    return Machine.of(
+        mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody><body name="base"><freejoint/><geom size=".1" mass="1"/>{sites}{arm}</body>
+            </worldbody><actuator>{thrusts}</actuator><sensor>{sensors}</sensor></mujoco>"""
+        )
+    )
+
+
+def chain(*names: str, sensors: str = "") -> Machine:
+    """Links one behind the other."""
+    bodies = "".join(f'<body><joint name="{name}"/><geom size=".1" mass="1"/><site name="s_{name}"/>' for name in names)
+    motors = "".join(f'<motor name="motor_{name}" joint="{name}"/>' for name in names)
+    return Machine.of(
+        mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody>{bodies}{"</body>" * len(names)}</worldbody><actuator>{motors}</actuator>
+            <sensor>{sensors}</sensor></mujoco>"""
+        )
+    )
+
+
+def numbered(word: str) -> list[str]:
+    return [f"{word}{k + 1}" for k in range(4)]
+
+
+@pytest.mark.parametrize("beside", [[], ["battery_current"], numbered("cell_voltage"), numbered("temp")])
+def test_commands_by_their_number_alone_are_told(beside: list[str]) -> None:
+    matches = matched(flying(), [*POSE, *beside, *numbered("m")])
+    assert [m.column for m in matches.commands] == numbered("m")
+    (doubt,) = matches.doubts
+    assert doubt.startswith("'m1', 'm2', 'm3', 'm4' are taken for the commands of thrust0, thrust1, thrust2, thrust3")
+
+
+def test_of_several_families_all_are_told_and_that_is_taken_which_is_called_so() -> None:
+    matches = matched(flying(), [*POSE, *numbered("k"), *numbered("thr")])
+    assert [m.column for m in matches.commands] == numbered("thr")
+    (doubt,) = matches.doubts
+    assert doubt.endswith("; or are these: 'k1', 'k2', 'k3', 'k4'?")
+
+
+@pytest.mark.parametrize("word", ["temp", "cell", "cell_voltage", "status", "sonar", "pressure"])
+def test_what_drives_nothing_is_no_command(word: str) -> None:
+    matches = matched(flying(), [*POSE, *numbered(word)])
+    assert not matches.commands
+    assert list(matches.left) == numbered(word)
+
+
+@pytest.mark.parametrize(
+    ("stem", "beside", "quantity", "sure"),
+    [
+        ("base_vel_w{}", "", "angular", False),
+        ("base_vel_w{}", "base_vel_{}", "angular", True),
+        ("base_vel_w{}_rad_s", "", "angular", True),
+        ("base_vel_w{}_m_s", "", "linear", True),
+        ("base_lin_vel_w{}", "", "linear", False),
+        ("base_lin_vel_w_{}", "", "linear", True),
+        ("base_vel_w_{}", "", "linear", False),
+        ("base_vel_w_{}", "base_ang_vel_{}", "linear", True),
+        ("base_ang_vel_w_{}", "", "angular", True),
+        ("base_w{}", "", "angular", True),
+        ("base_v{}", "", "linear", True),
+    ],
+)
+def test_a_rate_or_the_world(stem: str, beside: str, quantity: str, sure: bool) -> None:
+    names = [stem.format(axis) for axis in "xyz"]
+    matches = matched(flying(), [*POSE, *names, *(beside.format(axis) for axis in "xyz" if beside)])
+    (match,) = [m for m in matches.vectors if list(m.columns) == names]
+    assert (match.target, match.sure) == (f"body:base.{quantity}_velocity", sure)
+    assert bool(matches.doubts) is not sure, matches.doubts
+
+
+@pytest.mark.parametrize("joints", [("gx", "gy"), ("ax", "ay"), ("wx", "wy"), ("arm_ax", "arm_ay")])
+@pytest.mark.parametrize("sensors", ["", "gyro"])
+def test_joints_that_are_called_as_a_bodys_velocity(joints: tuple[str, str], sensors: str) -> None:
+    machine = chain(*joints, sensors=f'<gyro name="imu" site="s_{joints[0]}"/>' if sensors else "")
+    for columns in (joints[::-1], [f"{joint}_deg" for joint in joints]):
+        matches = matched(machine, [*columns, f"{joints[1]}_vel", f"{joints[0]}_vel", f"{joints[1]}_cmd"])
+        assert {m.target: m.column for m in matches.positions} == {
+            f"joint:{joint}.position": sorted(columns)[k] for k, joint in enumerate(joints)
+        }
+        assert {m.target: m.column for m in matches.velocities} == {
+            f"joint:{joint}.velocity": f"{joint}_vel" for joint in joints
+        }
+        assert [(m.column, m.target) for m in matches.commands] == [(f"{joints[1]}_cmd", f"actuator:motor_{joints[1]}")]
+
+
+def test_an_inertial_unit_that_the_model_lacks_measures_no_joint() -> None:
+    matches = matched(chain("shoulder", "elbow"), ["q1", "q2", "gx", "gy", "gz", "ax", "ay", "az"])
+    assert not matches.velocities
+    assert not matches.vectors
+
+
+@pytest.mark.parametrize(
+    ("sensors", "joint", "target"),
+    [
+        ('<gyro name="imu" site="t0"/>', "", "sensor:imu"),
+        ("", "", "body:base.angular_velocity"),
+        ("", "gx", None),
+    ],
+)
+def test_a_gyro_of_a_free_body(sensors: str, joint: str, target: str | None) -> None:
+    """Without one in the model it tells the body's rates about the world's axes, which is told; a joint comes first."""
+    matches = matched(flying(sensors, joint), [*POSE, "gx", "gy", "gz"])
+    assert next((m.target for m in matches.vectors if "gx" in m.columns), None) == target
+    assert any("give the model a <gyro>" in doubt for doubt in matches.doubts) == (
+        target == "body:base.angular_velocity"
+    )
+    assert [m.column for m in matches.positions] == [joint] * bool(joint)
