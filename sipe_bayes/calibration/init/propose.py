@@ -171,9 +171,11 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
     measured = {m.target for m in (*matches.positions, *matches.velocities, *matches.vectors)}
     owners = {target.rpartition(".")[0] for target in measured}
     known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}.position" in measured}
+    turning = [j for j in range(model.njnt) if has_pose(model, j)]
+    known |= {j for j in turning if _poses(model, j) and measured.issuperset(f"body:{p}" for p in _poses(model, j))}
     chained = {model.joint(joint).name for joint in dependent_joints(model, known)}
     blind = [j.name for j in machine.joints if f"joint:{j.name}" not in owners and j.name not in chained]
-    posed = [] if _is_felt(machine, matches) else [j for j in range(model.njnt) if has_pose(model, j)]
+    posed = [] if _is_felt(machine, matches) else turning
     blind += [pose for j in posed for pose in _poses(model, j) if f"body:{pose}" not in measured]
     unnamed = sum(not has_pose(model, j) and not model.joint(j).name for j in range(model.njnt))
     if blind:
