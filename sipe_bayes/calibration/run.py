@@ -127,6 +127,7 @@ def calibrate(
         prior=problem.prior,
         parameters=marginals.summaries(None if missing is None else missing.further),
         causes=() if missing is None else missing.causes,
+        further=None if missing is None else missing.further,
         train=predictions.train,
         holdout=predictions.holdout,
         findings=noticed,

@@ -106,6 +106,15 @@ def _doubts(findings: Findings, parameters: Sequence[ParameterSummary]) -> list[
     return [item.text for item in findings.blocking if not (wider and item.code in _ALLOWED_FOR)]
 
 
+def doubt(calibration: Calibration) -> str | None:
+    """Why no value may be used within any of its intervals, the first reason; None where some may."""
+    doubts = _doubts(Findings(calibration.findings), calibration.parameters)
+    mixing = mixing_verdict(calibration)
+    if not doubts and mixing is not None and mixing.tone == "bad":
+        return mixing.text.removesuffix(".")
+    return doubts[0] if doubts else None
+
+
 def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None) -> Verdict:
     """What a model that lacks something may be used for."""
     tones = {p.name: parameter_verdict(p, findings).tone for p in parameters}
