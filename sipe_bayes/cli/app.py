@@ -136,10 +136,12 @@ def calibrate(
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
         calibration = run(config, estimator, seed, budget, out, threads, progress, device)
-        discovery = None
-        if discover:
+    discovery = None
+    if discover:
+        with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
+            paced = discover_commands.Paced(progress)
             folder = Path(calibration.out) / "discover"
-            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=progress)
+            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=paced)
     if as_json:
         print(to_json(calibration.to_dict() | ({} if discovery is None else {"discovery": discovery.to_dict()})))
         return

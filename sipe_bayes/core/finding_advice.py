@@ -85,6 +85,14 @@ ADVICE: dict[Code, str] = {
         "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "
         "shows in a few moments only, cut the logs to these."
     ),
+    Code.STRUCTURES_CUT_SHORT: (
+        "What was not fitted may be what the model lacks. Give a larger budget, or fewer candidates by `--only` and "
+        "`structure.sites`."
+    ),
+    Code.COLUMNS_UNTRIED: (
+        "Much of a channel is unexplained, and not every column could be tried for it. Look at the signals in the "
+        "report: a wrong sign mirrors, a wrong unit scales. `sipe init --check` asks the logs too."
+    ),
     Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
     Code.SEARCH_UNSETTLED: (
         "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "

@@ -126,6 +126,15 @@ class Code(Enum):
         "result uses all"
     )
 
+    STRUCTURES_CUT_SHORT = blocking(
+        "the budget of {budget} rollouts was spent before {before}: give --budget {larger} and another --out"
+    )
+    COLUMNS_UNTRIED = caution(
+        "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "
+        "not enough, the most promising that {example}: see that the columns are right, or give --budget {larger} and "
+        "another --out"
+    )
+
     # laplace
     DIVERGES_AS_GIVEN = caution("the model as given diverges on these logs; the search started elsewhere")
     SEPARATE_OPTIMA = caution("the search found {count} separate optima; the posterior is a mixture of them")
