@@ -159,7 +159,7 @@ def headline(
         return Verdict("fair", "Only nuisance parameters were estimated.")
     doubts = _doubts(findings, wanted)
     if doubts and brief:
-        return Verdict("bad", "No value may be trusted within its interval yet; the first warning says why.")
+        return Verdict("bad", "No value may be trusted within its interval yet; the warnings say why.")
     if doubts:
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
         first = "; ".join(doubts[:_DOUBTS])
