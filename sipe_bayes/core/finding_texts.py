@@ -44,7 +44,7 @@ def blocking(template: str, row: str = "") -> Text:
 _LOOKS_LIKE = (
     "{cause} ({percent:.2g} % of the residual of {channel}), most in {log} between {start:.3g} and {stop:.3g} s"
 )
-_NOT_NOISE = "the residuals are not noise (p = {p:.2g}): they look like " + _LOOKS_LIKE
+_NOT_NOISE = "the residuals are not noise ({p}): they look like " + _LOOKS_LIKE
 _RIDGE = "{combination} = {value:.4g} ± {width:.1g}{unit} "
 
 
@@ -240,7 +240,7 @@ class Code(Enum):
     )
 
     # what the model lacks
-    NO_MISFIT = note("the residuals pass for noise (p = {p:.2g}); what they resemble most is " + _LOOKS_LIKE)
+    NO_MISFIT = note("the residuals pass for noise ({p}); what they resemble most is " + _LOOKS_LIKE)
     SMALL_MISFIT = caution(
         _NOT_NOISE + "; a small effect that moves no parameter by more than {far:g} sd: {remedy} if you need more"
     )
@@ -279,13 +279,13 @@ class Code(Enum):
     )
 
     # logs
-    WITHIN_PRIOR = note("log {log} is like simulations of the prior (p = {p:.2g})")
+    WITHIN_PRIOR = note("log {log} is like simulations of the prior ({p})")
     OUTSIDE_PRIOR = blocking(
-        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s: widen the "
+        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s: widen the "
         "bounds, or correct the model, units or signs"
     )
     OUTSIDE_PRIOR_FOLLOWED = caution(
-        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s; the calibrated "
+        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s; the calibrated "
         "model follows it all the same"
     )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 from sipe_bayes.core.finding_texts import TEXTS, Code, Severity
 
-__all__ = ["Code", "Finding", "Findings", "Severity", "finding", "rank"]
+__all__ = ["Code", "Finding", "Findings", "Severity", "finding", "p_text", "rank"]
 
 _LACKS = (Code.MISFIT, Code.MISFIT_SHIFTS)
 _UNFINISHED = (
@@ -80,6 +80,11 @@ def finding(
     names = tuple(parameters)
     places = {"parameters": ", ".join(names), "log": log, **values}
     return Finding(code, severity or text.severity, text.template.format(**places), names, log)
+
+
+def p_text(p: float, floor: float) -> str:
+    """A p-value as a sentence has it; at the ``floor``, the least that the draws behind it can give, it may be less."""
+    return f"p {'<=' if p <= floor else '='} {p:.2g}"
 
 
 class Findings:

@@ -235,7 +235,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     share = f"{100 * misfit.share[channel]:.2g} % of the residual of {channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
-    return Verdict("bad", f"The model lacks something: it looks like {misfit.cause} ({share}, p = {misfit.p:.2g}).")
+    return Verdict("bad", f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text}).")
 
 
 def mixing_verdict(calibration: Calibration) -> Verdict | None:

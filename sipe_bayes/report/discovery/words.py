@@ -135,7 +135,7 @@ def remains(discovery: Discovery) -> Verdict | None:
         explained = f" Pieces with a name explain {100 * share:.0f} % of what a force without one would."
     if misfit is None:
         return Verdict("fair", f"Whether the residuals pass for noise cannot be told.{explained}")
-    p = f"(p = {misfit.p:.2g})"
+    p = f"({misfit.p_text})"
     if not misfit.alarm:
         return Verdict("good", f"What remains passes for noise {p}.{explained}")
     if discovery.passes:
