@@ -174,7 +174,7 @@ def domain_randomization(drawn: Recommended, problem: Problem, saved: str) -> di
     """
     space = problem.environment.space
     draws = drawn.posterior.values(_COVARIANCE_DRAWS, generator=torch.Generator().manual_seed(0))
-    ends = np.quantile(draws, [0.05, 0.95], axis=0)
+    ends = space.values(drawn.posterior.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy())
     rows = [
         {"name": s.name, "targets": problem.environment.multipliers(s), "unit": s.unit}
         | {"mean": draws[:, j].mean(), "sd": draws[:, j].std(), "q05": ends[0, j], "q95": ends[1, j]}

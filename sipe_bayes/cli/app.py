@@ -278,7 +278,7 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
     console.print(table)
     rest = [p.name for p in calibration.parameters[len(shown) :]]
     if rest:
-        more = [*rest[:_NAMED], *[f"{len(rest) - _NAMED} others"] * (len(rest) > _NAMED)]
+        more = [*rest[:_NAMED], *[f"{len(rest) - _NAMED} more"] * (len(rest) > _NAMED)]
         console.print(f"values and intervals of {listed(more)}: in the report", highlight=False, markup=False)
 
 

@@ -105,7 +105,11 @@ def _stretched(calibration: Calibration, further: Particles) -> Particles:
 
 
 def _freed(posterior: Posterior, prior: Posterior, unusable: BoolArray) -> Particles:
-    """Draws of a posterior, parameters that are ``unusable`` (N,) those of the prior."""
-    generator = torch.Generator().manual_seed(0)
-    theta, before = (p.sample((_DRAWS,), generator=generator).numpy() for p in (posterior, prior))
-    return Particles(np.where(unusable, before, theta), posterior.space)
+    """Draws of a posterior, or its own points, parameters that are ``unusable`` (N,) drawn from the prior."""
+    generator, weights = torch.Generator().manual_seed(0), None
+    if isinstance(posterior, Particles):
+        theta, weights = posterior.theta.numpy(), posterior.weights
+    else:
+        theta = posterior.sample((_DRAWS,), generator=generator).numpy()
+    before = prior.sample((len(theta),), generator=generator).numpy()
+    return Particles(np.where(unusable, before, theta), posterior.space, weights=weights)

@@ -43,4 +43,4 @@ def test_parameters_without_a_row_are_named(capsys: pytest.CaptureFixture[str]) 
     rows = [line.split()[0] for line in lines if line.split()[0].startswith("p")]
     first = int(rows[-1][1:]) + 1
     named = ", ".join(f"p{k}" for k in range(first, first + 4))
-    assert line == f"values and intervals of {named} and {20 - first} others: in the report"
+    assert line == f"values and intervals of {named} and {20 - first} more: in the report"

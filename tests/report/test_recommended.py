@@ -70,6 +70,15 @@ def test_a_value_that_may_not_be_used_is_drawn_from_its_prior() -> None:
     assert "WARNING, not calibrated, drawn from the prior: p1: at a bound." in drawn.remarks()
 
 
+def test_the_others_keep_the_ends_that_are_printed() -> None:
+    given = with_further(calibration(Code.MISFIT, Code.MODE_AT_BOUND))
+    drawn = recommended(given)
+    assert drawn.names(Usable.NONE) == ("p1",)
+    ends = drawn.posterior.space.values(drawn.posterior.quantile(ENDS).numpy())
+    for j in (0, 2):
+        np.testing.assert_allclose(ends[:, j], given.parameters[j].further, rtol=1e-3)
+
+
 def test_while_a_finding_blocks_everything_is_drawn_from_the_prior() -> None:
     """As the headline has it; a misfit that wider intervals allow for is no such finding."""
     spent = noticed(Code.BUDGET_SPENT, severity=Severity.BLOCKING)
