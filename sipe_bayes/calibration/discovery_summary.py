@@ -38,7 +38,19 @@ from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.fitted import FittedStructure
+from sipe_bayes.structure.state import Phase
 from sipe_bayes.structure.structures import Structures
+
+_LARGER = 2  # times the budget that did not reach: what to try next
+_BEFORE = {
+    Phase.COLUMNS: "any piece was tried",
+    Phase.RANK: "what the model may lack was ranked",
+    Phase.FIT: "all pieces that promise something were fitted",
+    Phase.AGAIN: "the best piece was compared with the model without it",
+    Phase.PRUNE: "each kept piece was left out once",
+    Phase.SWAP: "what did about as well was tried in the place of what is kept",
+}
+"""What a search whose budget was spent did not come to, by what it was doing; the yardstick is no part of it."""
 
 
 def summarise(
@@ -82,9 +94,21 @@ def summarise(
         named_share=structures.named_share,
         settled=structures.settled,
         rollouts=structures.rollouts,
+        column_rollouts=structures.state.column_rollouts,
         seconds=seconds,
-        findings=_thinned(problem, structures),
+        findings=(*_budget_spent(structures), *_thinned(problem, structures)),
     )
+
+
+def _budget_spent(structures: Structures) -> list[Finding]:
+    """What the budget did not reach: the end of the search, or all signs and units of columns."""
+    state, budget, noticed = structures.state, structures.search.budget, []
+    about = functools.partial(finding, budget=budget, larger=_LARGER * budget)
+    if state.cut in _BEFORE:
+        noticed.append(about(Code.STRUCTURES_CUT_SHORT, before=_BEFORE[state.cut]))
+    if state.untried:
+        noticed.append(about(Code.COLUMNS_UNTRIED, count=len(state.untried), example=state.untried[0].sentence))
+    return noticed
 
 
 def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:

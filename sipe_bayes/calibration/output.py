@@ -30,11 +30,14 @@ from sipe_bayes.posterior import Posterior
 from sipe_bayes.report.interactive.clips import Clip, make_clip
 from sipe_bayes.report.interactive.motion import motion
 from sipe_bayes.report.page import write_report
+from sipe_bayes.report.recommended import Recommended, recommended
 from sipe_bayes.report.words import with_unit
+from sipe_bayes.rl.randomization import Usable
 from sipe_bayes.simulation.rendering import with_sky
 
 CHECKPOINT = "checkpoint.safetensors"
 RANDOMIZATION = "randomization"
+RANDOMIZATION_POSTERIOR = "domain_randomization_posterior"  # where it is not the one that was fitted
 _RANDOMIZATION_DRAWS = 100  # in the generated code
 _COVARIANCE_DRAWS = 4000  # behind the written covariance
 _CLIP_WINDOW = 2.0  # s after which a clip's simulations start anew at the least: in less little is to be seen
@@ -116,10 +119,7 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
     except ExportError as error:
         noticed = [finding(Code.NOT_EXPORTED, reason=error)]
     calibration = replace(calibration, findings=(*calibration.findings, *noticed))
-    draws = calibration.posterior.values(_RANDOMIZATION_DRAWS, generator=torch.Generator().manual_seed(0))
-    write_randomization(problem.environment, draws, folder / RANDOMIZATION)
-    randomization = domain_randomization(calibration, problem)
-    write_text(folder / "domain_randomization.json", to_json(randomization, indent=2))
+    _write_randomization(recommended(calibration), problem, folder)
     write_report(calibration, folder, _clip(calibration, problem))
     write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
     write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
@@ -148,19 +148,39 @@ def save_posterior(posterior: Posterior, folder: Path) -> None:
     write_bytes(folder / "posterior.nc", posterior.netcdf())
 
 
-def domain_randomization(calibration: Calibration, problem: Problem) -> dict[str, object]:
+def _write_randomization(drawn: Recommended, problem: Problem, folder: Path) -> None:
+    """What policies are trained under, as a file, as generated code, and where it is another one as a posterior."""
+    saved = "posterior"
+    if not drawn.plain:
+        saved = RANDOMIZATION_POSTERIOR
+        drawn.posterior.save(folder / saved)
+    plain = domain_randomization(drawn, problem, saved)
+    write_text(folder / "domain_randomization.json", to_json(plain, indent=2))
+    draws = drawn.posterior.values(_RANDOMIZATION_DRAWS, generator=torch.Generator().manual_seed(0))
+    uncalibrated = drawn.names(Usable.NONE)
+    write_randomization(problem.environment, draws, folder / RANDOMIZATION, drawn.remarks(), uncalibrated)
+
+
+def domain_randomization(drawn: Recommended, problem: Problem, saved: str) -> dict[str, object]:
     """What a policy trainer samples from: each parameter's normal in its unit, its bounds, and the covariance.
 
     ``sipe_bayes.rl.randomization.load_randomization`` reads it. ``targets`` says what the value is multiplied by for
-    each target that it is written to, ``posterior`` which saved posterior beside the file the normal stands for.
+    each target that it is written to, ``usable`` which interval of the report is drawn from and ``reason`` why.
+
+    Args:
+        drawn: what the report says to use.
+        problem: whose parameters.
+        saved: the posterior beside the file that the normal stands for.
     """
     space = problem.environment.space
-    draws = calibration.posterior.values(_COVARIANCE_DRAWS, generator=torch.Generator().manual_seed(0))
+    draws = drawn.posterior.values(_COVARIANCE_DRAWS, generator=torch.Generator().manual_seed(0))
+    ends = space.values(drawn.posterior.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy())
     rows = [
-        {"name": p.name, "targets": problem.environment.multipliers(s)}
-        | {key: getattr(p, key) for key in ("unit", "mean", "sd", "q05", "q95")}
+        {"name": s.name, "targets": problem.environment.multipliers(s), "unit": s.unit}
+        | {"mean": draws[:, j].mean(), "sd": draws[:, j].std(), "q05": ends[0, j], "q95": ends[1, j]}
         | {key: getattr(s, key) for key in ("low", "high", "log")}
-        for p, s in zip(calibration.parameters, space, strict=True)
+        | {"usable": str(drawn.bases[s.name].usable), "reason": drawn.bases[s.name].reason}
+        for j, s in enumerate(space)
     ]
     covariance = np.atleast_2d(np.cov(draws.T))
-    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "posterior": "posterior"}
+    return {"parameters": rows, "names": list(space.names), "covariance": covariance.tolist(), "posterior": saved}

@@ -94,7 +94,6 @@ def calibrate(
     fit = _Fit.of(problem, method, theta)
     problem = replace(problem, train=_tamed(problem.train, method))
     alone, conflict, unknown = _one_by_one(replace(problem, train=logs), fit, method.seed, tell)
-    tell(_CHECKING)
     probed, residuals = _residuals(problem, method, fit, unknown, tell)
     lacks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
     tell("simulating the posterior's band")
@@ -127,6 +126,7 @@ def calibrate(
         prior=problem.prior,
         parameters=marginals.summaries(None if missing is None else missing.further),
         causes=() if missing is None else missing.causes,
+        further=None if missing is None else missing.further,
         train=predictions.train,
         holdout=predictions.holdout,
         findings=noticed,
@@ -289,6 +289,7 @@ def _residuals(
     Nothing with a ``StateSpace``, whose process noise takes what the model lacks. unknown: gets findings of what they
     cannot tell.
     """
+    tell(_CHECKING)
     if isinstance(problem.likelihood, StateSpace):
         return None, []
     windows, theta, noise, starts = fit.windows, fit.theta, fit.noise, fit.starts

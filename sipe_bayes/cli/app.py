@@ -60,6 +60,7 @@ _REFUSED: Any = typer.BadParameter.__mro__[2]
 _PIPED_WIDTH = 120
 _AXES = ("_x", "_y", "_z")
 _LINES, _SENTENCES, _WARNINGS, _CHANNELS = 20, 3, 3, 3  # that a calibration may fill, and of each kind of line
+_NAMED = 4  # of the parameters that the table has no room for
 _SDS = 3.3  # in a 90 % interval
 _LONGEST, _VERDICT = 300, 44  # characters of a sentence on the terminal, and of a verdict in the table
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
@@ -136,10 +137,12 @@ def calibrate(
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
         calibration = run(config, estimator, seed, budget, out, threads, progress, device)
-        discovery = None
-        if discover:
+    discovery = None
+    if discover:
+        with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
+            paced = discover_commands.Paced(progress)
             folder = Path(calibration.out) / "discover"
-            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=progress)
+            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=paced)
     if as_json:
         print(to_json(calibration.to_dict() | ({} if discovery is None else {"discovery": discovery.to_dict()})))
         return
@@ -250,7 +253,7 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
     from rich.text import Text
 
     from sipe_bayes.report.verdicts import lacking, parameter_verdict
-    from sipe_bayes.report.words import significant
+    from sipe_bayes.report.words import listed, significant, unit_text
 
     wider = any(p.further is not None for p in calibration.parameters)
     table, words = Table(box=None, pad_edge=False), ["unit", "verdict"]
@@ -267,12 +270,16 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
         ends = [] if p.further is None else [significant(x, wide, max(map(abs, p.further))) for x in p.further]
         cells = [value, *[" .. ".join(ends)] * wider, f"{low} .. {high}"]
         # brackets of a name are not markup
-        table.add_row(Text(p.name), *cells, p.unit, Text(_cut(verdict.text, _VERDICT), style=_TONES[verdict.tone]))
-    if len(shown) < len(calibration.parameters):
-        table.add_row(f"and {len(calibration.parameters) - len(shown)} more, in the report")
+        table.add_row(
+            Text(p.name), *cells, unit_text(p.unit), Text(_cut(verdict.text, _VERDICT), style=_TONES[verdict.tone])
+        )
     # a number that is cut is a wrong one: lines that are too long are the terminal's to wrap
     console.width = max(console.width, Measurement.get(console, console.options.update(max_width=10**3), table).maximum)
     console.print(table)
+    rest = [p.name for p in calibration.parameters[len(shown) :]]
+    if rest:
+        more = [*rest[:_NAMED], *[f"{len(rest) - _NAMED} more"] * (len(rest) > _NAMED)]
+        console.print(f"values and intervals of {listed(more)}: in the report", highlight=False, markup=False)
 
 
 def _pooled(calibration: Calibration) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,9 +13,39 @@ from sipe_bayes.inference.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
     from sipe_bayes.diagnostics.discovery import Discovery
+    from sipe_bayes.inference.recorded import Progress
 
 _TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
+
+
+class Paced:
+    """Progress that says how far a search is and about how long the rest of its budget takes, at the pace until now.
+
+    That is an estimate and no bound: structures with more pieces simulate and are checked more slowly, and what comes
+    after the search, comparing before and after, is not in it.
+
+    Args:
+        shown: called with what is being done, in which that stands.
+    """
+
+    def __init__(self, shown: Progress) -> None:
+        self._shown = shown
+        self._first: tuple[int, float] | None = None  # rollouts that an earlier run had done, and when this one began
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Say what is being done, and how much of all is done."""
+        now = time.monotonic()
+        before, began = self._first = self._first or (done, now)
+        if done < total:
+            what += f"; {done} of {total} rollouts"
+            if done > before:
+                what += f", about {_spoken((now - began) * (total - done) / (done - before))} if all are needed"
+        self._shown(what, done, total)
+
+
+def _spoken(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def discover(
@@ -33,10 +64,11 @@ def discover(
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.core.files import to_json
 
-    with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
+    with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, progress)
+        paced = Paced(progress)
+        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, paced)
     if as_json:
         print(to_json(discovery.to_dict()))
     else:
@@ -71,7 +103,9 @@ def lines_of(discovery: Discovery) -> list[str]:
         warnings,
     )
 
-    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts, {discovery.seconds:.0f} s"
+    of_columns = f" ({discovery.column_rollouts} for signs and units of columns)" if discovery.column_rollouts else ""
+    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}"
+    effort += f", {discovery.seconds:.0f} s"
     lines = [f"{discovery.name}, what the model lacks: {effort}"]
     tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]
     for one in discovery.rows:

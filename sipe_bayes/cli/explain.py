@@ -79,6 +79,7 @@ def _of_run(record: Path) -> list[_Entry]:
 
     from sipe_bayes.core.files import read_json, reading
     from sipe_bayes.core.finding_texts import Severity
+    from sipe_bayes.core.findings import rank
 
     what, remedy = "the result of a calibration", "give the folder of sipe calibrate"
     plain = read_json(record, what, remedy)
@@ -88,4 +89,4 @@ def _of_run(record: Path) -> list[_Entry]:
             new = _Entry(_named(str(item["code"])), Severity(str(item["severity"])), str(item["text"]))
             first = entries.get(new.code)
             entries[new.code] = replace(first, count=first.count + 1) if first else new
-    return sorted(entries.values(), key=lambda entry: -list(Severity).index(entry.severity))
+    return sorted(entries.values(), key=lambda entry: rank(entry.code, entry.severity))

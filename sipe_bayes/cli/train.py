@@ -86,6 +86,8 @@ def train(
         chosen = Settings.of({**settings, "hidden": _sizes(settings["hidden"])}, "train")
         shown = None if demonstrations is None else Trajectories.load(demonstrations)
         drawn = None if randomization is None else load_randomization(randomization)
+        for name, reason in {} if drawn is None else drawn.uncalibrated.items():
+            print(f"warning: {name} is not calibrated, and drawn from its prior: {reason}")
         print(f"how it goes: {folder / 'curve.csv'}; tensorboard --logdir {folder / 'tensorboard'}", flush=True)
         with ProgressBar(unit="steps") as progress:
             run(

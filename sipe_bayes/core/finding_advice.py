@@ -85,6 +85,14 @@ ADVICE: dict[Code, str] = {
         "Nothing, as a rule: `sipe calibrate` with the discovered configuration fits all of the logs. Where an effect "
         "shows in a few moments only, cut the logs to these."
     ),
+    Code.STRUCTURES_CUT_SHORT: (
+        "What was not fitted may be what the model lacks. Give a larger budget, or fewer candidates by `--only` and "
+        "`structure.sites`."
+    ),
+    Code.COLUMNS_UNTRIED: (
+        "Much of a channel is unexplained, and not every column could be tried for it. Look at the signals in the "
+        "report: a wrong sign mirrors, a wrong unit scales. `sipe init --check` asks the logs too."
+    ),
     Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
     Code.SEARCH_UNSETTLED: (
         "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "
@@ -127,7 +135,10 @@ ADVICE: dict[Code, str] = {
         "The interval is about the prior's. `sipe suggest --for NAME` says what to send; or fix it at a measured value."
     ),
     Code.MODE_AT_BOUND: _BOUNDS,
-    Code.AT_PHYSICAL_BOUND: "Nothing to do: the model does without it. The interval is one-sided.",
+    Code.AT_PHYSICAL_BOUND: (
+        "While a finding blocks, nothing follows from it: what the fit lacks may stand in its place. Else there is "
+        "nothing to do: the model does without it, and the interval is one-sided."
+    ),
     Code.RIDGE: "Only the combination acts on the motion. Use it, not its members.",
     Code.RIDGE_TO_RESOLVE: "Weigh, measure or look up one member, and take it out of the unknowns.",
     Code.RIDGE_EXPECTED: "The planned motion would tell the combination alone. Plan another, or fix a member.",
@@ -161,7 +172,7 @@ ADVICE: dict[Code, str] = {
     ),
     Code.OUTSIDE_PRIOR_FOLLOWED: (
         "Units and signs are right, since the simulation bends as the log does. One of twenty right logs is called so. "
-        "Else widen the bounds that a value lies at, or ask for the physics that the model lacks: `sipe discover`."
+        "Else widen the bounds that a value lies at, or let `sipe discover` look for the physics that the model lacks."
     ),
     Code.OUTSIDE_PRIOR_UNKNOWN: "Judge by the signals in the report.",
     Code.LOGS_DISAGREE: (

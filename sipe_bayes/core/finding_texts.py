@@ -44,7 +44,7 @@ def blocking(template: str, row: str = "") -> Text:
 _LOOKS_LIKE = (
     "{cause} ({percent:.2g} % of the residual of {channel}), most in {log} between {start:.3g} and {stop:.3g} s"
 )
-_NOT_NOISE = "the residuals are not noise (p = {p:.2g}): they look like " + _LOOKS_LIKE
+_NOT_NOISE = "the residuals are not noise ({p}): they look like " + _LOOKS_LIKE
 _RIDGE = "{combination} = {value:.4g} ± {width:.1g}{unit} "
 
 
@@ -124,6 +124,15 @@ class Code(Enum):
     SEARCHED_ON_PARTS = note(
         "the search used {used:.3g} of the logs' {all:.3g} s, in blocks spread over them; `sipe calibrate` of its "
         "result uses all"
+    )
+
+    STRUCTURES_CUT_SHORT = blocking(
+        "the budget of {budget} rollouts was spent before {before}: give --budget {larger} and another --out"
+    )
+    COLUMNS_UNTRIED = caution(
+        "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "
+        "not enough, the most promising that {example}: see that the columns are right, or give --budget {larger} and "
+        "another --out"
     )
 
     # laplace
@@ -235,7 +244,7 @@ class Code(Enum):
     )
 
     # what the model lacks
-    NO_MISFIT = note("the residuals pass for noise (p = {p:.2g}); what they resemble most is " + _LOOKS_LIKE)
+    NO_MISFIT = note("the residuals pass for noise ({p}); what they resemble most is " + _LOOKS_LIKE)
     SMALL_MISFIT = caution(
         _NOT_NOISE + "; a small effect that moves no parameter by more than {far:g} sd: {remedy} if you need more"
     )
@@ -274,13 +283,13 @@ class Code(Enum):
     )
 
     # logs
-    WITHIN_PRIOR = note("log {log} is like simulations of the prior (p = {p:.2g})")
+    WITHIN_PRIOR = note("log {log} is like simulations of the prior ({p})")
     OUTSIDE_PRIOR = blocking(
-        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s: widen the "
+        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s: widen the "
         "bounds, or correct the model, units or signs"
     )
     OUTSIDE_PRIOR_FOLLOWED = caution(
-        "log {log} is unlike simulations of the prior (p = {p:.2g}), most in {channel} at {time:.3g} s; the calibrated "
+        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s; the calibrated "
         "model follows it all the same"
     )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")

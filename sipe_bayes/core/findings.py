@@ -12,7 +12,27 @@ from dataclasses import asdict, dataclass
 
 from sipe_bayes.core.finding_texts import TEXTS, Code, Severity
 
-__all__ = ["Code", "Finding", "Findings", "Severity", "finding"]
+__all__ = ["Code", "Finding", "Findings", "Severity", "finding", "p_text", "rank"]
+
+_LACKS = (Code.MISFIT, Code.MISFIT_SHIFTS)
+_UNFINISHED = (
+    Code.BUDGET_SPENT,
+    Code.SEARCH_CUT_SHORT,
+    Code.SEARCH_UNSETTLED,
+    Code.PROCESS_NOISE_UNSETTLED,
+    Code.NOT_JUDGED,
+    Code.NOT_LOOKED_AROUND,
+)
+"""Those that say no more than that a search did not come to its end: what the model lacks is often the cause."""
+
+
+def rank(code: Code, severity: Severity) -> int:
+    """How early a finding is told: what blocks, what the model lacks, a search without an end, cautions, notes."""
+    if severity is Severity.BLOCKING:
+        return 2 if code in _UNFINISHED else 0
+    if severity is Severity.CAUTION:
+        return 1 if code in _LACKS else 3
+    return 4
 
 
 @dataclass(frozen=True)
@@ -62,6 +82,11 @@ def finding(
     return Finding(code, severity or text.severity, text.template.format(**places), names, log)
 
 
+def p_text(p: float, floor: float) -> str:
+    """A p-value as a sentence has it; at the ``floor``, the least that the draws behind it can give, it may be less."""
+    return f"p {'<=' if p <= floor else '='} {p:.2g}"
+
+
 class Findings:
     """Findings in the order in which they came, each once."""
 
@@ -100,20 +125,26 @@ class Findings:
 
     @property
     def blocking(self) -> list[Finding]:
-        """Those for which no interval is to be trusted."""
-        return [item for item in self._items if item.severity is Severity.BLOCKING]
+        """Those for which no interval is to be trusted, causes first."""
+        return [item for item in self.ranked if item.severity is Severity.BLOCKING]
+
+    @property
+    def ranked(self) -> list[Finding]:
+        """All of them, worst first, and causes before what follows from them."""
+        return sorted(self._items, key=lambda item: rank(item.code, item.severity))
 
     @property
     def warnings(self) -> list[str]:
-        """The texts of all but notes."""
-        return [item.text for item in self._items if item.severity is not Severity.NOTE]
+        """The texts of all but notes, worst first."""
+        return [item.text for item in self.ranked if item.severity is not Severity.NOTE]
 
     @property
     def kinds(self) -> list[str]:
         """The warnings, worst first, those of one kind about several logs as one with their number."""
-        worth = [item for item in self._items if item.severity is not Severity.NOTE]
         groups: dict[tuple[object, ...], list[Finding]] = {}
-        for item in sorted(worth, key=lambda item: item.severity is not Severity.BLOCKING):
+        for item in self.ranked:
+            if item.severity is Severity.NOTE:
+                continue
             alike = (item.code, item.severity, item.parameters) if item.log is not None else (item,)
             groups.setdefault(alike, []).append(item)
         others = ((items[0].text, len(items) - 1) for items in groups.values())

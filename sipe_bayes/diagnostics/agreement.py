@@ -49,7 +49,8 @@ class Disagreement:
         p: of Cochran's Q under agreement.
         parameter: its most economical explanation.
         p_left: the same with that parameter free in every log.
-        per_log: (log, value, sd) in the parameter's unit, of logs that determine it.
+        per_log: (log, value, sd) in the parameter's unit, of logs that determine it; on a logarithmic scale half of
+            what lies between the values a sd in theta below and above.
         unit: of the parameter.
         odd: the log without which the others agree best, where they do at the same level.
         p_without: how well they agree without it.
@@ -177,11 +178,9 @@ def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement
     parameter, per_log = space[shared[worst]], []
     for log, theta, sd in zip(logs, *apart[worst].own, strict=True):
         if sd < (1 - THRESHOLDS.not_determined) / np.sqrt(12):  # of the uniform prior's
-            inside = float(np.clip(theta, 0.0, 1.0))
-            slope = float(parameter.value(inside + 1e-6) - parameter.value(inside - 1e-6)) / 2e-6
             within = float(np.clip(theta, -1.0, 2.0)) if parameter.scale == "log" else float(theta)  # else 1e99
-            value = float(parameter.value(within))  # perhaps beyond a bound
-            per_log.append((log.name, value, float(sd) * slope))
+            value, low, high = (float(parameter.value(x)) for x in (within, within - sd, within + sd))
+            per_log.append((log.name, value, (high - low) / 2))  # perhaps beyond a bound
     left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
     agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree

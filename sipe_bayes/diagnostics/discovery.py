@@ -133,6 +133,7 @@ class Discovery:
         named_share: of what can be explained, what named pieces explain; None where that was not asked.
         settled: whether every fit that counts came to rest.
         rollouts: of all fits.
+        column_rollouts: those of them that tried signs and units of columns.
         seconds: that it took.
         findings: what was noticed on the way.
         run: record of the run.
@@ -159,6 +160,7 @@ class Discovery:
     named_share: float | None
     settled: bool
     rollouts: int
+    column_rollouts: int
     seconds: float
     findings: tuple[Finding, ...] = ()
     run: Mapping[str, object] = field(default_factory=dict)
@@ -192,8 +194,10 @@ class Discovery:
             **{name: _stage(stage) for name, stage in (("before", self.before), ("after", self.after))},
             "named_share": self.named_share,
             "settled": self.settled,
+            "findings": [item.to_dict() for item in self.findings],
             "warnings": Findings(self.findings).warnings,
             "rollouts": self.rollouts,
+            "column_rollouts": self.column_rollouts,
             "seconds": self.seconds,
             "out": self.out,
         }

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, Finding, finding, p_text
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -57,6 +57,7 @@ class OutsidePrior:
         channel: where it is farthest.
         time: s, where it is farthest.
         followed: whether the calibrated model follows the log all the same, but for what it is named to lack.
+        floor: the least p that the simulations can give.
     """
 
     p: float
@@ -64,6 +65,7 @@ class OutsidePrior:
     channel: str
     time: float
     followed: bool = False
+    floor: float = 0.0
 
     @property
     def alarm(self) -> bool:
@@ -75,7 +77,7 @@ class OutsidePrior:
         """It as a finding."""
         outside = Code.OUTSIDE_PRIOR_FOLLOWED if self.followed else Code.OUTSIDE_PRIOR
         code = outside if self.alarm else Code.WITHIN_PRIOR
-        return finding(code, log=self.log, p=self.p, channel=self.channel, time=self.time)
+        return finding(code, log=self.log, p=p_text(self.p, self.floor), channel=self.channel, time=self.time)
 
     @property
     def text(self) -> str:
@@ -134,7 +136,8 @@ def outside_prior(
         p = float((1 + (largest >= far[k, i, 0]).sum()) / (1 + len(made)))
         channel = windows.simulator.environment.channels[windows.channels[i]]
         begin = float(windows.start[chosen[k]] * windows.dt[chosen[k]])
-        outcome.append(OutsidePrior(p, name, channel, begin + float(farthest[k, i]), followed))
+        when = begin + float(farthest[k, i])
+        outcome.append(OutsidePrior(p, name, channel, when, followed, floor=1 / (1 + len(made))))
     return outcome
 
 

@@ -10,7 +10,7 @@ from numbers import Real
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, Finding, finding, p_text
 from sipe_bayes.core.thresholds import THRESHOLDS
 
 
@@ -205,6 +205,7 @@ class Misfit:
             squares what that tenth of the time has too many.
         shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
             where that cannot be told.
+        floor: the least p that the draws of the null can give.
     """
 
     p: float
@@ -216,11 +217,17 @@ class Misfit:
     stop: float
     share: dict[str, float] = field(default_factory=dict)
     shift: dict[str, float] = field(default_factory=dict)
+    floor: float = 0.0
 
     @property
     def alarm(self) -> bool:
         """Whether the residuals are not noise."""
         return self.p <= THRESHOLDS.misfit
+
+    @property
+    def p_text(self) -> str:
+        """Its p in a sentence."""
+        return p_text(self.p, self.floor)
 
     @property
     def moved(self) -> list[str]:
@@ -244,7 +251,7 @@ class Misfit:
             code if self.alarm else Code.NO_MISFIT,
             parameters=self.moved if self.matters and small else (),
             log=self.log,
-            p=self.p,
+            p=self.p_text,
             cause=self.cause,
             percent=100 * self.share[self.channel],
             channel=self.channel,

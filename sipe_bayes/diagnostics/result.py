@@ -21,7 +21,7 @@ from sipe_bayes.diagnostics.records import (
     Ridge,
     Signal,
 )
-from sipe_bayes.posterior import Posterior
+from sipe_bayes.posterior import Particles, Posterior
 
 FLAGS: Mapping[Code, str] = {
     Code.NO_EFFECT: "no_effect",
@@ -99,6 +99,8 @@ class Calibration:
         outside: of each training log, whether the prior gives such a one.
         noise: of each fitted channel.
         causes: for which the parameters' ``further`` allow, to first order.
+        further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals;
+            None where nothing can be said.
         mixing: of Markov chains; None of other methods.
         logs: what was read and what was done to it.
         run: configuration, versions, seed and checksums, as JSON has them.
@@ -124,6 +126,7 @@ class Calibration:
     outside: list[OutsidePrior] = field(default_factory=list)
     noise: dict[str, ChannelNoise] = field(default_factory=dict)
     causes: tuple[str, ...] = ()
+    further: Particles | None = None
     mixing: Mixing | None = None
     logs: list[LogReport] = field(default_factory=list)
     run: dict[str, object] = field(default_factory=dict)

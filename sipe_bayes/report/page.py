@@ -235,9 +235,9 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
 
 
 def noticed(findings: Sequence[Finding]) -> list[dict[str, object]]:
-    """The findings that are no notes, those of one code together, with what to do about them, split at code."""
+    """The findings that are no notes, worst first, those of one code together, with what to do, split at code."""
     groups: dict[Code, list[str]] = {}
-    for item in findings:
+    for item in Findings(findings).ranked:
         if item.severity is not Severity.NOTE:
             groups.setdefault(item.code, []).append(item.text)
     return [{"texts": texts, "advice": ADVICE[code].split("`")} for code, texts in groups.items()]

@@ -106,6 +106,15 @@ def _doubts(findings: Findings, parameters: Sequence[ParameterSummary]) -> list[
     return [item.text for item in findings.blocking if not (wider and item.code in _ALLOWED_FOR)]
 
 
+def doubt(calibration: Calibration) -> str | None:
+    """Why no value may be used within any of its intervals, the first reason; None where some may."""
+    doubts = _doubts(Findings(calibration.findings), calibration.parameters)
+    mixing = mixing_verdict(calibration)
+    if not doubts and mixing is not None and mixing.tone == "bad":
+        return mixing.text.removesuffix(".")
+    return doubts[0] if doubts else None
+
+
 def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None) -> Verdict:
     """What a model that lacks something may be used for."""
     tones = {p.name: parameter_verdict(p, findings).tone for p in parameters}
@@ -150,7 +159,7 @@ def headline(
         return Verdict("fair", "Only nuisance parameters were estimated.")
     doubts = _doubts(findings, wanted)
     if doubts and brief:
-        return Verdict("bad", "No value may be trusted within its interval yet; the first warning says why.")
+        return Verdict("bad", "No value may be trusted within its interval yet; the warnings say why.")
     if doubts:
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
         first = "; ".join(doubts[:_DOUBTS])
@@ -226,7 +235,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     share = f"{100 * misfit.share[channel]:.2g} % of the residual of {channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
-    return Verdict("bad", f"The model lacks something: it looks like {misfit.cause} ({share}, p = {misfit.p:.2g}).")
+    return Verdict("bad", f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text}).")
 
 
 def mixing_verdict(calibration: Calibration) -> Verdict | None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.units import UNITS
 
+_PER = {"command": "unit of command", "position": "rad or m", "velocity": "rad/s or m/s"}  # of an actuator's numbers
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LAST_WORD = re.compile(r"^(.*\w)[\s_.\-]*[\s_.\-\[(]([^\s_\[\]()]+)[\])]?$")
 
@@ -64,7 +65,10 @@ def listed(names: Sequence[str]) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1"."""
+    """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1", of an actuator what it may be."""
+    of, per, by = unit.partition("/")
+    if of == "force":
+        return f"N or N m{f' per {_PER.get(by, by)}' if per else ''}"
     return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_RAISED), unit)
 
 

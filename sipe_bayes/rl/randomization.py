@@ -22,7 +22,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum, auto
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,14 @@ _ROUNDING = 1e-9  # in theta, from one space's bounds to another's
 _POINT = 1e-12  # variance in theta of a normal that is a point
 
 
+class Usable(StrEnum):
+    """Which interval of a calibrated parameter may be used: the plain one, the wider one beside it, or none."""
+
+    PLAIN = auto()
+    WIDER = auto()
+    NONE = auto()
+
+
 @dataclass(frozen=True, eq=False)
 class Randomization:
     """What an episode draws.
@@ -51,6 +61,7 @@ class Randomization:
             channels' units; one number leaves the desired goal alone.
         action_delay: control steps; each episode's delay is one of 0 to this many, all equally probable; until the
             first action arrives nothing is done.
+        uncalibrated: parameters that are drawn from their prior, since no value of them may be used, and why.
 
     Raises:
         ValueError: for anything else.
@@ -59,6 +70,7 @@ class Randomization:
     posterior: Posterior
     observation_noise: float | FloatArray = 0.0
     action_delay: int = 0
+    uncalibrated: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.posterior, Posterior):
@@ -125,7 +137,8 @@ def load_randomization(path: str | os.PathLike[str]) -> Randomization:
     """Read the ``domain_randomization.json`` of `sipe calibrate`.
 
     Its ``posterior`` names the saved posterior in the same folder, which is read. A file without that entry stands for
-    its normal: ``mean`` and ``covariance`` in the parameters' units, cut off at ``low`` and ``high``.
+    its normal: ``mean`` and ``covariance`` in the parameters' units, cut off at ``low`` and ``high``. Parameters whose
+    ``usable`` is "none" are ``uncalibrated``; a file of before there was such an entry has none.
     ``observation_noise`` and ``action_delay`` may be added to the file.
 
     Raises:
@@ -138,7 +151,8 @@ def load_randomization(path: str | os.PathLike[str]) -> Randomization:
     with reading(file, what, remedy):
         more = {name: plain[name] for name in ("observation_noise", "action_delay") if name in plain}
         posterior = load_posterior(file.parent / str(plain["posterior"])) if "posterior" in plain else _normal(plain)
-        return Randomization(posterior, **more)
+        rows = [row for row in plain.get("parameters", ()) if Usable(row.get("usable", "plain")) is Usable.NONE]
+        return Randomization(posterior, **more, uncalibrated={str(row["name"]): str(row["reason"]) for row in rows})
 
 
 def _normal(plain: dict[str, Any]) -> GaussianMixture:

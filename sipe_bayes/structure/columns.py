@@ -1,19 +1,22 @@
 """A column of a log with a flipped sign or in another unit: tried before any physics is blamed.
 
 Where the plain model leaves much of a channel unexplained, each channel that moves and each command is multiplied by
--1, 180 / pi, 1000 and their inverses, and the model fitted again. For a channel y, p(y) = |f|^n p(f y), n its samples.
+-1, 180 / pi, 1000 and their inverses, and the model fitted again, the least explained columns first and signs before
+units, as far as a share of the budget goes. For a channel y, p(y) = |f|^n p(f y), n its samples.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.envs.laws.bound import driven_joint
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.noise import noise_level
 from sipe_bayes.likelihood.windows import Windows
 
@@ -59,17 +62,32 @@ def moving(windows: Windows) -> BoolArray:
     return np.asarray(windows.spread**2 > noise**2 * (1 + np.maximum(chance, 0.2)))
 
 
-def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> float:
-    """The largest share of a channel's spread that the residuals' sd (C,) is, of those that are ``shown`` to move."""
-    return float((sd[shown] / windows.spread[shown]).max()) if shown.any() else 0.0
+def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> dict[str, float]:
+    """The share of a channel's spread that the residuals' sd (C,) is, by name of those that are ``shown`` to move."""
+    names = np.array(windows.fitted)[shown].tolist()
+    return dict(zip(names, (sd[shown] / windows.spread[shown]).tolist(), strict=True))
 
 
-def choices(channels: Sequence[str], actuators: Sequence[str]) -> Iterator[Column]:
-    """Every one of these columns with every factor."""
-    for name in channels:
-        yield from (Column(name, False, factor) for factor in FACTORS)
-    for name in actuators:
-        yield from (Column(name, True, factor) for factor in FACTORS)
+def choices(environment: MjcfEnvironment, share: Mapping[str, float]) -> list[Column]:
+    """Every channel given and every command with every factor, what promises most first.
+
+    A column promises more the less is explained of it, of a command of the channels of the joint that it drives; and a
+    factor the earlier it stands in ``FACTORS``: from one column to the next as much as from one factor to the next.
+
+    Args:
+        environment: whose columns.
+        share: of each channel that may be wrong, how much of its spread is unexplained.
+    """
+    model, targets = environment.compile(), {c.label: c.target for c in environment.measurements}
+    promise = {(name, False): left for name, left in share.items()}
+    for actuator in environment.actuators:
+        joint = driven_joint(model, model.actuator(actuator).id)
+        site = f"joint:{model.joint(joint).name}." if joint >= 0 else None
+        own = [left for name, left in share.items() if site is not None and targets[name].startswith(site)]
+        promise[actuator, True] = max(own or share.values(), default=0.0)
+    ranked = enumerate(sorted(promise, key=lambda column: -promise[column]))
+    every = [(rank + k, Column(*column, factor)) for rank, column in ranked for k, factor in enumerate(FACTORS)]
+    return [column for _, column in sorted(every, key=lambda item: item[0])]
 
 
 def corrected(logs: Trajectories, columns: Sequence[Column], actuators: Sequence[str]) -> Trajectories:

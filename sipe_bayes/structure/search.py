@@ -65,6 +65,7 @@ class DiscoverOptions(Options):
     sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
     gross: float = option(0.25, "of a channel's spread left from which signs and units are tried", least=0)
     column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
+    column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
     fit_budget: int = option(2000, "rollouts of one fit", least=1)
     physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
@@ -104,8 +105,8 @@ class StructureSearch:
         self._rollouts, self._fit_rollouts, self._doing = state.rollouts, 0, self.describe(state)
         self._tell("")
         if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
-            return replace(state, phase=Phase.DONE)
-        return {
+            return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
+        state = {
             Phase.PLAIN: self._plain,
             Phase.COLUMNS: self._columns,
             Phase.RANK: self._rank,
@@ -116,6 +117,7 @@ class StructureSearch:
             Phase.RESIDUAL: self._residual,
             Phase.DONE: lambda state: state,
         }[state.phase](state)
+        return state if state.cut is None else replace(state, phase=Phase.DONE)
 
     def describe(self, state: DiscoverState) -> str:
         """What comes next, for the progress bar."""
@@ -178,43 +180,50 @@ class StructureSearch:
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
-        plain = self._try([])
+        plain, _ = self._try([])
         return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS)
 
     def _columns(self, state: DiscoverState) -> DiscoverState:
         """The column whose factor makes the plain model fit far better, if any does."""
-        given, plain = self.given, state.fitted[0] if state.fitted else None
-        state = replace(state, phase=Phase.RANK)
-        rests: set[int] = set()
+        given, plain, options = self.given, state.fitted[0] if state.fitted else None, self.options
+        state, share = replace(state, phase=Phase.RANK), dict.fromkeys(given.environment.channels, 0.0)
         if plain is not None:
             windows = given.windows(given.simulator([]))
             shown = moving(windows)
-            if unexplained(windows, plain.sd, shown) < self.options.gross:
+            left = unexplained(windows, plain.sd, shown)
+            if max(left.values(), default=0.0) < options.gross:
                 return state
-            rests = set(np.asarray(windows.channels)[~shown].tolist())
-        names = [name for c, name in enumerate(given.environment.channels) if c not in rests]
-        columns, fits = list(choices(names, given.environment.actuators)), []
-        for number, column in enumerate(columns, 1):
+            rests = set(np.array(windows.fitted)[~shown].tolist())
+            share = {name: left.get(name, 0.0) for name in share if name not in rests}
+        columns, tried, spent, number = choices(given.environment, share), [], 0, 0
+        # without a plain model there is nothing else to spend the budget on
+        most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
+        while number < len(columns) and spent + options.column_budget <= most:
+            column, number = columns[number], number + 1
             self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"
-            fits.append((column, self._try([column])))
-        tried = [(self._of_given(one, [column]), column, one) for column, one in fits if one is not None]
+            one, rollouts = self._try([column])
+            spent += rollouts
+            if one is not None:
+                tried.append((self._of_given(one, [column]), column, one))
         if plain is None and not tried:
-            given.fit([], None, self.options.fit_budget)  # raises what keeps the plain model from being fitted
+            given.fit([], None, options.fit_budget)  # raises what keeps the plain model from being fitted
         best = max(tried, key=lambda item: item[0], default=None)
-        rollouts = sum(one.rollouts for _, _, one in tried) + (0 if plain is None else plain.rollouts)
-        if best is None or (plain is not None and best[0] < plain.evidence + self.options.column_gain):
-            return state if plain is None else replace(state, fitted=(replace(plain, rollouts=rollouts),))
+        if best is None or (plain is not None and best[0] < plain.evidence + options.column_gain):
+            return replace(state, column_rollouts=spent, untried=tuple(columns[number:]))
         self._placed = {}
+        spent += (0 if plain is None else plain.rollouts) - best[2].rollouts
         # evidences are in the corrected logs' units from here on
-        return replace(state, fitted=(replace(best[2], rollouts=rollouts),), columns=(best[1],))
+        return replace(state, fitted=(best[2],), columns=(best[1],), column_rollouts=spent)
 
-    def _try(self, columns: Sequence[Column]) -> FittedStructure | None:
-        """The plain model fitted to logs with columns multiplied; None where it cannot be."""
+    def _try(self, columns: Sequence[Column]) -> tuple[FittedStructure | None, int]:
+        """The plain model fitted to logs with columns multiplied, None where it cannot be; and the rollouts."""
         budget = self.options.column_budget if columns else self.options.fit_budget
+        self._rollouts, self._fit_rollouts = self._rollouts + self._fit_rollouts, 0
         try:
-            return self.given.corrected(columns).fit([], None, budget, self._tell)
+            one = self.given.corrected(columns).fit([], None, budget, self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
-            return None
+            return None, self._fit_rollouts  # as far as it told
+        return one, one.rollouts
 
     def _of_given(self, one: FittedStructure, columns: Sequence[Column]) -> float:
         """The evidence of logs as they were given."""
@@ -344,11 +353,11 @@ class StructureSearch:
     def _residual(self, state: DiscoverState) -> DiscoverState:
         ranked = self._ranked(state.here, last_resort=True)
         offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
-        state = replace(state, offers=state.offers + offers, phase=Phase.DONE)
-        if not ranked or ranked[0].gain <= self.cost + self.options.least_gain:
-            return state
-        best = ranked[0]
-        return self._fitted(state, (*state.present, best.placed.label), np.concatenate([state.here.theta, best.theta]))
+        state = replace(state, offers=state.offers + offers)
+        if ranked and ranked[0].gain > self.cost + self.options.least_gain:
+            labels = (*state.present, ranked[0].placed.label)
+            state = self._fitted(state, labels, np.concatenate([state.here.theta, ranked[0].theta]))
+        return replace(state, phase=Phase.DONE)
 
     def _owners(self, one: FittedStructure) -> list[str | None]:
         """Whose each parameter of a structure is: None for the user's own."""
@@ -360,6 +369,7 @@ class StructureSearch:
         left = min(self.options.fit_budget, self.budget - state.rollouts)
         try:
             one = self.fitting.fit(self.structure(labels), initial, max(left, 1), self._tell)
-        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
-            return replace(state, failed=(*state.failed, labels))
+        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
+            short = isinstance(error, BudgetTooSmall) and left < self.options.fit_budget
+            return replace(state, failed=(*state.failed, labels), cut=state.phase if short else None)
         return replace(state, fitted=(*state.fitted, one))

@@ -71,8 +71,11 @@ class DiscoverState:
         queue: labels of the extensions that this round still has to fit.
         failed: labels of structures that could not be fitted.
         columns: of the logs that are multiplied, since then the plain model fits far better.
+        column_rollouts: of the trials of signs and units.
+        untried: signs and units that their share of the budget did not reach.
         judged: what held-out logs say of structures.
         refused: labels of structures that they speak against.
+        cut: what the search was doing when the budget was spent; None while it is not.
     """
 
     phase: Phase = Phase.PLAIN
@@ -83,8 +86,11 @@ class DiscoverState:
     queue: tuple[str, ...] = ()
     failed: tuple[tuple[str, ...], ...] = ()
     columns: tuple[Column, ...] = ()
+    column_rollouts: int = 0
+    untried: tuple[Column, ...] = ()
     judged: tuple[Judgement, ...] = ()
     refused: tuple[tuple[str, ...], ...] = ()
+    cut: Phase | None = None
 
     @property
     def done(self) -> bool:
@@ -93,8 +99,9 @@ class DiscoverState:
 
     @property
     def rollouts(self) -> int:
-        """Of all fits, and of the looks at held-out logs."""
-        return sum(one.rollouts for one in self.fitted) + sum(one.rollouts for one in self.judged)
+        """Of all fits, those with other signs and units among them, and of the looks at held-out logs."""
+        fits = sum(one.rollouts for one in self.fitted) + self.column_rollouts
+        return fits + sum(one.rollouts for one in self.judged)
 
     def of(self, labels: Sequence[str]) -> FittedStructure | None:
         """The fit of a structure, whatever the order of its extensions."""

@@ -16,7 +16,7 @@ from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.search import StructureSearch
-from sipe_bayes.structure.state import DiscoverState, Offer
+from sipe_bayes.structure.state import DiscoverState, Offer, Phase
 
 _NEGLIGIBLE = 1e-3  # probability below which a structure is left out of the average
 
@@ -73,8 +73,9 @@ class Structures:
 
     @property
     def settled(self) -> bool:
-        """Whether every fit that matters came to rest and the budget was enough."""
-        return self.state.done and all(one.settled for p, one in zip(self.probabilities, self.fitted, strict=True) if p)
+        """Whether every fit that matters came to rest and the budget was enough, but for the yardstick."""
+        enough = self.state.done and self.state.cut in (None, Phase.RESIDUAL)
+        return enough and all(one.settled for p, one in zip(self.probabilities, self.fitted, strict=True) if p)
 
     @cached_property
     def probabilities(self) -> FloatArray:

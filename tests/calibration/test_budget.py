@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import mujoco
@@ -10,10 +11,12 @@ import torch
 
 from sipe_bayes.calibration.gathered import Marginals, most_probable
 from sipe_bayes.calibration.run import run
-from sipe_bayes.core.findings import Code, Findings, finding
+from sipe_bayes.core.findings import Code, Finding, Findings, Severity, finding
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.posterior import GaussianMixture, uniform
+from sipe_bayes.report.page import render
+from tests.problems.calibrations import make_calibration
 from tests.problems.made_up_logs import PENDULUM
 from tests.problems.swings import swing, write_case
 
@@ -70,3 +73,17 @@ def test_findings_of_one_kind_about_many_logs_are_one_line() -> None:
     assert len(kinds) == 2
     assert kinds[0].startswith("the budget of 5 rollouts")
     assert kinds[1].endswith("(and so 11 more)")
+
+
+def test_a_spent_budget_does_not_stand_before_its_cause() -> None:
+    """What blocks for another reason and what the model lacks come first, wherever they were noticed."""
+    spent, rubs = finding(Code.BUDGET_SPENT, budget=5), Finding(Code.MISFIT, Severity.CAUTION, "it rubs")
+    apart = Finding(Code.LOGS_DISAGREE, Severity.BLOCKING, "logs disagree")
+    others = Finding(Code.LOG_JUMPS, Severity.CAUTION, "a log jumps"), Finding(Code.RIDGE, Severity.NOTE, "a ridge")
+    findings = Findings([*others, spent, rubs, apart])
+    expected = ["logs disagree", "it rubs", spent.text, "a log jumps"]
+    assert findings.warnings == findings.kinds == expected
+    assert findings.doubts == ["logs disagree", spent.text]
+    page = render(dataclasses.replace(make_calibration(), findings=tuple(findings)), [])
+    places = [page.index(f">{text}") for text in expected]
+    assert places == sorted(places)

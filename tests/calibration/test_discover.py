@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pandas as pd
 import pytest
 
 import sipe_bayes as sipe
@@ -18,9 +19,12 @@ from sipe_bayes.calibration.discovery_summary import summarise
 from sipe_bayes.calibration.output import CHECKPOINT
 from sipe_bayes.calibration.run import run
 from sipe_bayes.core.files import OutputError
+from sipe_bayes.core.findings import Code
 from sipe_bayes.diagnostics.discovery import Discovery
+from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.report.discovery.words import discovery_verdicts
 from tests.problems.interruptions import stop_in_stage
 from tests.problems.lacking import FRICTION, OWN, write_lacking
@@ -53,15 +57,23 @@ def test_finds_what_was_planted(case: tuple[Path, Discovery]) -> None:
 def test_what_was_added_has_an_interval_with_what_the_model_lacks(
     case: tuple[Path, Discovery], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As the user's values have, where what remains matters; the plain intervals lie within."""
+    """As the user's values have, where what remains matters: each its own, and the plain one lies within."""
     config, _ = case
+    wide = {"rod_mass": (0.35, 0.95), "damping": (0.02, 0.18), "hinge.dry_friction": (0.05, 0.3)}
+
+    def lacking(_: object, own: Posterior, *__: object) -> MissingPhysics:
+        assert own.space.names == tuple(wide)
+        ends = np.stack([[p.normalise(end) for end in wide[p.name]] for p in own.space], axis=1)
+        return MissingPhysics(Particles(np.repeat(ends, 50, axis=0), own.space), (), False)
+
     monkeypatch.setattr(Misfit, "matters", True)
+    monkeypatch.setattr("sipe_bayes.calibration.discovery_summary.missing_physics", lacking)
     problem = sipe.prepare(config, 1)
     again = summarise(problem, sipe.discover(problem), "again", 0, 0.0)
     assert [p.name for p in again.added] == ["hinge.dry_friction"]
     for p in (*again.parameters, *again.added):
-        assert p.further is not None
-        assert p.further[0] <= p.q05 < p.q95 <= p.further[1], p
+        assert p.further == pytest.approx(wide[p.name]), p
+        assert wide[p.name][0] < p.q05 < p.q95 < wide[p.name][1], p
 
 
 def test_averaged_values_hold_the_truth(case: tuple[Path, Discovery]) -> None:
@@ -255,3 +267,32 @@ def test_wrong_restriction_is_one_line(table: str, words: list[str], tmp_path: P
     assert "\n" not in str(refused.value)
     assert [w for w in words if w not in str(refused.value)] == []
     assert not (tmp_path / "out").exists()
+
+
+def test_a_budget_that_ends_too_soon_is_said_and_what_to_give(tmp_path: Path) -> None:
+    """Before any piece was tried: neither that nothing is lacking nor that the values hold."""
+    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\nbudget = 10\n')
+    spent = run_discovery(config, tmp_path / "out", num_threads=1)
+    assert not spent.settled
+    assert [item.code for item in spent.findings] == [Code.STRUCTURES_CUT_SHORT]
+    texts = [verdict.text for verdict in discovery_verdicts(spent)]
+    trust = (
+        "No value may be trusted yet: the budget of 10 rollouts was spent before any piece was tried: give --budget 20"
+    )
+    assert any(text.startswith(trust) for text in texts), texts
+    assert "no piece was tried" in texts[0]
+    assert json.loads((tmp_path / "out" / "structures.json").read_text())["settled"] is False
+    assert "was spent before any piece was tried" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_columns_that_were_not_tried_are_said(tmp_path: Path) -> None:
+    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\nbudget = 1500\n')
+    config.write_text(config.read_text().replace("window = 1.0", 'window = "log"'))
+    table = pd.read_csv(tmp_path / "log.csv")
+    table["angle"] = 0.5 * np.sin(7 * table["time"])  # of no sign or unit
+    table.to_csv(tmp_path / "log.csv", index=False)
+    spent = run_discovery(config, tmp_path / "out", num_threads=1)
+    untried = [item for item in spent.findings if item.code is Code.COLUMNS_UNTRIED]
+    assert len(untried) == 1
+    assert "signs and units of columns were not tried" in untried[0].text
+    assert spent.column_rollouts <= 300

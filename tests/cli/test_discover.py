@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from sipe_bayes.cli.app import main
+from sipe_bayes.cli.discover import Paced
 from tests.problems.lacking import write_lacking
 from tests.problems.swings import strict_json
 
@@ -49,3 +51,18 @@ def test_calibrates_and_then_discovers(
     assert (Path(found["out"]) / "report.html").exists()
     assert Path(found["discovery"]["out"]) == Path(found["out"]) / "discover"
     assert (Path(found["out"]) / "discover" / "discovered.toml").exists()
+
+
+def test_what_the_rest_takes_is_an_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the pace of this run, with all that it did beside rollouts; an earlier run's count for nothing."""
+    clock, shown = iter([100.0, 110.0, 140.0, 150.0]), list[str]()
+    monkeypatch.setattr("sipe_bayes.cli.discover.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    paced = Paced(lambda what, _, __: shown.append(what))
+    for done in (1000, 1000, 1200, 2000):
+        paced("fitting", done, 2000)
+    assert shown == [
+        "fitting; 1000 of 2000 rollouts",
+        "fitting; 1000 of 2000 rollouts",
+        "fitting; 1200 of 2000 rollouts, about 3 min if all are needed",
+        "fitting",
+    ]

@@ -32,3 +32,15 @@ def test_channels_beyond_three_are_counted(capsys: pytest.CaptureFixture[str]) -
     assert len(lines) == 3
     assert lines[-1].endswith("[2 more in the report]")
     assert "more" not in "".join(printed(capsys, {f"q{k}": "rad" for k in range(3)}))
+
+
+def test_parameters_without_a_row_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    """Twenty lines hold a few rows; what became of the others is no riddle."""
+    print_calibration(make_calibration(size=24))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 20
+    (line,) = [line for line in lines if line.startswith("values and intervals of")]
+    rows = [line.split()[0] for line in lines if line.split()[0].startswith("p")]
+    first = int(rows[-1][1:]) + 1
+    named = ", ".join(f"p{k}" for k in range(first, first + 4))
+    assert line == f"values and intervals of {named} and {20 - first} more: in the report"

@@ -166,3 +166,21 @@ def test_a_log_that_says_nothing_disagrees_with_nobody() -> None:
     silent = LogEstimate("silent", np.array([5.0, -3.0]), np.zeros((2, 2)))
     loud = LogEstimate("loud", np.array([0.5, 0.5]), 1e4 * np.eye(2))
     assert disagreement(space, [silent, loud]) is None
+
+
+@pytest.mark.parametrize("beyond", [0.4, 1.0, 1.6, -0.5, 3.0])
+def test_how_uncertain_a_log_is_beyond_a_bound_of_a_logarithmic_scale(beyond: float) -> None:
+    """Half of the 68 % interval of draws of theta as values; what lies very far off is told where it is cut off."""
+    parameter = Parameter("stiffness", low=1.0, high=1000.0, unit="N m/rad", scale="log")
+    precise, rough = 1 / 0.02**2, 1 / 0.05**2
+    logs = [LogEstimate("a", np.array([0.4]), np.array([[precise]]))]
+    logs.append(LogEstimate("b", np.array([beyond]), np.array([[rough]])))
+    logs.append(LogEstimate("c", np.array([0.9]), np.array([[precise]])))
+    noticed = disagreement(ParameterSpace([parameter]), logs)
+    assert noticed is not None
+    drawn = np.clip(beyond, -1, 2) + 0.05 * np.random.default_rng(0).standard_normal(200_000)
+    low, high = parameter.value(np.quantile(drawn, [0.1587, 0.8413]))
+    name, value, sd = noticed.per_log[1]
+    assert name == "b"
+    assert value == pytest.approx(parameter.value(float(np.clip(beyond, -1, 2))), rel=0.03)
+    assert sd == pytest.approx((high - low) / 2, rel=0.05)  # the information has the uniform prior's beside it

@@ -79,6 +79,7 @@ def make_discovery(*pieces: Piece, rows: int = 2) -> Discovery:
         named_share=0.8,
         settled=True,
         rollouts=1234,
+        column_rollouts=0,
         seconds=5.6,
         out="runs/pendulum-discover",
     )

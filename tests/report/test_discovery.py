@@ -20,6 +20,8 @@ FRICTION = piece("friction", kept=True)
 LAW = piece("stribeck", kept=True, native=False, nearest="LuGre", parameters=("hinge.size", "hinge.speed"))
 GAINS = piece("gain", "motor", kept=True, parameters=tuple(f"motor.gain[{k}]" for k in range(6)))
 
+CUT = finding(Code.STRUCTURES_CUT_SHORT, budget=30000, larger=60000, before="any piece was tried")
+
 
 def changed(*pieces: Any, **changes: Any) -> Discovery:
     return dataclasses.replace(make_discovery(*pieces), **changes)
@@ -83,6 +85,8 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "not trusted": (changed(FRICTION, **left(LARGE)), "bad", "No value may be trusted within its interval yet"),
     "unknown, not trusted": (changed(FRICTION, **left(None)), "bad", "No value may be trusted within its interval yet"),
     "not settled": (changed(FRICTION, settled=False), "bad", "raise its budget"),
+    "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000 and another --out"),
+    "nothing tried": (changed(**left(LARGE), settled=False, findings=(CUT,)), "bad", "no piece was tried"),
 }
 
 
@@ -102,6 +106,7 @@ NEXT = {
     "a column": (changed(columns=("a",)), "sipe calibrate runs/pendulum-discover/discovered.toml"),
     "nothing": (make_discovery(), "go on with the configuration"),
     "nothing, wrong": (changed(**left(LARGE)), "structure.extra"),
+    "nothing tried": (changed(**left(LARGE), findings=(CUT,)), "with a larger budget"),
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sipe_bayes.report.words import with_unit
+from sipe_bayes.report.words import unit_text, with_unit
 
 
 @pytest.mark.parametrize(
@@ -23,3 +23,19 @@ from sipe_bayes.report.words import with_unit
 )
 def test_one_unit_stands_beside_a_name(name: str, unit: str, text: str) -> None:
     assert with_unit(name, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("unit", "text"),
+    [
+        ("kg m^2", "kg m²"),
+        ("1", ""),
+        ("rad/s", "rad/s"),
+        ("force", "N or N m"),
+        ("force/command", "N or N m per unit of command"),
+        ("force/velocity", "N or N m per rad/s or m/s"),
+        ("force/(position s)", "N or N m per (position s)"),
+    ],
+)
+def test_a_unit_says_what_it_may_be(unit: str, text: str) -> None:
+    assert unit_text(unit) == text

@@ -15,8 +15,10 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
-from sipe_bayes.structure.columns import moving, unexplained
+from sipe_bayes.structure.columns import choices, moving, unexplained
 from sipe_bayes.structure.machine import Machine
+from sipe_bayes.structure.state import Phase
+from tests.problems.machines import MACHINES, environment
 from tests.problems.pendulums import log, pendulum
 
 FRICTION = Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",))
@@ -141,7 +143,8 @@ def test_what_rests_has_neither_sign_nor_unit() -> None:
     for trajectory, expected in ((moves, True), (rests, False), (rough, True)):
         windows = Windows(Segments(0.5), simulator, Trajectories.stack([trajectory]))
         assert moving(windows).tolist() == [expected] * len(windows.channels)
-        assert (unexplained(windows, windows.spread, moving(windows)) > 0) == expected
+        left = unexplained(windows, windows.spread, moving(windows))
+        assert left == (dict.fromkeys(windows.fitted, 1.0) if expected else {})
 
 
 def test_columns_that_are_tried_in_vain_count() -> None:
@@ -158,6 +161,52 @@ def test_columns_that_are_tried_in_vain_count() -> None:
     assert not structures.state.columns
     assert done == sorted(done)
     assert structures.rollouts >= done[-1] > 500
+    assert structures.state.column_rollouts > 500 > structures.plain.rollouts
+    of_fits = sum(one.rollouts for one in structures.fitted)
+    assert structures.rollouts == of_fits + structures.state.column_rollouts
+
+
+def test_signs_and_units_leave_the_budget_to_physics() -> None:
+    """What is not tried for it is named, and the pieces are ranked all the same."""
+    moves = log(pendulum(), [0.6, 0.08], 4)
+    noise = 0.5 * np.sin(7 * moves.dt * np.arange(len(moves.observations)))[:, None]
+    structures = discover(
+        pendulum(),
+        Trajectories.stack([replace(moves, observations=noise)]),
+        restriction=Restriction(only=("delay",)),
+        options=DiscoverOptions(column_gain=1e9, column_budget=150),
+        budget=1000,
+    )
+    assert structures.offers()
+    assert structures.settled
+    assert 0 < structures.state.column_rollouts <= 0.2 * 1000
+    tried = 10 - len(structures.state.untried)
+    assert 1 <= tried < 10
+    machine = structures.search.given.environment
+    assert list(structures.state.untried) == choices(machine, dict.fromkeys(machine.channels, 1.0))[tried:]
+
+
+def test_the_least_explained_columns_are_tried_first() -> None:
+    """A command is as little explained as the joint that it drives; each column's sign comes before its units."""
+    machine = environment(MACHINES["double"])
+    shoulder, elbow = (f"joint:{joint}." for joint in ("shoulder", "elbow"))
+    share = dict(zip(machine.channels, (0.1, 0.2, 0.9, 0.3), strict=True))
+    columns = choices(machine, share)
+    assert [(c.name, c.factor) for c in columns[:2]] == [(f"{elbow}position", -1.0), (f"{elbow}position", 180 / np.pi)]
+    signs = [column.name for column in columns if column.factor == -1.0]
+    assert signs == [f"{elbow}position", "m2", f"{elbow}velocity", f"{shoulder}velocity", "m1", f"{shoulder}position"]
+    assert len(set(columns)) == len(columns) == 5 * 6
+
+
+def test_a_budget_that_ends_before_the_physics_is_no_settled_search() -> None:
+    recorded = Trajectories.stack([log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)])
+    given = recorded, Restriction(only=("dry_friction",))
+    spent = discover(pendulum(), given[0], restriction=given[1], budget=1)
+    assert (spent.best.labels, spent.offers(), spent.settled) == ((), [], False)
+    assert spent.state.cut is Phase.COLUMNS
+    ranked = discover(pendulum(), given[0], restriction=given[1], budget=spent.rollouts + 2)
+    assert ranked.offers()
+    assert (len(ranked.fitted), ranked.settled, ranked.state.cut) == (1, False, Phase.FIT)
 
 
 @pytest.mark.parametrize("same", [True, False])

@@ -34,6 +34,8 @@ Deviations:
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
@@ -78,13 +80,13 @@ class _Named:
         def p(statistic: int) -> float:
             return float((1 + (largest >= odd[statistic]).sum()) / (1 + count))
 
-        worst, k = int(odd.argmax()), len(logs.probes)
+        worst, k, floor = int(odd.argmax()), len(logs.probes), 1 / (1 + count)
         if k:
             best = int(odd[:k].argmax())
-            named = self._probe_named(p(worst), best, seen)
+            named = replace(self._probe_named(p(worst), best, seen), floor=floor)
             if best == worst or (p(best) <= THRESHOLDS.misfit and max(named.share.values()) >= THRESHOLDS.small_misfit):
                 return named
-        return self._colour_named(p(worst), worst - k, seen)
+        return replace(self._colour_named(p(worst), worst - k, seen), floor=floor)
 
     def _probe_named(self, p: float, probe: int, seen: Solved) -> Misfit:
         logs = self.logs

@@ -84,6 +84,8 @@ def headline(discovery: Discovery) -> Verdict:
         return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
+    if not discovery.pieces and cut_short(discovery):
+        return Verdict("bad", "The residuals are not noise; no piece was tried, so what the model lacks is not known.")
     tried = "no piece that was tried is shown to be" if alternatives(discovery) else "nothing that was tried is"
     return Verdict("bad", f"The residuals are not noise, and {tried} what the model lacks.")
 
@@ -133,7 +135,7 @@ def remains(discovery: Discovery) -> Verdict | None:
         explained = f" Pieces with a name explain {100 * share:.0f} % of what a force without one would."
     if misfit is None:
         return Verdict("fair", f"Whether the residuals pass for noise cannot be told.{explained}")
-    p = f"(p = {misfit.p:.2g})"
+    p = f"({misfit.p_text})"
     if not misfit.alarm:
         return Verdict("good", f"What remains passes for noise {p}.{explained}")
     if discovery.passes:
@@ -143,6 +145,9 @@ def remains(discovery: Discovery) -> Verdict | None:
 
 def trust(discovery: Discovery) -> Verdict:
     """Which intervals hold: those averaged over the structures, once residuals pass and the search has settled."""
+    cut = cut_short(discovery)
+    if cut is not None:
+        return Verdict("bad", f"No value may be trusted yet: {cut}.")
     if not discovery.settled:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
@@ -168,6 +173,8 @@ def next_steps(discovery: Discovery) -> str:
         alone = f"; its intervals hold if that is so, with probability {probability_text(least)}: use those above"
         onward = f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
         return onward + alone * (least < THRESHOLDS.shown_interval)
+    if cut_short(discovery):
+        return "search again with a larger budget, as said above"
     if discovery.passes:
         return "nothing to put in; go on with the configuration as it is"
     return (
@@ -212,5 +219,11 @@ def value_rows(discovery: Discovery) -> list[dict[str, str]]:
 
 
 def warnings(discovery: Discovery) -> list[str]:
-    """What was noticed while the results were written."""
-    return Findings(discovery.findings).warnings
+    """What was noticed on the way, but for what the verdicts say."""
+    rest = (item for item in discovery.findings if item.code is not Code.STRUCTURES_CUT_SHORT)
+    return Findings(rest).warnings
+
+
+def cut_short(discovery: Discovery) -> str | None:
+    """What the budget was spent before; None where it was enough."""
+    return next((item.text for item in Findings(discovery.findings).of(Code.STRUCTURES_CUT_SHORT)), None)

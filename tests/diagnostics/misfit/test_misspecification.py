@@ -5,6 +5,8 @@ One log each at fixed seeds; rates over many are measured by examples/studies/mi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,7 @@ def test_what_is_left_out_is_seen_and_named(missing: Parameter, value: float, rh
     assert cause in seen.cause
     assert seen.channel == "joint:hinge.position"
     assert seen.log == "log"
+    assert "(p <= 0.025)" in seen.text  # 39 draws of the null give no less
     assert 0 <= seen.start < seen.stop <= 4
     assert seen.alarm
     assert seen.matters
@@ -92,6 +95,11 @@ def test_a_small_effect_is_called_small() -> None:
     assert small(0.04, {"mass": -1.3}).moved == ["mass"]
     assert "mass by -1.3 sd" in small(0.04, {"mass": -1.3}).text
     assert "do not trust the intervals" in small(0.4, {}).text
+    assert "(p = 0.01)" in small(0.4, {}).text
+    assert "(p <= 0.01)" in replace(small(0.4, {}), floor=0.01).text
+    outside = OutsidePrior(0.025, "log", "angle", 1.0)
+    assert "prior (p = 0.025)" in outside.text
+    assert "prior (p <= 0.025)" in replace(outside, floor=0.025).text
     quiet = small(0.4, {}, p=0.2)
     assert not quiet.matters
     assert "pass for noise" in quiet.text
