@@ -1,9 +1,9 @@
 """Draws in the place of windows' normals: where one is not the posterior, or where several optima share it.
 
-Each optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``), and that of a
-single one looked beyond (``inference.stretches``). Where all stand and nothing lies beyond, they are the posterior,
-shared by their evidence. Optima with hardly any mass are left out of this, and several are not asked about where starts
-are estimated, which follow one optimum alone.
+Each optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``), where starts are
+estimated only if it leaves one open, and that of a single one looked beyond (``inference.stretches``). Where all
+stand and nothing lies beyond, they are the posterior, shared by their evidence. Optima with hardly any mass are left
+out of this, and several are not asked about where starts are estimated, which follow one optimum alone.
 
 The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
 normals with the moments of what was drawn around an optimum (``importance.draw``).
@@ -25,6 +25,8 @@ from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget, 
 from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
+
+_OPEN = 0.5  # an sd, of the range, from which the slope at the optimum is nought: elsewhere it may be steep
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,10 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     shared = sharing(kept, problem)
     if len(shared) > 1 and windows.num_start:
         return Probe()
-    if min(np.sqrt(np.diag(one.covariance)).min() for one in shared) < 10 * SHORTEST:
+    sds = np.sqrt([np.diag(one.covariance) for one in shared])
+    if sds.min() < 10 * SHORTEST:
         return Probe()  # an sd that the look around the optimum may have set
-    probes = 0 if windows.num_start else len(shared) * importance.probe_size(n)
+    probes = len(shared) * importance.probe_size(n) if not windows.num_start or sds.max() > _OPEN else 0
     look = value_cost(windows) * look_size(n, near=False) if len(shared) == 1 else 0
     if not windows.has_room(windows.num_start + probes + look):
         return Probe(judged=False)

@@ -35,3 +35,16 @@ def test_draws_hold_the_side_that_changes_nothing(starts: str, window: float | N
         assert ("draws" in estimator.diagnostics) is drawn
         np.testing.assert_allclose(found, exact, atol=0.08)
         assert not estimator.findings.blocking
+
+
+@pytest.mark.parametrize("starts", ["recorded", "estimated"])
+def test_a_search_that_ends_where_nothing_changes(starts: str) -> None:
+    """Below the floor's edge there is no slope, so the normal is open: the steep side is looked for all the same."""
+    log = floored_log(np.array([0.4, 0.3]), 1, 100, 0.02)
+    mass = grid_posterior(log, (GRID, GRID)).sum(0)
+    exact = np.interp(LEVELS, np.cumsum(mass) - 0.5 * mass, GRID)
+    likelihood = sipe.Segments(None, noise="white", starts=starts)
+    estimator = Laplace(floored_pendulum(), likelihood=likelihood, seed=1, initial=np.array([[0.4, 0.4999]]))
+    drawn = estimator.fit(log if starts == "recorded" else replace(log, states=None)).quantile(LEVELS)[:, 1].numpy()
+    print(drawn, exact, estimator.diagnostics)
+    np.testing.assert_allclose(drawn, exact, atol=0.08)
