@@ -76,6 +76,11 @@ class Environment(ABC):
         """Prior sds (2 nv + na,) of where windows start about their reference: positions, velocities, activations."""
         return np.repeat(START_SD, [model.nv, model.nv, model.na])
 
+    @property
+    def remembers(self) -> FloatArray:
+        """Seconds (O,) after a window's beginning in which a channel tells of what was before, which is not known."""
+        return np.zeros(len(self.channels))
+
     def least_steps(self, theta: FloatArray) -> FloatArray:
         """Least changes (N,) of theta (N,) that finite differences can be taken over; zero for all that is smooth."""
         return np.zeros(len(self.space))

@@ -275,6 +275,18 @@ class MjcfEnvironment(Environment):
         return [(j, *one) for j, one in sensed if one is not None]
 
     @cached_property
+    def remembers(self) -> FloatArray:
+        """Of sensors with an unknown delay or filter; a joint goes on steadily enough before, what follows from it not.
+
+        Three time constants of a filter.
+        """
+        out = np.zeros(len(self.channels))
+        for j, attribute, channels in self._sensed:
+            spans = {"delay": self.parameters[j].high, "filter": 3 * self.parameters[j].high}
+            out[[k for k in channels if self._readers[k].derived]] += spans.get(attribute, 0.0)
+        return out
+
+    @cached_property
     def sensed(self) -> tuple[int, ...]:  # type: ignore[override]
         """Channels of whose sensor something is unknown."""
         return tuple(sorted({k for _, _, channels in self._sensed for k in channels}))

@@ -86,3 +86,16 @@ def _rates(dt: FloatArray) -> FloatArray:
         shortest = alike[left].min()
         alike[left & (alike <= shortest * (1 + _SAME_RATE))] = -shortest
     return -alike
+
+
+def settled(remembers: FloatArray, dt: FloatArray, steps: IntArray, places: IntArray) -> BoolArray:
+    """Which samples (W, L, C) of windows tell of the window alone; of a short one at least the second half.
+
+    Args:
+        remembers: (C,) seconds in which a channel tells of what was before.
+        dt: (W,) seconds between samples.
+        steps: (W,) of each window.
+        places: (L,) of the samples in it.
+    """
+    first = np.minimum(np.ceil(remembers / dt[:, None] - 1e-9), steps[:, None] // 2)
+    return np.asarray(places[:, None] >= first[:, None])

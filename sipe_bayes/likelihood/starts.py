@@ -257,6 +257,7 @@ def followed_joints(simulator: Simulator, trajectories: Trajectories) -> set[int
     return set.intersection(*(set(follow) for _, follow in _inferred(simulator, trajectories)))
 
 
+@functools.lru_cache(maxsize=2)  # asked several times of the same logs, and dear of long ones
 def _inferred(simulator: Simulator, trajectories: Trajectories) -> list[tuple[set[int], list[int]]]:
     """Of each log the ids of the joints that channels tell indirectly, and of those that follow through chains."""
     return [_estimated(simulator, replace(trajectory, states=None), False)[1:] for trajectory in trajectories]

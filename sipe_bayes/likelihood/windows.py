@@ -1,11 +1,11 @@
 """log p(trajectory | theta) by windows of the log (multiple shooting), each window's start estimated with theta.
 
 A log of T samples is cut into windows of ``window`` seconds; each is simulated from its own starting state, which is
-unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by exactly one
-window. Long open loops are chaotic and one model error would dominate them; short windows with measured starts give
-away the noise of the measurement: both cost coverage. The residuals are white or first-order autoregressive and carry
-on across windows (``sipe_bayes.likelihood.noise``). That of an orientation is the rotation vector from the predicted to
-the measured one, three numbers of one noise scale.
+unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by one window at
+most (not what a late sensor tells of the time before it). Long open loops are chaotic and one model error would
+dominate them; short windows with measured starts give away the noise of the measurement: both cost coverage. Residuals
+are white or first-order autoregressive, across windows too (``sipe_bayes.likelihood.noise``). That of an orientation is
+the rotation vector from the predicted to the measured one, three numbers of one noise scale.
 
 A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior, far wider
 than any measurement (``Environment.start_sd``), so that what is never measured does not make the equations singular.
@@ -25,7 +25,7 @@ from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
-from sipe_bayes.likelihood.sequences import Sequence, sequences, spread_blocks
+from sipe_bayes.likelihood.sequences import Sequence, sequences, settled, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, fitted_channels, fitted_rotations
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
@@ -125,8 +125,7 @@ class Windows:
             keep = spread_blocks(self.log, self.settings.seconds / lasting)
             self.log, self.start, self.steps = self.log[keep], self.start[keep], self.steps[keep]
         self.dt = trajectories.dt[self.log]
-        names = trajectories.names or (None,) * len(trajectories)
-        self.names = [names[k] for k in self.log]
+        self.names = [(trajectories.names or [None] * len(trajectories))[k] for k in self.log]
 
     def _read_samples(self, trajectories: Trajectories) -> None:
         simulator, environment = self.simulator, self.simulator.environment
@@ -140,7 +139,8 @@ class Windows:
             self.owned = place < (self.steps + last)[:, None]
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
-        self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
+        tells = settled(environment.remembers[self.channels], self.dt, self.steps, place)
+        self.observed = self.owned[:, :, None] & np.isfinite(self.measured) & tells
         self.actions = trajectories.actions[
             self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)
         ][:, :-1]

@@ -17,7 +17,7 @@ those of a loop that does not close.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 import mujoco
 import numpy as np
@@ -26,7 +26,8 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 
 SD = 0.1  # rad or m, and ten times as much a second: how far from closed a window may start, a noisy crank included
 _STEP, _MOST, _TOLERANCE, _APART, _HARDLY = 0.05, 30, 1e-10, 1e-6, 1e-3
-_FOLDED = 0.02  # of the largest singular value
+_FOLDED = 0.02  # of the largest singular value, now or by the next sample as it goes
+_APPROACH = 40  # steps from the reset to the first sample, at least
 
 
 class _Chain:
@@ -156,26 +157,28 @@ def close(model: mujoco.MjModel, states: FloatArray, reset: FloatArray, known: C
     if not chain.joints:
         return []
     others = np.setdiff1d(np.arange(nv), chain.dofs)
-    follows, position, last = set(chain.joints), chain.position, 0.0
+    position, follows = chain.position, set(chain.joints)
 
-    def go(goal: FloatArray) -> FloatArray:
-        """The positions (nq,) at which the known joints are at their goal, from where the last ones were."""
-        nonlocal follows, last
-        way = np.zeros(nv)
+    def gone(goal: FloatArray, least: int) -> Iterator[FloatArray]:
+        """The positions (nq,) on the way to where the known joints are at their goal, in at least so many steps."""
+        way, ahead = np.zeros(nv), position.copy()
         mujoco.mj_differentiatePos(model, way, 1.0, position, goal)
         way[chain.dofs] = 0
-        ahead, count = position.copy(), max(1, int(np.ceil(np.abs(way).max() / _STEP)))
+        count = max(least, int(np.ceil(np.abs(way).max() / _STEP)))
         for _ in range(count):
             mujoco.mj_integratePos(model, ahead, way, 1.0 / count)
             ahead = chain.closed(ahead)
-            opening, loose = chain.opening(ahead)
-            if min(opening, 2 * opening - last) < _FOLDED:
-                follows -= loose
-            last = opening
-        return ahead
+            yield ahead
 
+    for position in gone(states[0, 1 : 1 + nq], _APPROACH):
+        opening, loose = chain.opening(position)
+        follows -= loose if opening < _FOLDED else set()
+    last = 0.0
     for state in states:
-        position = go(state[1 : 1 + nq])
+        *_, position = gone(state[1 : 1 + nq], 1)
+        opening, loose = chain.opening(position)
+        follows -= loose if min(opening, 2 * opening - last) < _FOLDED else set()
+        last = opening
         state[1 : 1 + nq] = position
         jacobian = chain.at(position)[1]
         velocity = state[1 + nq : 1 + nq + nv]

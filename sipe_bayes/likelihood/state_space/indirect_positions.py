@@ -37,6 +37,8 @@ class IndirectOptions(Options):
     values: int = option(4, "values with which it is seen whether a position matters at all", least=2)
     unique: float = option(0.9, "share of the samples at which the next best place must fit worse", above=0, most=1)
     clear: float = option(0.1, "by how much it must fit worse there", "squared spreads", above=0)
+    over: float = option(0.3, "by which noise and soft limits let a position leave its range", "rad", least=0)
+    whole: float = option(0.05, "share of the samples with all channels from which the others are bridged", above=0)
     fits: float = option(0.2, "root mean square of what may be left", "of a channel's spread", above=0)
 
 
@@ -179,6 +181,8 @@ def indirect_positions(
         column = 1 + int(model.jnt_qposadr[joint])
         position = _best(chain, states, column, _values(model, joint), np.where(channels & alone, size, np.inf))
         if position is not None:
+            if model.jnt_limited[joint]:
+                position = _within(chain, position, *map(float, model.jnt_range[joint]))
             states[:, column], indirect[j] = position, True
             if not measured[model.nv + j]:
                 states[:, 1 + model.nq + j] = _velocities(chain, position)
@@ -187,21 +191,29 @@ def indirect_positions(
 
 def _values(model: mujoco.MjModel, joint: int) -> FloatArray:
     """What a position may be; of an unlimited slide something near by."""
-    if model.jnt_limited[joint]:
-        low, high = model.jnt_range[joint]
-        return np.linspace(float(low), float(high), OPTIONS.grid)
-    reach = np.pi if model.jnt_type[joint] == _HINGE else 1.0
-    return np.linspace(-reach, reach, OPTIONS.grid, endpoint=False)
+    hinge, (low, high) = model.jnt_type[joint] == _HINGE, map(float, model.jnt_range[joint])
+    if model.jnt_limited[joint] and not (hinge and high - low >= 2 * np.pi):
+        return np.linspace(low, high, OPTIONS.grid)
+    middle, reach = 0.5 * (low + high) * bool(model.jnt_limited[joint]), np.pi if hinge else 1.0
+    return middle + np.linspace(-reach, reach, OPTIONS.grid, endpoint=False)
 
 
 def _predicted(
-    chain: Sampled, states: FloatArray, column: int, values: FloatArray, at: IntArray | None = None
+    chain: Sampled,
+    states: FloatArray,
+    column: int,
+    values: FloatArray,
+    at: IntArray | None = None,
+    theta: FloatArray | None = None,
 ) -> FloatArray:
-    """Predictions (B, K, C) with values (B, K) in a column of the states (K, S), NaN where they diverge."""
+    """Predictions (B, K, C) with values (B, K) in a column of the states (K, S), NaN where they diverge.
+
+    theta: (N,), by default in the middle.
+    """
     many = np.repeat(states[None], len(values), axis=0)
     many[..., column] = values
-    middle = np.full((len(values), len(chain.simulator.space)), 0.5)
-    predicted, _, _ = chain.simulate(middle, many, at)
+    middle = np.full(len(chain.simulator.space), 0.5) if theta is None else theta
+    predicted, _, _ = chain.simulate(np.tile(middle, (len(values), 1)), many, at)
     return predicted
 
 
@@ -215,31 +227,45 @@ def _dependent(chain: Sampled, states: FloatArray, position: int, values: FloatA
 
 
 def _best(chain: Sampled, states: FloatArray, column: int, values: FloatArray, size: FloatArray) -> FloatArray | None:
-    """Position (K,) of every sample; None where it is not unique, or does not fit.
+    """Position (K,) of every sample; None where it is not unique, or fits neither in the middle nor as published.
 
     size (C,): infinite of channels that do not count.
     """
+    space = chain.simulator.space
+    thetas = np.full(len(space), 0.5), np.clip(space.default_theta, 0.0, 1.0)
+    tried = (_best_at(chain, states, column, values, size, theta) for theta in thetas)
+    return next((position for position in tried if position is not None), None)
+
+
+def _best_at(
+    chain: Sampled, states: FloatArray, column: int, values: FloatArray, size: FloatArray, theta: FloatArray
+) -> FloatArray | None:
+    """The same at theta (N,)."""
     # the grid, and whether one place of it is clearly ahead
     tried = np.repeat(values[:, None], len(states), axis=1)
-    residual = _residual(chain, _predicted(chain, states, column, tried), size)
+    residual = _residual(chain, _predicted(chain, states, column, tried, theta=theta), size)
     misfit = np.where(np.isnan(residual), np.inf, residual**2).sum(-1)
     spacing = float(values[1] - values[0])
     circle = bool(np.isclose(spacing * OPTIONS.grid, 2 * np.pi))
     seen = np.ptp(np.where(np.isfinite(misfit), misfit, 0.0), axis=0) > 1e-6
+    count = np.isfinite(size) & chain.observed.any(0)
+    whole = seen & chain.observed[:, count].all(1)
+    if whole.mean() >= OPTIONS.whole:  # channels of several rates
+        seen = whole
     if not seen.any() or (_lead(misfit[:, seen], circle) > OPTIONS.clear).mean() < OPTIONS.unique:
         return None
     # Gauss-Newton from there
     position = values[misfit.argmin(0)]
     for k in range(OPTIONS.steps):
         tried = np.stack([position, position + _STEP])
-        at, moved = _residual(chain, _predicted(chain, states, column, tried), size)
+        at, moved = _residual(chain, _predicted(chain, states, column, tried, theta=theta), size)
         slope = np.nan_to_num((at - moved) / _STEP)
         steepness = (slope**2).sum(-1)
         step = (slope * np.nan_to_num(at)).sum(-1) / np.maximum(steepness, 1e-12)
         position = position + np.where(seen, np.clip(step, -spacing, spacing) / (1 + (k == 0)), 0.0)
     # whether what is left is small
-    left = _residual(chain, _predicted(chain, states, column, position[None]), size)[0][:, np.isfinite(size)]
-    counted = chain.observed[:, np.isfinite(size)]
+    left = _residual(chain, _predicted(chain, states, column, position[None], theta=theta), size)[0]
+    counted = chain.observed & np.isfinite(size) & seen[:, None]
     if not float(np.sqrt((left[counted] ** 2).mean())) < OPTIONS.fits:
         return None
     return _joined(chain, position, ~seen, circle)
@@ -269,6 +295,17 @@ def _joined(chain: Sampled, position: FloatArray, blind: BoolArray, circle: bool
             along = np.unwrap(position[seen]) if circle else position[seen]
             joined[mine] = np.interp(mine, seen, along)
     return joined
+
+
+def _within(chain: Sampled, positions: FloatArray, low: float, high: float) -> FloatArray:
+    """Positions (K,), those of a log that leaves a range of more than a turn by whole turns back into it."""
+    out = positions.copy()
+    for log in np.unique(chain.log) if high - low >= 2 * np.pi else ():
+        mine = chain.log == log
+        above, below = float(positions[mine].max()) - high, low - float(positions[mine].min())
+        turns = [max(0.0, np.ceil((beyond - OPTIONS.over) / (2 * np.pi))) for beyond in (above, below)]
+        out[mine] -= 2 * np.pi * (turns[0] - turns[1])
+    return out
 
 
 def _velocities(chain: Sampled, positions: FloatArray) -> FloatArray:
