@@ -117,6 +117,7 @@ _OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "ind
     "humidity", "pressure", "rssi", "sonar", "lidar", "ultrasonic", "fault", "warning", "health",
 }  # fmt: skip
 _CELLS = {"cell", "cells"}  # of a battery: their voltages drive nothing
+TURNS = {"cos", "sin", "cosine", "sine"}  # of an angle, as a resolver tells it
 _UNITS = {
     "rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degs": "deg", "degree": "deg",
     "degrees": "deg", "mrad": "mrad", "rev": "rev", "revs": "rev", "turns": "rev", "rpm": "rpm", "dps": "deg/s",
@@ -193,7 +194,7 @@ def _flags(words: list[str]) -> tuple[set[str], list[str]]:
         "angle": _ANGLES, "length": _LENGTHS, "place": _PLACES, "speed": _SPEEDS, "acceleration": _ACCELERATIONS,
         "torque": _TORQUES, "command": _COMMANDS, "desired": _DESIRED, "measured": _MEASURED, "current": _CURRENTS,
         "voltage": _VOLTAGES, "duty": _DUTIES, "supply": _SUPPLIES, "time": _TIMES, "episode": _EPISODES,
-        "other": _OTHERS,
+        "other": _OTHERS | TURNS,
     }  # fmt: skip
     flags: set[str] = set()
     rest = []

@@ -16,6 +16,7 @@ from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.matching import Matches, match_columns
+from sipe_bayes.calibration.init.names import TURNS, pieces_of
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
@@ -153,12 +154,25 @@ def _relative(path: Path, folder: Path) -> str:
 def _check_some(machine: Machine, matches: Matches, opened: Opened, file: Path) -> None:
     if matches.positions or matches.velocities or matches.vectors:
         return
+    if turns := _resolved(opened):
+        raise LogError(f"{file}: no column could be matched: {turns[0]}")
     joints = ", ".join(joint.name for joint in machine.joints) or "none with a name"
     columns = ", ".join(map(repr, list(opened.columns)[:20])) or "none that change"
     raise LogError(
         f"{file}: no column could be matched to a joint or free body of the model (joints: {joints}; columns: "
         f"{columns}); rename the columns after the joints, such as `NAME_position`, or write the configuration by hand"
     )
+
+
+def _resolved(opened: Opened) -> list[str]:
+    """What is to be said of columns that are cosines and sines."""
+    columns = [column for column in opened.columns if TURNS & {*pieces_of(column)}]
+    if not columns:
+        return []
+    return [
+        f"{', '.join(columns)}: cosine and sine of an angle are no position; add a column of atan2(sine, cosine), or a "
+        "framexaxis sensor to the MJCF and its numbers under [[measurements]] by hand, such as sensor:NAME[0]"
+    ]
 
 
 def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, commands: Sequence[Reading]) -> list[str]:

@@ -235,7 +235,8 @@ def _contacts(model: mujoco.MjModel, machine: Machine) -> list[Unknown]:
         above = [top_of(model, g, tops) for g in group] if bodies & tops or len(groups) == 1 else sorted(bodies)
         name = f"{_shared(model, above)}_friction"
         name += f"_{k + 1}" * any(unknown.name == name for unknown in out)
-        span, what = (least, max(1.5, 2 * least)), _mixed(own, still, least)
+        given, what = [own_friction(model, g) for g in (*own, *still)], _mixed(own, still, least)
+        span = min([least, *given]), max([1.5, 2 * least, *given])  # what the model has lies within
         out += _of_geoms(model, name, "friction", (own, still), span, what)
     if touching:
         every = (sorted(touching), sorted({s for still in touching.values() for s in still}))
@@ -384,11 +385,11 @@ def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknow
     if best == fit.delays[-1]:
         why = "which other things than a delay do as well: look at the model and at what drives it; none is asked for"
         return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
-    low, high = dt * max(0, best - max(3, best // 2)), _round(dt * max(2 * best, best + 3))
+    high = _round(dt * max(2 * best, best + 3))
     targets = tuple(f"actuator:{name}.delay" for name in actuators)
     times, when = float(np.sqrt(at_zero)), f"{1e3 * dt * late:.3g} ms late, {late:.2g} samples"
     note = f"commands arrive about {when}: without that, simulated windows miss {times:.2f} times as much"
     if times < _LITTLE:
-        low, share = 0.0, 100 * (1 - 1 / times)
+        share = 100 * (1 - 1 / times)
         note = f"commands may arrive about {when}: uncertain, for it explains {share:.1g} % of what simulations miss"
-    return [Unknown("delay", targets, float(f"{low:.2g}"), high, False, note)], note
+    return [Unknown("delay", targets, 0.0, high, False, note)], note  # none at all is what the model has

@@ -127,3 +127,10 @@ def test_each_friction_is_the_contacts(tyre: str, floor: str) -> None:
         ]
         assert seen or geoms == ["floor"]
         np.testing.assert_allclose(seen, value)
+
+
+def test_bounds_hold_the_friction_that_the_model_has() -> None:
+    """A castor more slippery than is usual, with a priority over the floor: a file without that does not load."""
+    unknowns = asked(rover("", skid='friction=".01" priority="1"'))
+    castor = next(u for u in unknowns.values() if u.targets == ("geom:castor.friction",))
+    assert castor.low <= 0.01

@@ -165,6 +165,7 @@ def test_what_is_odd_is_named(arm: tuple[Path, str], before: str, after: str, wo
     [
         ({"a": [3.0, 1.0, 2.0], "theta": [1.0, 2.0, 1.0]}, ["clock", "'a'", "theta"]),
         ({"time": [0.0, 0.1, 0.2], "abc": [1.0, 2.0, 1.0]}, ["no column", "hinge", "abc"]),
+        ({"time": [0.0, 0.1, 0.2], "hinge_cos": [1.0, 0.9, 0.8], "hinge_sin": [0.0, 0.4, 0.6]}, ["hinge_sin", "atan2"]),
     ],
 )
 def test_what_can_not_be_matched_is_refused(tmp_path: Path, columns: dict[str, list[float]], words: list[str]) -> None:

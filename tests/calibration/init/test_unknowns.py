@@ -41,11 +41,12 @@ def test_a_delay_at_the_end_of_those_tried_is_none(miss: list[float], asked: boo
     assert ("none is asked for" in note) is not asked
 
 
-def test_a_late_delay_is_searched_from_where_it_shows() -> None:
-    """A search from no delay at all follows all else that does nearly the same before it finds this."""
+def test_the_bounds_of_a_delay_hold_it_and_none_at_all() -> None:
+    """None is what the model has, and a configuration without it in the bounds does not load."""
     fit = Fit((0, 9, 10, 11), np.array([1.6, 1.1, 1.0, 1.1]), np.zeros(0), np.zeros((400, 0)), np.ones(1))
     (delay,), _ = delay_of(["motor"], fit, 0.002)
-    assert 0 < delay.low < 0.018 < 0.022 < delay.high
+    assert delay.low == 0
+    assert delay.high > 0.022
 
 
 @pytest.mark.parametrize(("times", "clear"), [(1.03, False), (1.3, True)])
@@ -55,4 +56,3 @@ def test_a_delay_that_explains_little_is_called_uncertain(times: float, clear: b
     assert delay.note == note
     assert ("uncertain, for it explains 3 % of what simulations miss" in note) is not clear
     assert note.startswith("commands arrive about 40 ms late" if clear else "commands may arrive about 40 ms late")
-    assert (delay.low > 0) is clear  # none at all stays possible
