@@ -111,7 +111,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
     """
     config = config if isinstance(config, Config) else load_config(config)
     train_logs, held_logs = config.logs_for("train"), config.logs_for("holdout")
-    environment = _environment(config, train_logs)
+    environment = environment_of(config, train_logs)
     units = dict(zip(environment.channels, environment.channel_units, strict=True))
     dimensions = {
         m.target: "dimensionless" if m.quaternion else _dimension(units[m.channels[0][1]]) for m in config.measurements
@@ -162,7 +162,8 @@ def _dimension(unit: str) -> str:
         return ""
 
 
-def _environment(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
+def environment_of(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
+    """A configuration's model and parameters; raises ConfigError, TargetError or ModelError for what does not fit."""
     parameters: list[Parameter] = []
     # the unit of a command offset is the command's; other units are the model's own (empty here)
     units = {f"{c.target}.offset": to_si(c.unit)[1] for c in config.commands}

@@ -27,7 +27,8 @@ def init(
 
             result = checked(check)
             agreed = "units, signs, delays and columns agree with simulations"
-            nothing = f"{check}: nothing is odd: {'what simulations tell agrees' if result.doubts else agreed}"
+            untold = f"in what simulations tell, which leaves {len(result.doubts)} things open"
+            nothing = f"{check}: nothing is odd{f' {untold}' if result.doubts else f': {agreed}'}"
             for line in [*(result.odd or [nothing]), *(f"OPEN: {doubt}" for doubt in result.doubts)]:
                 print(line)
             if result.odd:

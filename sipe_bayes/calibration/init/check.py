@@ -33,6 +33,7 @@ from sipe_bayes.calibration.init.windows import (
     trial_of,
     tried_part,
 )
+from sipe_bayes.calibration.problem import environment_of
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 
@@ -63,6 +64,7 @@ def checked(path: Path) -> Checked:
         ModelError: for a model that does not compile.
     """
     config = load_config(path)
+    environment_of(config, config.logs_for("train"))  # raises what a calibration would
     folder = path.parent
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)

@@ -160,6 +160,16 @@ def test_what_is_odd_is_named(arm: tuple[Path, str], before: str, after: str, wo
     assert all(word in result.output for word in words), result.output
 
 
+def test_what_a_calibration_refuses_is_refused(arm: tuple[Path, str]) -> None:
+    """A delay that leaves out the model's own, none: nothing was odd, and then the file did not load."""
+    folder, text = arm
+    assert "bounds = [0.0, 0.02]" in text
+    (folder / "odd.toml").write_text(text.replace("bounds = [0.0, 0.02]", "bounds = [0.01, 0.02]"))
+    result = CliRunner().invoke(app, ["init", "--check", str(folder / "odd.toml")])
+    assert result.exit_code == 2, result.output
+    assert "the default 0 s lies outside the bounds" in result.output
+
+
 @pytest.mark.parametrize(
     ("columns", "words"),
     [
