@@ -160,8 +160,8 @@ def unmeasured_starts(
     if isinstance(likelihood, StateSpace) and not holdout:
         return []
     model, findings = simulator.model, []
-    unmeasured = unmeasured_joints(simulator, logs)
-    for joint in set(unmeasured) & set(tied_joints(simulator, logs)):
+    unmeasured, tied = unmeasured_joints(simulator, logs), tied_joints(simulator, logs)
+    for joint in (joint for joint in unmeasured if joint in tied):
         findings.append(finding(Code.CHAIN_NOT_FOLLOWED, joint=model.joint(joint).name or f"joint {joint}"))
     for joint in (joint for joint in unmeasured if has_pose(model, joint)):
         body = model.body(int(model.jnt_bodyid[joint])).name or f"body {int(model.jnt_bodyid[joint])}"

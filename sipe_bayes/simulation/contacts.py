@@ -63,11 +63,10 @@ def _spread(count: int) -> IntArray:
 
 def _touching(model: mujoco.MjModel, logs: Sequence[FloatArray]) -> tuple[Counter[tuple[int, int]], int]:
     """In how many states each pair of geoms touches, and of how many."""
-    place = np.concatenate([np.maximum(np.arange(len(states)) - 1, 0) for states in logs])
-    first = np.repeat(np.cumsum([0, *map(len, logs[:-1])]), [len(states) for states in logs])
-    states = np.concatenate(list(logs))[:, 1 : 1 + model.nq]
+    states, lengths = np.concatenate(list(logs))[:, 1 : 1 + model.nq], [len(own) for own in logs]
+    first = np.repeat(np.cumsum(lengths) - lengths, lengths)  # of each state's log
     now = _spread(len(states))
-    before = (first + place)[now]
+    before = np.maximum(now - 1, first[now])
     finite = np.isfinite(states[now]).all(1) & np.isfinite(states[before]).all(1)
     now, before = now[finite], before[finite]
     near, data, seen = copy.copy(model), mujoco.MjData(model), Counter[tuple[int, int]]()

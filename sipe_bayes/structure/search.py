@@ -37,6 +37,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetTooSmall
@@ -63,7 +64,7 @@ class DiscoverOptions(Options):
     rival: float = option(0.1, "of a piece's gain in its round, by which a rival may fall behind", least=0)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
     sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
-    gross: float = option(0.25, "of a channel's spread left from which signs and units are tried", least=0)
+    gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
     column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
     column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)

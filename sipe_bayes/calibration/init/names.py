@@ -73,17 +73,9 @@ OF_BODIES = _ALONG | _ABOUT | _PUSHED
 _SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
     "angvel",
 } | _ALONG | _ABOUT  # fmt: skip
-_ACCELERATIONS = {
-    "acceleration",
-    "accelerations",
-    "acc",
-    "accel",
-    "qacc",
-    "ddq",
-    "qdd",
-    "ddot",
+_ACCELERATIONS = _PUSHED | {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot"} | {
     "accelerometer",
-} | _PUSHED
+}  # fmt: skip
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
     "input", "drive", "applied", "a",

@@ -30,10 +30,8 @@ _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
 _SHARES = (1.0, 100.0)  # that need not be whole numbers
 _FULL_DUTIES = (1.0, 100.0, 127.0, 255.0, 400.0, 511.0, 1000.0, 1023.0, 2047.0, 4095.0, 32767.0, 65535.0)
 _MILLIVOLTS = 200.0
-_NOISE, _FEW = (
-    0.01,
-    0.05,
-)  # of the largest command, what is about zero; of the samples, what is none of a command's side
+_NOISE = 0.01  # of the largest command, what is about zero
+_FEW = 0.05  # of the samples, what tells nothing of the side on which a command lies
 _TURNS = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}
 
 

@@ -85,7 +85,8 @@ def test_angles_of_more_than_a_turn_and_channels_of_two_rates(limit: str, every:
     log = Trajectory(seen, np.zeros((299, 1)), 0.01)
     off = estimate_states(rod, log)[:, 1] - angle
     print(np.abs(off).max())
-    assert np.abs(off).max() < 0.15
+    assert np.abs(off[:-4]).max() < 0.1
+    assert np.abs(off).max() < 0.15  # the last sample may have no sine: it stays where the one before was, .13 rad away
     assert not unmeasured_joints(rod, Trajectories.stack([log]))
 
 
