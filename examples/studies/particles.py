@@ -19,7 +19,6 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,9 +34,9 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.scores import c2st
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.strategy import mixture
-from sipe_bayes.likelihood.starts import moved
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.simulation.tangents import moved
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "particles"
@@ -91,8 +90,8 @@ POSITION, VELOCITY = 0.004, 0.04  # sds of the measurements
 JUMPS = (0.001, 0.04)  # of the process noise: positions, velocities
 
 
-def logged(name: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, sipe.Trajectory]:
-    """The simulator, a truth and its log with process noise."""
+def logged(name: str, seed: int, share: float = 1.0) -> tuple[sipe.Simulator, np.ndarray, sipe.Trajectory]:
+    """The simulator, a truth and its log with process noise, of which ``share`` is left."""
     body, joints, unknown, size = MODELS[name]
     xml = (
         f'<mujoco><option timestep="0.01"/><worldbody>{body}</worldbody>'
@@ -111,7 +110,7 @@ def logged(name: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, sipe.Traje
         (piece,) = simulator.rollout(theta, action[None], state[0], dt=DT)
         assert piece.states is not None
         seen.append(piece.observations[0])
-        state = moved(simulator.model, piece.states[1:2], (jumps * rng.standard_normal(2 * count))[None])
+        state = moved(simulator.model, piece.states[1:2], (share * jumps * rng.standard_normal(2 * count))[None])
     (piece,) = simulator.rollout(theta, actions[-1:], state[0], dt=DT)
     observations = np.stack([*seen, piece.observations[0]])
     return (
@@ -131,7 +130,7 @@ def one_row(name: str, seed: int) -> dict[str, Any]:
     assert estimator.state is not None
     optimum = max(estimator.state.search.optima, key=lambda one: one.evidence)
     assert isinstance(optimum, ChainOptimum)
-    posterior = mixture([replace(optimum, averaged=None)], simulator.space)
+    posterior = mixture([optimum.as_linearised], simulator.space)
     chain = estimator.bound(Trajectories.stack([log]))
     chain.budget = np.inf
     begin = time.process_time()

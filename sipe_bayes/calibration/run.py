@@ -48,7 +48,7 @@ from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.growing_windows import grows
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.inference.registry import estimator_class

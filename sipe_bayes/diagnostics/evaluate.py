@@ -18,8 +18,8 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
-from sipe_bayes.inference.laplace.growing_windows import grown_starts, grows, tells_starts, told_starts
 from sipe_bayes.inference.laplace.options import GrowingTuning
+from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows, tells_starts, told_starts
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.starts import velocity_columns

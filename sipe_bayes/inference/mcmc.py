@@ -5,7 +5,7 @@ independent Metropolis-Hastings proposal from the widened ``laplace`` posterior 
 independent draws where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008), which finds its way
 where it is not.
 
-The target is that of ``window_target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes
+The target is that of ``windows.target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes
 first and also places the walkers; that saves D of D + 1 simulations. How far a fresh Jacobian would move the target is
 measured on some of the first walkers and reported as ``linearisation_error`` (sd in nats; NaN where it would cost more
 than a tenth of the budget). With ``StateSpace`` the target is that of ``state_space.target``, with the noise of the
@@ -40,8 +40,8 @@ from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, distinct
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
-from sipe_bayes.inference.laplace.window_target import Target, WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.target import Target, WindowFit, WindowTarget, value_cost
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows

@@ -22,9 +22,10 @@ from sipe_bayes.core.rotations import with_noise
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import Noise, noise_level
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import estimate_states, first_states, moved, with_history
+from sipe_bayes.likelihood.starts import estimate_states, first_states, with_history
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.simulation.tangents import moved
 
 
 def observation_noise(

@@ -11,6 +11,9 @@ from typing import ClassVar
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
 
 
 class BudgetExhausted(RuntimeError):
@@ -103,6 +106,23 @@ class StateSpace:
 
 
 Likelihood = Segments | StateSpace
+
+
+def chosen_channels(
+    simulator: Simulator | CallableSimulator, trajectories: Trajectories, fit: tuple[str, ...] | None
+) -> list[int]:
+    """Which channels ``fit`` names, default all; raises ValueError for unknown ones and other sizes."""
+    environment = simulator.environment
+    if trajectories.observations.shape[2] != len(environment.channels):
+        raise ValueError(
+            f"trajectories: expected observations of the {len(environment.channels)} channels "
+            f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
+        )
+    if trajectories.actions.shape[2] != environment.num_actions:
+        raise ValueError(
+            f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
+        )
+    return fitted_channels(environment.channels, fit)
 
 
 def fitted_channels(names: Sequence[str], fit: tuple[str, ...] | None) -> list[int]:

@@ -350,24 +350,6 @@ def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, Floa
     return added(vectors, smooth), slope / dt
 
 
-def moved(model: mujoco.MjModel, states: FloatArray, tangent: FloatArray) -> FloatArray:
-    """States (..., S) moved by tangents (..., 2 nv + na); either may have fewer leading dimensions."""
-    shape = np.broadcast_shapes(states.shape[:-1], tangent.shape[:-1])
-    out = np.broadcast_to(states, (*shape, states.shape[-1])).copy()
-    tangent = np.broadcast_to(tangent, (*shape, tangent.shape[-1]))
-    nq, nv = model.nq, model.nv
-    if nq == nv:
-        out[..., 1 : 1 + nq] += tangent[..., :nv]
-    else:
-        flat, turns = out.reshape(-1, out.shape[-1]), tangent.reshape(-1, tangent.shape[-1])
-        for state, turn in zip(flat, turns, strict=True):
-            position = state[1 : 1 + nq].copy()
-            mujoco.mj_integratePos(model, position, np.ascontiguousarray(turn[:nv]), 1.0)
-            state[1 : 1 + nq] = position
-    out[..., 1 + nq : 1 + nq + nv + model.na] += tangent[..., nv:]
-    return out
-
-
 def past_commands(
     simulator: Simulator, trajectories: Trajectories, log: IntArray, start: IntArray, dt: FloatArray
 ) -> list[FloatArray]:

@@ -26,38 +26,20 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
 from sipe_bayes.likelihood.sequences import Sequence, sequences, settled, spread_blocks
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, fitted_channels, fitted_rotations
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
     all_starts_measured,
     are_states,
     contacts_of,
     estimate_states,
-    moved,
     past_commands,
     start_sd,
     with_history,
 )
-from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
-
-
-def chosen_channels(
-    simulator: Simulator | CallableSimulator, trajectories: Trajectories, fit: tuple[str, ...] | None
-) -> list[int]:
-    """Which channels ``fit`` names, default all; raises ValueError for unknown ones and other sizes."""
-    environment = simulator.environment
-    if trajectories.observations.shape[2] != len(environment.channels):
-        raise ValueError(
-            f"trajectories: expected observations of the {len(environment.channels)} channels "
-            f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
-        )
-    if trajectories.actions.shape[2] != environment.num_actions:
-        raise ValueError(
-            f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
-        )
-    return fitted_channels(environment.channels, fit)
+from sipe_bayes.simulation.tangents import moved
 
 
 @dataclass(frozen=True)
@@ -83,6 +65,7 @@ class Windows:
     """
 
     _masked = 0
+    _unmasked: BoolArray
 
     def __init__(
         self, settings: Segments, simulator: Simulator, trajectories: Trajectories, like: Windows | None = None
@@ -172,14 +155,19 @@ class Windows:
         return self._subset
 
     def mask(self, samples: IntArray) -> None:
-        """Leave out samples (k, 3), each by log, number in it and channel of the model, with all left out before.
+        """Leave out samples (k, 3), each by log, number in it and channel of the model, and no others.
 
-        Starts stay where they are, and parts that were taken of the windows before as they are.
+        They are those of the last time, and more, or fewer where a search begins anew. Starts stay where they are, and
+        parts that were taken of the windows before as they are.
         """
-        length, fresh = self.observed.shape[1], samples[self._masked :]
-        if not len(fresh):
+        length = self.observed.shape[1]
+        if len(samples) == self._masked:
             return
-        for log, sample, channel in fresh.tolist():
+        if len(samples) < self._masked:
+            self.observed, self._masked = self._unmasked.copy(), 0
+        elif not self._masked:
+            self._unmasked = self.observed.copy()
+        for log, sample, channel in samples[self._masked :].tolist():
             place = sample - self.start
             own = np.flatnonzero((self.log == log) & (place >= 0) & (place < length))
             self.observed[own, place[own], self.channels.index(channel)] = False

@@ -15,7 +15,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
 from sipe_bayes.inference.laplace.strategy import distinct
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior

@@ -15,7 +15,7 @@ from sipe_bayes.envs.base import START_SD
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.strategy import distinct
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal

@@ -19,8 +19,9 @@ from sipe_bayes.core.rotations import bridged, written_near
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.starts import estimate_states, moved, with_history
+from sipe_bayes.likelihood.starts import estimate_states, with_history
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.simulation.tangents import moved
 
 _WORST = 30.0
 _BEST = 1e-3

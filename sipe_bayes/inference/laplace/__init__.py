@@ -25,7 +25,7 @@ mean lies beyond it, and the truncated density is right up to the bound.
 1. Choose starting points: the model as given and the best of a few draws from the prior (``screening``); where windows
    begin at known states, through contact or over long logs, by beginnings that grow (``contact_starts``).
 2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
-3. Record where that ends (``window_optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
+3. Record where that ends (``windows.optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
    over a handful of weighted noise values; where starts are estimated, ask points two sds away whether it is too narrow
    and take slopes between them then (``wide_differences``).
 4. Look around (``pattern_search``) and go on from a better place, or from the middle of a ridge.
@@ -35,9 +35,9 @@ mean lies beyond it, and the truncated density is right up to the bound.
    of a mixture, weighted by their restricted likelihood.
 7. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
    single one (``inference.stretches``); where they do not stand, importance draws and kernels on them take the normals'
-   place, each optimum's on its own draws (``window_draws``).
+   place, each optimum's on its own draws (``windows.draws``).
 
-**Phases** of the search over windows (``window_state.Phase``, a function each in ``window_search.WindowSearch``)::
+**Phases** of the search over windows (``windows.state.Phase``, a function each in ``windows.search.WindowSearch``)::
 
     starting point
         |                  starts are measured
@@ -58,7 +58,7 @@ mean lies beyond it, and the truncated density is right up to the bound.
         v
       next starting point, or done
 
-With ``StateSpace`` every sample's state is unknown and ``state_space.search`` takes the place of ``window_search``, or
+With ``StateSpace`` every sample's state is unknown and ``state_space.search`` takes the place of ``windows.search``, or
 ``state_space.known_starts`` where the first states are known. All are a ``strategy.Strategy``: made of a
 ``SearchProblem`` and the bound logs, with a frozen state of their own.
 

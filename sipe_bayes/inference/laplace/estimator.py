@@ -27,10 +27,11 @@ from sipe_bayes.inference.laplace.state_space.several_linearisations import line
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
-from sipe_bayes.inference.laplace.window_draws import draw_size, more, probed, sharing
-from sipe_bayes.inference.laplace.window_optimum import not_followed
-from sipe_bayes.inference.laplace.window_search import WindowSearch
-from sipe_bayes.inference.laplace.window_state import WindowOptimum, WindowState
+from sipe_bayes.inference.laplace.windows.draws import draw_size, more, probed, sharing
+from sipe_bayes.inference.laplace.windows.longer_windows import led_on
+from sipe_bayes.inference.laplace.windows.optimum import not_followed
+from sipe_bayes.inference.laplace.windows.search import WindowSearch
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -184,15 +185,17 @@ class Laplace(Estimator[LaplaceState]):
         ended = replace(state, done=True)
         if isinstance(windows, Chain):
             optima, shots_left = distinct(state.search.optima), self._shots_left(state.search)
-            if shots_left and self._absorbs(windows, optima[0]):
+            if self._lost(windows, optima[0], state.search):
                 return state
             state, target = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
             return self._looked_beyond(windows, state, target) if stands or not shots_left else state
+        assert isinstance(state.search, WindowState)
+        if (elsewhere := led_on(self.problem, windows, state.search)) is not None:
+            return replace(state, search=elsewhere)
         kept = distinct(state.search.optima)
         probe = probed(self.problem, windows, kept)
         if probe.stands:
-            assert isinstance(state.search, WindowState)
             return replace(ended, search=_looked_around(state.search, kept[0]))
         state = replace(ended, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
         return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows, kept)))
@@ -201,11 +204,16 @@ class Laplace(Estimator[LaplaceState]):
         """Whether a finished search may go on from where windows of the logs lead."""
         return isinstance(search, StateSpaceState) and search.shots < self.options.tuning.state_space.shooting.shots
 
-    def _absorbs(self, chain: Chain, optimum: Optimum) -> bool:
-        """Whether process noise explains much of a log through contact: a trajectory that needs less may be found."""
-        assert isinstance(optimum, ChainOptimum)
-        share = self.options.tuning.state_space.shooting.absorbed
-        return optimum.rough and optimum.absorbed > share * chain.observed.sum()
+    def _lost(self, chain: Chain, optimum: Optimum, search: WindowState | StateSpaceState | KnownStartState) -> bool:
+        """Whether process noise explains much of a log, and windows are to find a trajectory that needs less.
+
+        Through contact; or, once, where not every state is told.
+        """
+        if not isinstance(search, StateSpaceState) or not isinstance(optimum, ChainOptimum):
+            return False
+        tuning = self.options.tuning.state_space.shooting
+        shots = tuning.shots if optimum.rough else int(not chain.determined.all())
+        return search.shots < shots and optimum.absorbed > tuning.absorbed * chain.observed.sum()
 
     def _judged(
         self, chain: Chain, state: LaplaceState, kept: list[Optimum]

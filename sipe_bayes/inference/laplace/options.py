@@ -8,8 +8,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
-from sipe_bayes.inference.laplace.pattern_search import PatternTuning
 from sipe_bayes.inference.laplace.state_space.options import ChainTuning
+from sipe_bayes.inference.laplace.windows.pattern_search import PatternTuning
 from sipe_bayes.inference.stretches import StretchTuning
 
 
@@ -26,7 +26,7 @@ class ScreeningTuning(Options):
 
 @dataclass(frozen=True)
 class WindowTuning(Options):
-    """How the search over windows goes; see ``window_search``."""
+    """How the search over windows goes; see ``windows.search``."""
 
     tolerance: float = option(0.02, "gain of a step below which the search stands still", "nats", above=0)
     rough_tolerance: float = option(1e-4, "the same while the noise is only guessed", "of the energy", above=0)
@@ -112,6 +112,18 @@ class ScoutTuning(Options):
 
 
 @dataclass(frozen=True)
+class LongerTuning(Options):
+    """When longer windows are tried where starts are not measured, and how; see ``windows.longer_windows``."""
+
+    lost: float = option(3.0, "noise from which the logs are not followed", "of the samples' scatter", above=1)
+    times: int = option(8, "how many times as long they are: as many starts fewer", least=2)
+    share: float = option(
+        0.6, "of the budget that is left, for their search: the rest goes on from there", above=0, below=1
+    )
+    better: float = option(0.5, "residuals from which the search goes on there", "of those before", above=0, below=1)
+
+
+@dataclass(frozen=True)
 class LaplaceTuning(Options):
     """Numbers of the search that users hardly ever change."""
 
@@ -121,6 +133,7 @@ class LaplaceTuning(Options):
     wide: WideDifferenceTuning = option(WideDifferenceTuning(), "differences as long as the posterior is wide")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
     contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
+    longer: LongerTuning = option(LongerTuning(), "what is tried where starts are not measured and short windows fail")
     scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
     stretches: StretchTuning = option(StretchTuning(), "how far a posterior is looked at beyond its normal")

@@ -7,8 +7,8 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.growing_windows import told_starts
 from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.inference.laplace.windows.growing_windows import told_starts
 from sipe_bayes.likelihood.windows import Windows
 
 

@@ -34,10 +34,10 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
-from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace, check_seen, fitted_rotations
-from sipe_bayes.likelihood.starts import estimate_states, moved, past_commands, start_sd, with_history
-from sipe_bayes.likelihood.windows import chosen_channels
+from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace, check_seen, chosen_channels, fitted_rotations
+from sipe_bayes.likelihood.starts import estimate_states, past_commands, start_sd, with_history
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.simulation.tangents import moved, tangents
 
 KNOWN_SD = (1e-6, 1e-5, 1e-6)  # of a start that is known, beyond rounding: position, velocity, activation
 
@@ -219,17 +219,7 @@ class Chain:
 
     def difference(self, after: FloatArray, before: FloatArray) -> FloatArray:
         """Tangents (..., D) that lead from states ``before`` (..., S) to ``after``."""
-        model = self.simulator.model
-        nq, nv, end = model.nq, model.nv, 1 + model.nq + model.nv + model.na
-        after, before = np.broadcast_arrays(after, before)
-        rest = after[..., 1 + nq : end] - before[..., 1 + nq : end]
-        if nq == nv:
-            return np.concatenate([after[..., 1 : 1 + nq] - before[..., 1 : 1 + nq], rest], axis=-1)
-        turn = np.empty((*after.shape[:-1], nv))
-        rows = (turn.reshape(-1, nv), before.reshape(-1, before.shape[-1]), after.reshape(-1, after.shape[-1]))
-        for out, one, two in zip(*rows, strict=True):
-            mujoco.mj_differentiatePos(model, out, 1.0, one[1 : 1 + nq].copy(), two[1 : 1 + nq].copy())
-        return np.concatenate([turn, rest], axis=-1)
+        return tangents(self.simulator.model, after, before)
 
     def simulate(
         self, theta: FloatArray, states: FloatArray, at: IntArray | None = None

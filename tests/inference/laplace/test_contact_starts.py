@@ -12,9 +12,9 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting
-from sipe_bayes.inference.laplace.contact_starts import begins_in_contact, grown_starts
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.window_energy import beyond_start_noise, present_noise, start_noise
+from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact, grown_starts
+from sipe_bayes.inference.laplace.windows.energy import beyond_start_noise, present_noise, start_noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from tests.problems.bouncing import bouncing, bouncing_log

@@ -10,7 +10,9 @@ import pytest
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.growing_windows import (
+from sipe_bayes.inference.laplace.options import GrowingTuning
+from sipe_bayes.inference.laplace.windows.energy import LinearisedWindows, WindowEnergy, WindowPoint
+from sipe_bayes.inference.laplace.windows.growing_windows import (
     ManyStarts,
     grown_starts,
     grows,
@@ -19,9 +21,7 @@ from sipe_bayes.inference.laplace.growing_windows import (
     scattered,
     told_starts,
 )
-from sipe_bayes.inference.laplace.options import GrowingTuning
-from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import Segments

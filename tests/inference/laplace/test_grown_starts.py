@@ -9,8 +9,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.contact_starts import grown_starts
 from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.windows.contact_starts import grown_starts
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.simulation.simulator import Simulator
 

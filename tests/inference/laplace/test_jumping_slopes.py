@@ -10,10 +10,10 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.growing_windows import grown
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.options import GrowingTuning
-from sipe_bayes.inference.laplace.window_state import Phase, Position
+from sipe_bayes.inference.laplace.windows.growing_windows import grown
+from sipe_bayes.inference.laplace.windows.state import Phase, Position
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows

@@ -7,7 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.pattern_search import PatternTuning, Surroundings, pattern_search, pattern_size
+from sipe_bayes.inference.laplace.windows.pattern_search import (
+    PatternTuning,
+    Surroundings,
+    pattern_search,
+    pattern_size,
+)
 
 SD, THETA = 0.02, np.array([0.4, 0.6])
 COVARIANCE = SD**2 * np.eye(2)

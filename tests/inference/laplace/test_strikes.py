@@ -11,7 +11,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.growing_windows import grows
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch

@@ -12,7 +12,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceOptions, LaplaceTuning, WideDifferenceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_optimum import Ending, summarised, widened
+from sipe_bayes.inference.laplace.windows.optimum import Ending, summarised, widened
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows

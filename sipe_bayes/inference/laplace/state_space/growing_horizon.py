@@ -22,8 +22,8 @@ from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.state_space.noise import roughness
 from sipe_bayes.inference.laplace.strategy import SearchProblem, distinct, mixture
-from sipe_bayes.inference.laplace.window_search import WindowSearch
-from sipe_bayes.inference.laplace.window_state import WindowState
+from sipe_bayes.inference.laplace.windows.search import WindowSearch
+from sipe_bayes.inference.laplace.windows.state import WindowState
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.state_space.chain import Chain

@@ -49,7 +49,8 @@ from sipe_bayes.inference.laplace.state_space.state import (
     screened,
     unknown_noise,
 )
-from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.inference.laplace.windows.longer_windows import trailed
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.state_space.differences import linearise
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 
@@ -133,15 +134,16 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
     def shoot(self, state: StateSpaceState) -> StateSpaceState:
         """A finished search, once more from where windows of the logs end; as it was where they lead nowhere.
 
-        They begin at the best optimum's theta, then at the starting points.
+        Through contact they begin at the best optimum's states and theta; else where the log's windows do.
         """
         chain, tuning = self.chain, self.tuning.shooting
-        begin = max(state.optima, key=lambda one: one.evidence).theta
+        best = max(state.optima, key=lambda one: one.evidence)
         states = [chain.reference, *(one.states for one in state.optima)]
         state = replace(state, shots=state.shots + 1)
         judges = 2 * self.problem.options.tuning.importance.judges  # of two optima
         room = tuning.steps * self.wide_step_rollouts + judges * len(chain.trajectories)
-        end = shot(self.problem, chain, begin, states, chain.budget - chain.rollouts - room)
+        budget = chain.budget - chain.rollouts - room
+        end = shot(self.problem, chain, best.theta, states, budget) if best.rough else self._by_windows(budget)
         if end is None:
             return replace(state, uncounted=chain.uncounted)
         movement, fixed = chain.movement(end.states), chain.fixed_sd
@@ -151,6 +153,18 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         here = replace(here, noise=self._guessed(noise, movement), estimate_theta=end.theta)
         points = np.concatenate([state.points, end.theta[None]])
         return replace(state, points=points, point=len(points) - 1, here=here, done=False, uncounted=chain.uncounted)
+
+    def _by_windows(self, budget: float) -> ChainPoint | None:
+        """Theta and states where long windows without process noise end; None where ``budget`` is too small."""
+        chain = self.chain
+        settings = Segments(noise="white", fit=chain.settings.fit, noise_sd=chain.settings.noise_sd)
+        quiet = replace(self.problem, find=lambda _: None)
+        trail = trailed(quiet, chain.simulator, chain.trajectories, settings, budget)
+        if trail is None:
+            return None
+        chain.rollouts += trail.rollouts
+        away = chain.difference(np.concatenate(trail.states), chain.reference)
+        return ChainPoint(trail.theta, chain.moved(chain.reference, away))
 
     # ------------------------------------------------------------------ phases
 

@@ -22,12 +22,12 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.growing_windows import counted, grown, level
 from sipe_bayes.inference.laplace.state_space.noise import roughness
 from sipe_bayes.inference.laplace.state_space.options import ShootingTuning
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_state import Phase, Position
+from sipe_bayes.inference.laplace.windows.growing_windows import counted, grown, level
+from sipe_bayes.inference.laplace.windows.state import Phase, Position
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.state_space.chain import Chain

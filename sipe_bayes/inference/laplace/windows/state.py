@@ -152,6 +152,7 @@ class WindowState(StrategyState[Position]):
         aside: the optima as they were recorded, while these are.
         scouted: whether other values that fit as well have been looked for.
         wild: (k, 3), samples that are left out; see ``likelihood.wild_samples``.
+        longer: whether the search has gone on from where longer windows led.
     """
 
     here: Position
@@ -160,6 +161,7 @@ class WindowState(StrategyState[Position]):
     aside: tuple[WindowOptimum, ...] = ()
     scouted: bool = False
     wild: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    longer: bool = False
 
     @property
     def known(self) -> bool:

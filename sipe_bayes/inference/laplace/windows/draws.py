@@ -18,10 +18,10 @@ import numpy as np
 
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
-from sipe_bayes.inference.laplace.pattern_search import SHORTEST
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, merged, mixture
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
-from sipe_bayes.inference.laplace.window_target import WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.laplace.windows.pattern_search import SHORTEST
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.target import WindowFit, WindowTarget, value_cost
 from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows

@@ -9,11 +9,8 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.inference.laplace.growing_windows import grows, level
-from sipe_bayes.inference.laplace.pattern_search import Surroundings, nearest_points, pattern_search, pattern_size
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.wide_differences import WideDifferences
-from sipe_bayes.inference.laplace.window_energy import (
+from sipe_bayes.inference.laplace.windows.energy import (
     WindowEnergy,
     beyond_rounding,
     beyond_start_noise,
@@ -23,7 +20,15 @@ from sipe_bayes.inference.laplace.window_energy import (
     pulls,
     updated_noise,
 )
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.growing_windows import grows, level
+from sipe_bayes.inference.laplace.windows.pattern_search import (
+    Surroundings,
+    nearest_points,
+    pattern_search,
+    pattern_size,
+)
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.wide_differences import WideDifferences
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise

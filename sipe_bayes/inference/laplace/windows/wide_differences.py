@@ -15,8 +15,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_energy import WindowEnergy
-from sipe_bayes.inference.laplace.window_state import WindowOptimum
+from sipe_bayes.inference.laplace.windows.energy import WindowEnergy
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.windows import Windows
 

@@ -38,23 +38,11 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.contact_starts import begins_in_contact, starting_points
-from sipe_bayes.inference.laplace.growing_windows import (
-    ManyStarts,
-    counted,
-    first_beginnings,
-    group,
-    grown,
-    grows,
-    num_groups,
-    scattered,
-)
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning
-from sipe_bayes.inference.laplace.pattern_search import SHORTEST, pattern_size
-from sipe_bayes.inference.laplace.scouting import may_scout, scouted
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_energy import (
+from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact, starting_points
+from sipe_bayes.inference.laplace.windows.energy import (
     LinearisedWindows,
     WindowEnergy,
     WindowPoint,
@@ -64,7 +52,17 @@ from sipe_bayes.inference.laplace.window_energy import (
     same_noise,
     updated_noise,
 )
-from sipe_bayes.inference.laplace.window_optimum import (
+from sipe_bayes.inference.laplace.windows.growing_windows import (
+    ManyStarts,
+    counted,
+    first_beginnings,
+    group,
+    grown,
+    grows,
+    num_groups,
+    scattered,
+)
+from sipe_bayes.inference.laplace.windows.optimum import (
     Ending,
     judged,
     middle_of_ridge,
@@ -72,7 +70,9 @@ from sipe_bayes.inference.laplace.window_optimum import (
     surroundings,
     widened,
 )
-from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowState
+from sipe_bayes.inference.laplace.windows.pattern_search import SHORTEST, pattern_size
+from sipe_bayes.inference.laplace.windows.scouting import may_scout, scouted
+from sipe_bayes.inference.laplace.windows.state import Kept, Phase, Position, WindowState
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import BudgetExhausted
@@ -168,11 +168,12 @@ class WindowSearch:
         unknown = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)
         return replace(onward, optima=tuple(replace(optimum, finding=unknown) for optimum in state.optima))
 
-    def onward(self, state: WindowState, theta: FloatArray) -> WindowState | None:
-        """A search that had ended, from a better place (N,); None where it has had enough, or no budget is left."""
+    def onward(self, state: WindowState, theta: FloatArray, starts: FloatArray | None = None) -> WindowState | None:
+        """A search that had ended, from a better place (N,), and starts (W, D); None where it has had enough."""
         if len(state.points) >= self._tuning.windows.most_points or self._leaves_no_room():
             return None
-        points, here = np.concatenate([state.points, theta[None]]), self._begin(theta)
+        points, here = np.concatenate([state.points, theta[None]]), self._begin(theta, subset=starts is None)
+        here = here if starts is None else replace(here, starts=starts)
         return replace(state, points=points, point=len(state.points), here=here, done=False)
 
     def _scout(self, state: WindowState) -> WindowState:

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.laplace.levenberg_marquardt import descend
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem
-from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint, present_noise
+from sipe_bayes.inference.laplace.windows.energy import LinearisedWindows, WindowEnergy, WindowPoint, present_noise
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 

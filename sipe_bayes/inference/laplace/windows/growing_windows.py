@@ -36,8 +36,8 @@ from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
 from sipe_bayes.inference.laplace.options import GrowingTuning
-from sipe_bayes.inference.laplace.window_energy import LinearisedWindows, WindowEnergy, WindowPoint
-from sipe_bayes.inference.laplace.window_state import Kept, Phase, Position, WindowOptimum
+from sipe_bayes.inference.laplace.windows.energy import LinearisedWindows, WindowEnergy, WindowPoint
+from sipe_bayes.inference.laplace.windows.state import Kept, Phase, Position, WindowOptimum
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, noise_level, pooled
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior

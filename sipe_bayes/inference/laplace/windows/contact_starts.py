@@ -30,7 +30,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import descend
 from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.window_energy import (
+from sipe_bayes.inference.laplace.windows.energy import (
     LinearisedWindows,
     WindowEnergy,
     WindowPoint,

@@ -1,0 +1,7 @@
+"""The search of ``laplace`` over windows of the logs (``likelihood.windows``).
+
+``search`` goes from starting point to recorded optimum over ``state``s; ``optimum`` is what is recorded. Starting
+points come from ``contact_starts`` and ``scouting``, and from ``longer_windows`` where no start is measured;
+``growing_windows`` is for bodies that tumble, ``pattern_search`` and ``wide_differences`` look around an optimum,
+``draws`` takes the normal's place, and ``target`` is what ``mcmc`` samples.
+"""

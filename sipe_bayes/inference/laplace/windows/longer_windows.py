@@ -1,0 +1,99 @@
+"""Where the search goes on once short windows have led astray: from where longer ones end.
+
+A joint that no channel measures, or several that the same channels tell together, begin a window anywhere. Half a
+second of two channels hardly says where, so that starts take what is theta's, and the search ends where neither is
+right: by the tip of an arm, or by its upper joint alone, in every fifth log, six sds off. A window eight times as long
+has an eighth of the starts. So where the noise that is left is far larger than the samples scatter, such windows are
+fitted by themselves, and the search goes on from their theta and from states along their simulations, if these follow
+the log much better. Nothing is asked where each joint's start is measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.inference.laplace.windows.growing_windows import level
+from sipe_bayes.inference.laplace.windows.search import WindowSearch
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.simulation.tangents import tangents
+
+
+@dataclass(frozen=True)
+class Trail:
+    """Where longer windows end.
+
+    Args:
+        theta: (N,).
+        states: along each log (T+1, S).
+        rollouts: that it took.
+    """
+
+    theta: FloatArray
+    states: Sequence[FloatArray]
+    rollouts: int
+
+
+def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState | None:
+    """A finished search on from where longer windows lead; None where it is not lost, or they are no better."""
+    tuning, settings = problem.options.tuning.longer, windows.settings
+    if state.longer or not windows.num_start or windows.starts_measured or settings.window is None:
+        return None
+    best = max(state.optima, key=lambda one: one.evidence)
+    if not (best.sd > tuning.lost * level(windows).sd).any():
+        return None
+    budget = tuning.share * (windows.budget - windows.rollouts)
+    trail = trailed(replace(problem, find=lambda _: None), windows.simulator, windows.trajectories, settings, budget)
+    if trail is None:
+        return None
+    windows.rollouts += trail.rollouts
+    begins = np.stack([trail.states[k][s] for k, s in zip(windows.log, windows.start, strict=True)])
+    starts = tangents(windows.simulator.model, begins, windows.reference)
+    residual, valid = windows.residuals(trail.theta[None], starts[None])
+    left = np.sqrt((residual[0] ** 2).sum((0, 1)) / np.maximum(windows.observed.sum((0, 1)), 1))
+    if not valid[0] or not np.log(left / best.sd).mean() < np.log(tuning.better):
+        return None
+    fresh = replace(state, optima=(), wild=np.zeros((0, 3), np.int64), longer=True)
+    return WindowSearch(problem, windows).onward(fresh, trail.theta, starts)
+
+
+def trailed(
+    problem: SearchProblem, simulator: Simulator, trajectories: Trajectories, settings: Segments, budget: float
+) -> Trail | None:
+    """Where windows several times as long as those of ``settings`` end; None where ``budget`` is too small."""
+    tuning, shortest = problem.options.tuning.longer, (trajectories.length * trajectories.dt).min()
+    length = math.inf if settings.window is None else tuning.times * settings.window
+    lengthened = replace(settings, window=None if length > shortest else length, windows=(), seconds=None)
+    logs = Trajectories.stack([replace(one, states=None) for one in trajectories])
+    windows = bind(lengthened, simulator, logs)
+    windows.budget = budget
+    search, optima = WindowSearch(problem, windows), tuple[WindowOptimum, ...]()
+    try:
+        state = search.start()
+        while not state.done:
+            state = search.step(state)
+            optima = state.optima
+    except BudgetExhausted:
+        pass  # what was recorded may do
+    if not optima:
+        return None
+    best = max(optima, key=lambda one: one.evidence)
+    thetas, begin = np.tile(best.theta, (windows.num_windows, 1)), windows.states(best.starts)
+    rollout = simulator.rollout(thetas, windows.actions, begin, windows.dt, windows.names, goals=windows.goals)
+    assert rollout.states is not None
+    states = [np.full((len(one) + 1, begin.shape[1]), np.nan) for one in logs]
+    for w, place in zip(*np.nonzero(windows.owned), strict=True):
+        states[windows.log[w]][windows.start[w] + place] = rollout.states[w, place]
+    if not all(np.isfinite(one[:, 1:]).all() for one in states):
+        return None
+    return Trail(best.theta, states, math.ceil(windows.rollouts) + 1)
