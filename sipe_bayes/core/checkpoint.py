@@ -2,7 +2,8 @@
 
 Fields may be arrays, tensors, numbers, text, booleans, None, enumerations, ``Finding``-like plain dictionaries of JSON,
 other frozen dataclasses, and tuples or dictionaries by name of all these. The dataclass that is asked for says how to
-read them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there.
+read them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there. Results of single
+pieces of work are kept in the same form (``Kept``).
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import dataclasses
 import enum
 import hashlib
 import json
+import shutil
 import time
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -98,6 +100,48 @@ class Stored(Generic[S]):
         if self.path is not None:
             save_state(self.path, self.last, self.fingerprint)
             self._written = time.monotonic()
+
+
+class Kept:
+    """Results of single pieces of work, a file each: a run that was interrupted makes only those that are not there.
+
+    Args:
+        folder: of the files; None to keep nothing.
+        fingerprint: of all that the results depend on; those of another are made anew.
+    """
+
+    def __init__(self, folder: Path | None = None, fingerprint: str = "") -> None:
+        self.folder, self.fingerprint = folder, fingerprint
+
+    def of(self, name: str, kind: type[S], make: Callable[[Kept], S]) -> S:
+        """What is kept, or else made now and kept.
+
+        Args:
+            name: of the piece of work.
+            kind: of the result: a dataclass, or a tuple or dictionary of what states hold.
+            make: called with what keeps the parts of the result until it is whole.
+        """
+        if self.folder is None:  # laid out in memory as what is read is: sums of it have the same bits
+            arrays: dict[str, Any] = {}
+            return typing.cast(S, _restored("", _flattened("", make(self), arrays), kind, arrays))
+        path, parts = self.folder / f"{name}.safetensors", self.folder / name
+        if path.exists():
+            try:
+                return load_state(path, kind, self.fingerprint)
+            except CheckpointError:  # of another run, or damaged
+                pass
+        save_state(path, make(Kept(parts, self.fingerprint)), self.fingerprint)
+        shutil.rmtree(parts, ignore_errors=True)
+        return load_state(path, kind, self.fingerprint)
+
+
+NOTHING_KEPT = Kept()
+
+
+def fingerprint_of(*content: object) -> str:
+    """Of anything that states hold: the same has the same, in another process too."""
+    arrays: dict[str, Any] = {}
+    return checksum(arrays, json.dumps(_flattened("", content, arrays)))
 
 
 def load_state(path: Path, kind: type[S], fingerprint: str) -> S:

@@ -265,14 +265,14 @@ def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log
     assert high - low > 3 * (mass["q95"] - mass["q05"])
 
 
-@pytest.mark.parametrize("part", ["ProbedLogs", "outside_prior"])
+@pytest.mark.parametrize("part", ["lacking.ProbedLogs", "predictions.outside_prior"])
 def test_a_check_that_fails_is_one_warning(
     part: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
         raise ValueError("the simulation diverges")
 
-    monkeypatch.setattr(f"sipe_bayes.calibration.run.{part}", fail)
+    monkeypatch.setattr(f"sipe_bayes.calibration.checks.{part}", fail)
     found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
     assert [w.endswith("is unknown: the simulation diverges") for w in found["warnings"]] == [True]
 
