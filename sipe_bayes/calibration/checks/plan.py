@@ -16,6 +16,7 @@ from sipe_bayes.diagnostics.evaluate import band_cost, starts_cost
 from sipe_bayes.diagnostics.identifiability import GRID
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood.binding import bind
@@ -92,7 +93,7 @@ def expected_rollouts(problem: Problem, method: Estimator) -> dict[Check, int]:
     logs, n = len(problem.train), windows.num_theta
     held = 0 if problem.holdout is None else len(problem.holdout)
     chain = isinstance(problem.likelihood, StateSpace)
-    known = chain or method.searches
+    known = chain or isinstance(method, Laplace)
     lin = (1 + n + windows.num_start) * logs
     search = starts_cost(windows)
     try:
