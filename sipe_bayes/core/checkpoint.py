@@ -12,7 +12,6 @@ import dataclasses
 import enum
 import hashlib
 import json
-import shutil
 import time
 import types
 import typing
@@ -108,10 +107,11 @@ class Kept:
     Args:
         folder: of the files; None to keep nothing.
         fingerprint: of all that the results depend on; those of another are made anew.
+        within: what the files' names begin with.
     """
 
-    def __init__(self, folder: Path | None = None, fingerprint: str = "") -> None:
-        self.folder, self.fingerprint = folder, fingerprint
+    def __init__(self, folder: Path | None = None, fingerprint: str = "", within: str = "") -> None:
+        self.folder, self.fingerprint, self.within = folder, fingerprint, within
 
     def of(self, name: str, kind: type[S], make: Callable[[Kept], S]) -> S:
         """What is kept, or else made now and kept.
@@ -124,14 +124,16 @@ class Kept:
         if self.folder is None:  # laid out in memory as what is read is: sums of it have the same bits
             arrays: dict[str, Any] = {}
             return typing.cast(S, _restored("", _flattened("", make(self), arrays), kind, arrays))
-        path, parts = self.folder / f"{name}.safetensors", self.folder / name
+        whole = f"{self.within}{name}"
+        path = self.folder / f"{whole}.safetensors"
         if path.exists():
             try:
                 return load_state(path, kind, self.fingerprint)
             except CheckpointError:  # of another run, or damaged
                 pass
-        save_state(path, make(Kept(parts, self.fingerprint)), self.fingerprint)
-        shutil.rmtree(parts, ignore_errors=True)
+        save_state(path, make(Kept(self.folder, self.fingerprint, f"{whole}.")), self.fingerprint)
+        for part in self.folder.glob(f"{whole}.*.safetensors"):
+            part.unlink(missing_ok=True)  # another run in this folder may have been faster
         return load_state(path, kind, self.fingerprint)
 
 

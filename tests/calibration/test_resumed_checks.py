@@ -115,10 +115,12 @@ def test_parts_of_a_check_are_kept(problem: Problem, tmp_path: Path, monkeypatch
         with pytest.raises(KeyboardInterrupt):
             calibrate(problem, checkpoint=checkpoint, progress=Stopped(f"{checking}: {words}"))
         assert (groups(), draws()) == made
-    assert (tmp_path / "out" / "checks" / "lacking").is_dir()
+    kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
+    assert {"starts.safetensors", "logs.safetensors", "lacking.extensions-0.safetensors"} <= kept
     assert said(calibrate(problem, checkpoint=checkpoint)) == said(whole)
     assert (groups(), draws()) == (0, of_draws - 1)
-    assert not (tmp_path / "out" / "checks" / "lacking").exists()
+    kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
+    assert kept == {f"{check.name.lower()}.safetensors" for check in Check}
 
 
 def test_logs_are_not_fitted_again(apart: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,7 +186,7 @@ def test_killed_in_its_checks(tmp_path: Path) -> None:
     process = subprocess.Popen(command(config, "--out", broken, "--threads", 1), **quiet)
     try:
         deadline = time.monotonic() + 300
-        while not (broken / "checks" / "lacking" / "extensions-1.safetensors").exists():
+        while not (broken / "checks" / "lacking.extensions-1.safetensors").exists():
             assert process.poll() is None, "it ended before it could be killed"
             assert time.monotonic() < deadline, "no check in five minutes"
             time.sleep(0.005)

@@ -90,7 +90,7 @@ def test_output_folder(finished: tuple[Path, Path, Any]) -> None:
     config, out, result = finished
     names = {p.name for p in out.iterdir()}
     assert names == {
-        *("checkpoint.safetensors", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
+        *("checkpoint.safetensors", "checks", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
         *("identified.xml", "domain_randomization.json", "randomization", "result.json", "report.html", "figures"),
         *(f"domain_randomization_posterior.{kind}" for kind in ("safetensors", "json")),
     }
