@@ -215,7 +215,7 @@ def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame
 
 def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     outside = OutsidePrior(0.01, "log", "angle", 1.0)
-    monkeypatch.setattr("sipe_bayes.calibration.run.outside_prior", lambda *_, **__: [outside])
+    monkeypatch.setattr("sipe_bayes.calibration.checks.predictions.outside_prior", lambda *_, **__: [outside])
     result = call(write_case(tmp_path, log), "--out", tmp_path / "out")
     assert "interval yet; the warnings say why" in result.stdout
     assert "warning: log log is unlike simulations of the prior" in " ".join(result.stdout.split())
@@ -230,7 +230,7 @@ def test_a_log_that_the_model_follows_is_no_doubt(
     def outside(*_: object, followed: bool, **__: object) -> list[OutsidePrior]:
         return [OutsidePrior(0.01, "log", "angle", 1.0, followed)]
 
-    monkeypatch.setattr("sipe_bayes.calibration.run.outside_prior", outside)
+    monkeypatch.setattr("sipe_bayes.calibration.checks.predictions.outside_prior", outside)
     found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
     assert found["doubts"] == []
     assert "outside_prior_followed" in [item["code"] for item in found["findings"]]
