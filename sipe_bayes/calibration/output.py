@@ -36,12 +36,13 @@ from sipe_bayes.rl.randomization import Usable
 from sipe_bayes.simulation.rendering import with_sky
 
 CHECKPOINT = "checkpoint.safetensors"
+CHECKS = "checks"  # folder of what the checks of a fit found
 RANDOMIZATION = "randomization"
 RANDOMIZATION_POSTERIOR = "domain_randomization_posterior"  # where it is not the one that was fitted
 _RANDOMIZATION_DRAWS = 100  # in the generated code
 _COVARIANCE_DRAWS = 4000  # behind the written covariance
 _CLIP_WINDOW = 2.0  # s after which a clip's simulations start anew at the least: in less little is to be seen
-_PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
+PACKAGES = ("sipe-bayes", "mujoco", "numpy", "scipy", "torch", "pyro-ppl", "emcee", "arviz")
 
 
 def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None) -> dict[str, object]:
@@ -58,7 +59,7 @@ def describe_run(problem: Problem, estimator: str, seed: int, budget: int | None
         "seed": seed,
         "budget": budget,
         "configuration": config.model_dump(mode="json", by_alias=True),
-        "versions": {"python": platform.python_version(), **{name: installed_version(name) for name in _PACKAGES}},
+        "versions": {"python": platform.python_version(), **{name: installed_version(name) for name in PACKAGES}},
     }
 
 

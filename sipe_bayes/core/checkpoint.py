@@ -2,7 +2,8 @@
 
 Fields may be arrays, tensors, numbers, text, booleans, None, enumerations, ``Finding``-like plain dictionaries of JSON,
 other frozen dataclasses, and tuples or dictionaries by name of all these. The dataclass that is asked for says how to
-read them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there.
+read them; nothing in the file does. Of a union of dataclasses it is the one whose fields are there. Results of single
+pieces of work are kept in the same form (``Kept``).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import json
 import time
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -98,6 +99,51 @@ class Stored(Generic[S]):
         if self.path is not None:
             save_state(self.path, self.last, self.fingerprint)
             self._written = time.monotonic()
+
+
+class Kept:
+    """Results of single pieces of work, a file each: a run that was interrupted makes only those that are not there.
+
+    Args:
+        folder: of the files; None to keep nothing.
+        fingerprint: of all that the results depend on; those of another are made anew.
+        within: what the files' names begin with.
+    """
+
+    def __init__(self, folder: Path | None = None, fingerprint: str = "", within: str = "") -> None:
+        self.folder, self.fingerprint, self.within = folder, fingerprint, within
+
+    def of(self, name: str, kind: type[S], make: Callable[[Kept], S]) -> S:
+        """What is kept, or else made now and kept.
+
+        Args:
+            name: of the piece of work.
+            kind: of the result: a dataclass, or a tuple or dictionary of what states hold.
+            make: called with what keeps the parts of the result until it is whole.
+        """
+        if self.folder is None:  # laid out in memory as what is read is: sums of it have the same bits
+            arrays: dict[str, Any] = {}
+            return typing.cast(S, _restored("", _flattened("", make(self), arrays), kind, arrays))
+        whole = f"{self.within}{name}"
+        path = self.folder / f"{whole}.safetensors"
+        if path.exists():
+            try:
+                return load_state(path, kind, self.fingerprint)
+            except CheckpointError:  # of another run, or damaged
+                pass
+        save_state(path, make(Kept(self.folder, self.fingerprint, f"{whole}.")), self.fingerprint)
+        for part in self.folder.glob(f"{whole}.*.safetensors"):
+            part.unlink(missing_ok=True)  # another run in this folder may have been faster
+        return load_state(path, kind, self.fingerprint)
+
+
+NOTHING_KEPT = Kept()
+
+
+def fingerprint_of(*content: object) -> str:
+    """Of anything that states hold: the same has the same, in another process too."""
+    arrays: dict[str, Any] = {}
+    return checksum(arrays, json.dumps(_flattened("", content, arrays)))
 
 
 def load_state(path: Path, kind: type[S], fingerprint: str) -> S:

@@ -364,8 +364,7 @@ class Code(Enum):
         "experiment; fit again with this log"
     )
     UNLIKE_SIMULATIONS = blocking(
-        "the log is unlike every simulation (p = {p:.2g}): widen the bounds, or correct the model, before you trust "
-        "the result"
+        "the log is unlike every simulation ({p}): widen the bounds, or correct the model, before you trust the result"
     )
     TRAINED_ANEW = note("the log's {differs} differ from those that were learned for: simulated and trained anew")
     ROUNDED_OUTPUTS = caution("x{outputs} vary by {sd:.0e} only, as rounding does; give fn's outputs in smaller units")

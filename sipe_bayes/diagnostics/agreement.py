@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -22,10 +23,11 @@ import scipy.optimize
 import scipy.stats
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.random_effects import LogEstimate
@@ -36,7 +38,7 @@ from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.simulation.simulator import Simulator
 
-_BUDGET = 5000  # rollouts for each log
+LOG_BUDGET = 5000  # rollouts for each log
 _PIECES = 5  # of a single log, where there is no other to compare it with
 _FLAT = 1e-6  # precision that keeps a log's information invertible where it leaves a direction open
 
@@ -93,6 +95,21 @@ def parts_of(windows: Windows) -> list[tuple[str, IntArray]]:
     return [(logs.names[0], piece) for piece in pieces]
 
 
+@dataclass(frozen=True)
+class LogEstimates:
+    """What logs say by themselves, and the names of those that could not be fitted alone."""
+
+    estimates: tuple[LogEstimate, ...] = ()
+    skipped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """What one log says, if it could be fitted."""
+
+    estimate: LogEstimate | None
+
+
 def log_estimates(
     simulator: Simulator,
     likelihood: Segments | StateSpace,
@@ -100,8 +117,9 @@ def log_estimates(
     theta: FloatArray,
     seed: int = 0,
     tell: Tell = silent,
-) -> tuple[list[LogEstimate], list[str]]:
-    """Fit each log by itself.
+    kept: Kept = NOTHING_KEPT,
+) -> LogEstimates:
+    """Fit each log by itself; nothing for a single log.
 
     Args:
         simulator: of the model.
@@ -110,21 +128,33 @@ def log_estimates(
         theta: (N,) where each fit starts.
         seed: of the fits.
         tell: called with what is being done.
-
-    Returns:
-        What they say, none for a single log, and the names of logs that could not be fitted alone.
+        kept: keeps what each log says.
     """
-    estimates, skipped = [], []
-    for trajectory in trajectories if len(trajectories) > 1 else ():
-        tell(f"checking log {trajectory.name} by itself")
-        alone = Laplace(simulator, likelihood=likelihood, seed=seed, initial=theta, budget=_BUDGET)
-        try:
-            alone.fit(trajectory)
-        except ValueError:  # LinAlgError is one
+    estimates, skipped, count = [], [], len(trajectories)
+    for number, trajectory in enumerate(trajectories if count > 1 else ()):
+        where = f"log {trajectory.name} by itself, {number + 1} of {count}"
+        tell(where)
+
+        def progress(what: str, done: int, budget: int, where: str = where) -> None:
+            tell(f"{where}, {what}")
+
+        method = Laplace(
+            simulator, likelihood=likelihood, seed=seed, initial=theta, budget=LOG_BUDGET, progress=progress
+        )
+        estimate = kept.of(f"log-{number}", _Alone, partial(_alone, method, trajectory)).estimate
+        if estimate is None:
             skipped.append(trajectory.name)
-            continue
-        estimates.append(LogEstimate(trajectory.name, *alone.information()))
-    return estimates, skipped
+        else:
+            estimates.append(estimate)
+    return LogEstimates(tuple(estimates), tuple(skipped))
+
+
+def _alone(method: Laplace, log: Trajectory, kept: Kept) -> _Alone:
+    try:
+        method.fit(log)
+    except ValueError:  # LinAlgError is one
+        return _Alone(None)
+    return _Alone(LogEstimate(log.name, *method.information()))
 
 
 def linear_estimates(
@@ -163,7 +193,7 @@ def linear_estimates(
     return estimates
 
 
-def disagreement(space: ParameterSpace, logs: list[LogEstimate]) -> Disagreement | None:
+def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Disagreement | None:
     """The disagreement of two or more logs, or None; only parameters shared by all logs are compared."""
     shared = [j for j, p in enumerate(space) if p.log is None]
     if len(logs) < 2 or not shared:

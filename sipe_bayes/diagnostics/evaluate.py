@@ -30,6 +30,7 @@ _BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
 _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
 _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
+_ITERATIONS = 4  # in which starts are looked for
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
@@ -320,14 +321,23 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
     return out
 
 
-def best_starts(windows: Windows, theta: FloatArray, noise: Noise, iterations: int = 4) -> FloatArray:
+def starts_cost(windows: Windows) -> int:
+    """Rollouts of ``best_starts`` at most; about, of bodies that tumble, whose windows grow."""
+    each = windows.num_start + len(_SHORTER)
+    return (1 + _ITERATIONS * each) * len(windows.trajectories)
+
+
+def band_cost(windows: Windows) -> int:
+    """Rollouts of ``posterior_band`` at most."""
+    return max(windows.num_theta, _FEW_DRAWS) * len(windows.trajectories)
+
+
+def best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> FloatArray:
     """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,)."""
-    return _from_best_starts(windows, theta, noise, iterations)[0]
+    return _from_best_starts(windows, theta, noise)[0]
 
 
-def _from_best_starts(
-    windows: Windows, theta: FloatArray, noise: Noise, iterations: int = 4
-) -> tuple[FloatArray, FloatArray, bool]:
+def _from_best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
     """The best starts (W, D), the residuals (W, L, C) from them, and whether that simulation is valid."""
 
     def simulated(starts: FloatArray) -> tuple[FloatArray, bool]:
@@ -339,7 +349,7 @@ def _from_best_starts(
         return starts, *simulated(starts)
     starts = windows.no_starts()
     residual, valid = simulated(starts)
-    for _ in range(iterations if valid and np.isfinite(residual).all() else 0):
+    for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
         linearisation = windows.linearise(theta, starts, with_theta=False, residual=residual)
         move = marginal(windows.moments(linearisation), noise, starts, windows.start_precision)[1]
         before = after = windows.chi_square(residual[None], noise)[0]

@@ -44,7 +44,7 @@ class PredictiveOptions(Options):
     neighbours: int = option(20, "of the local outlier factor, as its authors advise", least=1)
 
 
-_OPTIONS = PredictiveOptions()
+PREDICTIVE = PredictiveOptions()
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ def outside_prior(
     Raises:
         ValueError: where more than half of the simulations diverge.
     """
-    chosen = spread_windows(windows, _OPTIONS.steps, every_log=True)
+    chosen = spread_windows(windows, PREDICTIVE.steps, every_log=True)
     logs = Trajectories.stack([_piece(windows, int(w)) for w in chosen])
     made = _predictive(windows, logs, prior, noise, seed)
-    if len(made) < _OPTIONS.simulations // 2:
-        share = f"{len(made)} of {_OPTIONS.simulations}"
+    if len(made) < PREDICTIVE.simulations // 2:
+        share = f"{len(made)} of {PREDICTIVE.simulations}"
         raise ValueError(f"prior: {share} simulations did not diverge, half are needed; narrow the bounds")
     far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
     farthest = np.zeros((len(logs), len(windows.channels)))
@@ -119,9 +119,9 @@ def outside_prior(
             known = np.flatnonzero(np.isfinite(log.observations[:, c]))
             if not len(known):
                 continue
-            kept = known[np.linspace(0, len(known) - 1, min(_OPTIONS.samples, len(known))).round().astype(int)]
+            kept = known[np.linspace(0, len(known) - 1, min(PREDICTIVE.samples, len(known))).round().astype(int)]
             simulated = np.stack([one[k, kept, c] for one in made])
-            scale = np.maximum(simulated.std(0), _OPTIONS.least * float(windows.spread[i]))
+            scale = np.maximum(simulated.std(0), PREDICTIVE.least * float(windows.spread[i]))
             far[k, i] = _outlier_factors(simulated, log.observations[kept, c], scale)
             gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(scale, 1e-12)
             farthest[k, i] = kept[gap.argmax()] * log.dt
@@ -154,7 +154,7 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
     for c in range(windows.observed.shape[2]):
         pairs = []
         for w, known in enumerate(windows.observed[..., c]):
-            if known.sum() > _OPTIONS.fewest:
+            if known.sum() > PREDICTIVE.fewest:
                 time = np.flatnonzero(known).astype(float)
                 line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]
                 both = np.stack([windows.measured[w, known, c] - predicted[w, known, c], windows.measured[w, known, c]])
@@ -179,8 +179,8 @@ def _piece(windows: Windows, number: int) -> Trajectory:
 def _predictive(windows: Windows, logs: Trajectories, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
     """Observations (R, T+1, O) of the logs at draws of the prior, orientations written near the logs' own."""
     replicas, rng = Replicas(windows.simulator, logs, noise), np.random.default_rng(seed)
-    thetas = prior.sample((_OPTIONS.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()
-    batches = np.array_split(thetas, max(1, _OPTIONS.simulations // _OPTIONS.batch))
+    thetas = prior.sample((PREDICTIVE.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()
+    batches = np.array_split(thetas, max(1, PREDICTIVE.simulations // PREDICTIVE.batch))
     made = (one for batch in batches for one in replicas.many(batch, rng, estimated=True))
     rotations, seen = windows.simulator.environment.rotations, logs.observations
     return [written_near(one.observations, seen, rotations) for one in made if one is not None]
@@ -194,7 +194,7 @@ def _outlier_factors(simulated: FloatArray, log: FloatArray, scale: FloatArray) 
     points = every[:, varies] / scale[varies]
     apart = np.sqrt(((points[:, None] - points) ** 2).sum(-1))
     np.fill_diagonal(apart, np.inf)
-    near = np.argsort(apart, axis=1)[:, : min(_OPTIONS.neighbours, len(simulated) - 1)]
+    near = np.argsort(apart, axis=1)[:, : min(PREDICTIVE.neighbours, len(simulated) - 1)]
     ways = np.take_along_axis(apart, near, axis=1)
     # how densely the neighbourhood is filled, a way counted as no shorter than the neighbour's own to its k-th
     density = 1 / (np.maximum(ways, ways[near, -1]).mean(1) + 1e-10)

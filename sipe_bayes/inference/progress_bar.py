@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -11,11 +12,14 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+_CHECKED = 1.0  # s, after which it is looked whether a line is due
 _SECONDS = 15.0  # between two lines, and before the first: what is done sooner says nothing
 
 
 class ProgressBar:
-    """A bar by tqdm on standard error; where that is neither a terminal nor a notebook, a line every 15 s at most.
+    """A bar by tqdm on standard error; where that is neither a terminal nor a notebook, a line every 15 s.
+
+    Lines come while nothing is reported too, so that long work is not taken for one that hangs.
 
     It is what ``progress`` of ``sipe.get_estimator``, ``sipe.calibrate`` and ``sipe.discover`` takes::
 
@@ -36,6 +40,9 @@ class ProgressBar:
         self._since = self._began  # when it began
         seen = "ipykernel" in sys.modules or sys.stderr.isatty()
         self._lines = not quiet and not seen
+        self._said: tuple[str, int, int] | None = None
+        self._lock, self._over = threading.Lock(), threading.Event()
+        self._beat: threading.Thread | None = None
         if not quiet and seen:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a notebook without ipywidgets gets a bar of letters
@@ -52,7 +59,11 @@ class ProgressBar:
         self.stop()
 
     def stop(self) -> None:
-        """End the bar, if there is one."""
+        """End the bar or the lines, if there are any."""
+        self._over.set()
+        if self._beat is not None:
+            self._beat.join(_SECONDS)
+            self._beat = None
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -64,9 +75,23 @@ class ProgressBar:
             self._bar.total, self._bar.n = total, min(done, total)
             self._bar.refresh()
         elif self._lines:
+            self._said = what, done, total
+            if self._beat is None and not self._over.is_set():
+                self._beat = threading.Thread(target=self._go_on, daemon=True)
+                self._beat.start()
             self._print(what, done, total)
 
+    def _go_on(self) -> None:
+        """Say again what is being done, until the end."""
+        while not self._over.wait(_CHECKED):
+            assert self._said is not None
+            self._print(*self._said)
+
     def _print(self, what: str, done: int, total: int) -> None:
+        with self._lock:
+            self._print_alone(what, done, total)
+
+    def _print_alone(self, what: str, done: int, total: int) -> None:
         now = time.monotonic()
         if total != self._before[1] or done < self._before[0]:  # another count
             self._first, self._since = (done, total), now
@@ -83,7 +108,7 @@ class ProgressBar:
         line += f"; {done} of at most {total} {self._unit}"
         own = done - self._first[0]  # not what an earlier run did
         rest = _spoken((self._last - self._since) * (total - done) / own) if own else ""
-        return f"{line}, at most {rest} for the rest" if own else line
+        return f"{line}, about {rest} for the rest if all are needed" if own else line
 
 
 def _spoken(seconds: float) -> str:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
@@ -59,8 +61,26 @@ class Probe:
     whole: float = math.nan
 
 
+@dataclass(frozen=True)
+class _Change:
+    """An ``Effect`` without what it is of: the number of that in its group."""
+
+    number: int
+    change: FloatArray
+    probes: FloatArray
+
+
+def probes_cost(windows: Windows, theta: FloatArray) -> int:
+    """Rollouts that ``probes`` takes, but for extensions that do not go together; exact where it is at this theta."""
+    if not isinstance(windows.simulator.environment, MjcfEnvironment):
+        return 0
+    groups = _groups(_placed(windows, theta, windows.no_starts()))
+    each = (1 + sum(one.probes.shape[0] * one.probes.shape[1] for one in group) for group in groups)
+    return sum(each) * len(windows.trajectories)
+
+
 def probes(
-    windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell = silent
+    windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell = silent, kept: Kept = NOTHING_KEPT
 ) -> tuple[list[Probe], FloatArray, BoolArray]:
     """Probes of all extensions that the registry has; none where the environment is no user's MJCF.
 
@@ -69,6 +89,7 @@ def probes(
         theta: (N,) where the model stands.
         starts: (W, D) of the windows.
         tell: called with what is being done.
+        kept: keeps what extensions do, group by group.
 
     Returns:
         The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
@@ -76,14 +97,19 @@ def probes(
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
-    machine = machine_of(windows, theta, starts)
-    every = [p for name in EXTENSIONS for p in placements(get_extension(name), machine)]
-    seen = effects(windows, theta, starts, [p for p in every if not p.extension.last_resort], tell)
+    seen = effects(windows, theta, starts, _placed(windows, theta, starts), tell, kept)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     nothing = np.zeros((*windows.observed.shape, 0))
     changes = np.concatenate([nothing, *(_unit(effect.change) for effect in seen)], axis=-1)
     return named, changes, np.concatenate([np.zeros(0, bool), *one_sided])
+
+
+def _placed(windows: Windows, theta: FloatArray, starts: FloatArray) -> list[Placed]:
+    """All extensions that the registry has, but those of last resort, wherever they have a place."""
+    machine = machine_of(windows, theta, starts)
+    every = (p for name in EXTENSIONS for p in placements(get_extension(name), machine))
+    return [p for p in every if not p.extension.last_resort]
 
 
 def _unit(change: FloatArray) -> FloatArray:
@@ -119,7 +145,12 @@ def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def effects(
-    windows: Windows, theta: FloatArray, starts: FloatArray, placed: Sequence[Placed], tell: Tell = silent
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    placed: Sequence[Placed],
+    tell: Tell = silent,
+    kept: Kept = NOTHING_KEPT,
 ) -> list[Effect]:
     """The effects of extensions that change what is observed.
 
@@ -129,7 +160,25 @@ def effects(
         starts: (W, D).
         placed: the extensions.
         tell: called with what is being done.
+        kept: keeps what they do, group by group.
     """
+
+    def changes(group: list[Placed], kept: Kept) -> tuple[_Change, ...]:
+        seen = _of_group(windows, theta, starts, group)
+        number = {id(one): k for k, one in enumerate(group)}
+        return tuple(_Change(number[id(effect.placed)], effect.change, effect.probes) for effect in seen)
+
+    out: list[Effect] = []
+    groups = _groups(placed)
+    for number, group in enumerate(groups):
+        tell(f"simulating what extensions would do, {number + 1} of {len(groups)}")
+        made = kept.of(f"extensions-{number}", tuple[_Change, ...], partial(changes, group))
+        out += [Effect(group[one.number], one.change, one.probes) for one in made]
+    return out
+
+
+def _groups(placed: Sequence[Placed]) -> list[list[Placed]]:
+    """What is simulated in one batch."""
     groups: dict[str, list[Placed]] = {}
     for one in placed:
         # a law costs steps of its own, an edit the cube's other models: these are simulated by themselves
@@ -137,11 +186,7 @@ def effects(
         if any(parameter.log is not None for parameter in one.parameters):
             key = key or "by log"  # which writes what others write for all logs
         groups.setdefault(key, []).append(one)
-    out: list[Effect] = []
-    for number, group in enumerate(groups.values()):
-        tell(f"simulating what extensions would do, {number} of {len(groups)}")
-        out += _of_group(windows, theta, starts, group)
-    return out
+    return list(groups.values())
 
 
 def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed]) -> list[Effect]:

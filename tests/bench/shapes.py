@@ -84,7 +84,7 @@ def measured(name: str) -> dict[str, Any]:
         return out
 
     def progress(what: str, *_: int) -> None:
-        if what.startswith("checking what each parameter") and not fitted[0]:
+        if what.startswith("check 1 of") and not fitted[0]:
             fitted[0] = time.process_time()
 
     Simulator.rollout = counted  # type: ignore[method-assign]

@@ -90,7 +90,7 @@ def test_output_folder(finished: tuple[Path, Path, Any]) -> None:
     config, out, result = finished
     names = {p.name for p in out.iterdir()}
     assert names == {
-        *("checkpoint.safetensors", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
+        *("checkpoint.safetensors", "checks", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
         *("identified.xml", "domain_randomization.json", "randomization", "result.json", "report.html", "figures"),
         *(f"domain_randomization_posterior.{kind}" for kind in ("safetensors", "json")),
     }
@@ -215,7 +215,7 @@ def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame
 
 def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     outside = OutsidePrior(0.01, "log", "angle", 1.0)
-    monkeypatch.setattr("sipe_bayes.calibration.run.outside_prior", lambda *_, **__: [outside])
+    monkeypatch.setattr("sipe_bayes.calibration.checks.predictions.outside_prior", lambda *_, **__: [outside])
     result = call(write_case(tmp_path, log), "--out", tmp_path / "out")
     assert "interval yet; the warnings say why" in result.stdout
     assert "warning: log log is unlike simulations of the prior" in " ".join(result.stdout.split())
@@ -230,7 +230,7 @@ def test_a_log_that_the_model_follows_is_no_doubt(
     def outside(*_: object, followed: bool, **__: object) -> list[OutsidePrior]:
         return [OutsidePrior(0.01, "log", "angle", 1.0, followed)]
 
-    monkeypatch.setattr("sipe_bayes.calibration.run.outside_prior", outside)
+    monkeypatch.setattr("sipe_bayes.calibration.checks.predictions.outside_prior", outside)
     found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
     assert found["doubts"] == []
     assert "outside_prior_followed" in [item["code"] for item in found["findings"]]
@@ -265,14 +265,14 @@ def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log
     assert high - low > 3 * (mass["q95"] - mass["q05"])
 
 
-@pytest.mark.parametrize("part", ["ProbedLogs", "outside_prior"])
+@pytest.mark.parametrize("part", ["lacking.ProbedLogs", "predictions.outside_prior"])
 def test_a_check_that_fails_is_one_warning(
     part: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> Any:
         raise ValueError("the simulation diverges")
 
-    monkeypatch.setattr(f"sipe_bayes.calibration.run.{part}", fail)
+    monkeypatch.setattr(f"sipe_bayes.calibration.checks.{part}", fail)
     found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
     assert [w.endswith("is unknown: the simulation diverges") for w in found["warnings"]] == [True]
 

@@ -29,7 +29,7 @@ def alarms(heavier: float, rho: float) -> list[str]:
             ]
         )
         start = simulator.space.normalise(np.array([mass, damping, coulomb]))
-        found = disagreement(simulator.space, log_estimates(simulator, Segments(0.5), logs, start)[0])
+        found = disagreement(simulator.space, log_estimates(simulator, Segments(0.5), logs, start).estimates)
         named.append("" if found is None else found.parameter if "disagree about" in found.text else "no single one")
     return named
 

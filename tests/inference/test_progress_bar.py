@@ -1,9 +1,10 @@
-"""The progress bar: on a terminal and in a notebook; lines elsewhere, one every 15 s at most."""
+"""The progress bar: on a terminal and in a notebook; lines elsewhere, one every 15 s."""
 
 from __future__ import annotations
 
 import io
 import sys
+import time
 
 import pytest
 
@@ -57,7 +58,7 @@ def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, counted: bool = 
 
 def test_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     fit, checks = "16 s: step 40; 40 of at most 100 rollouts", "34 s: checking"
-    assert lines(monkeypatch) == [f"{fit}, at most 24 s for the rest", checks]
+    assert lines(monkeypatch) == [f"{fit}, about 24 s for the rest if all are needed", checks]
     assert lines(monkeypatch, counted=False) == ["16 s: step 40", checks]
 
 
@@ -71,8 +72,25 @@ def test_a_count_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
             progress("fitting", done, total)
             clock.now += 15
     first, _, second = stream.getvalue().splitlines()
-    assert first.endswith("850 of at most 1000 rollouts, at most 45 s for the rest")
-    assert second.endswith("50 of at most 500 rollouts, at most 2 min for the rest")
+    assert first.endswith("850 of at most 1000 rollouts, about 45 s for the rest if all are needed")
+    assert second.endswith("50 of at most 500 rollouts, about 2 min for the rest if all are needed")
+
+
+def test_lines_come_while_nothing_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one long piece of work, as long as it lasts and no longer."""
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr("sipe_bayes.inference.progress_bar._SECONDS", 0.05)
+    monkeypatch.setattr("sipe_bayes.inference.progress_bar._CHECKED", 0.01)
+    with sipe.ProgressBar() as progress:
+        progress("long work", 3, 8)
+        deadline = time.monotonic() + 30
+        while stream.getvalue().count("long work; 3 of at most 8 rollouts") < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    printed = stream.getvalue()
+    assert printed.count("long work; 3 of at most 8 rollouts") >= 3
+    time.sleep(0.2)
+    assert stream.getvalue() == printed
 
 
 def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:

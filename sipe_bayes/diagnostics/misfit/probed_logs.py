@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
@@ -71,6 +72,13 @@ class Solved:
     variance: FloatArray
 
 
+@dataclass(frozen=True)
+class _Statistics:
+    """Rows (S, K + 2 C) of ``Solved.statistics``."""
+
+    rows: FloatArray
+
+
 @dataclass
 class _Null:
     """Draws of the null as far as they were asked for, and where the next come from."""
@@ -92,6 +100,7 @@ class ProbedLogs:
         prior: of the fit; default flat.
         lin: at theta and starts, where it is known.
         tell: called with what is being done.
+        kept: keeps what extensions do, and draws of the null.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -106,11 +115,12 @@ class ProbedLogs:
         prior: QuadraticPrior | None = None,
         lin: Linearisation | None = None,
         tell: Tell = silent,
+        kept: Kept = NOTHING_KEPT,
     ) -> None:
-        kept = spread_windows(windows, MISFIT.steps)
-        if len(kept) < windows.num_windows:
-            windows, starts = windows.part(kept), None if starts is None else starts[kept]
-            lin = None if lin is None else Linearisation(lin.residual[kept], lin.jacobian[kept], lin.valid)
+        some = spread_windows(windows, MISFIT.steps)
+        if len(some) < windows.num_windows:
+            windows, starts = windows.part(some), None if starts is None else starts[some]
+            lin = None if lin is None else Linearisation(lin.residual[some], lin.jacobian[some], lin.valid)
         starts = best_starts(windows, theta, noise) if starts is None else starts
         prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
         self.windows, self.theta, self.noise = windows, theta, noise
@@ -118,8 +128,8 @@ class ProbedLogs:
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        self.tell = tell
-        self.probes, effects, self.one_sided = probes(windows, theta, starts, tell)
+        self.tell, self.kept = tell, kept
+        self.probes, effects, self.one_sided = probes(windows, theta, starts, tell, kept)
         n = windows.num_theta
         parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
         self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
@@ -148,10 +158,15 @@ class ProbedLogs:
         made = self._nulls.setdefault(seed, _Null(np.random.default_rng(seed)))
         while len(made.rows) < simulated:
             self.tell(f"comparing with noise alone, draw {len(made.rows)} of at most {MISFIT.simulated}")
-            draws = self.drawn(made.rng, MISFIT.batch)
-            for s, moments in enumerate(self.together(draws)):
-                made.rows.append(self.solved(draws[..., s], self.estimated(moments)).statistics)
+            draws = self.drawn(made.rng, MISFIT.batch)  # also of what is kept: the next begin where these end
+            name = f"noise-{seed}-{len(made.rows)}"
+            made.rows.extend(self.kept.of(name, _Statistics, functools.partial(self._statistics, draws)).rows)
         return np.stack(made.rows[:simulated])
+
+    def _statistics(self, draws: FloatArray, kept: Kept) -> _Statistics:
+        """Of residuals (W, L, C, S), each with the noise that is estimated in it."""
+        solved = (self.solved(draws[..., s], self.estimated(m)) for s, m in enumerate(self.together(draws)))
+        return _Statistics(np.stack([one.statistics for one in solved]))
 
     def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         """Residuals (W, L, C, S) of the noise alone."""

@@ -66,10 +66,14 @@ class Outside:
         (factor,) = _factors(scipy.spatial.distance.cdist(point, self.points), self.spacing)
         return float((1 + (self.factors >= factor).sum()) / (1 + len(self.factors)))
 
+    @property
+    def floor(self) -> float:
+        """The least p that the simulations can give."""
+        return 1 / (1 + len(self.factors))
+
     def alarm(self, p: float) -> bool:
         """Whether p is too small for a log of the prior, or as small as so few simulations let it be."""
-        least = 1 / (1 + len(self.factors))
-        return p <= (max(THRESHOLDS.unlike, least) if self.known_start else least)
+        return p <= (max(THRESHOLDS.unlike, self.floor) if self.known_start else self.floor)
 
 
 def _nearest(distances: FloatArray) -> IntArray:

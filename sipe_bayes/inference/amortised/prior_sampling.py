@@ -40,7 +40,7 @@ from torch import Tensor, from_numpy
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import CheckpointError, Snapshot
-from sipe_bayes.core.findings import Code
+from sipe_bayes.core.findings import Code, p_text
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -189,7 +189,7 @@ class PriorSampling(Estimator[S], Generic[S, L]):
         if np.array_equal(measured(trajectories), learned.experiment.measured):
             p = learned.outside.p_value(*self._looks(trajectories.observations[None], trajectories))
             if learned.outside.alarm(p):
-                self.find(Code.UNLIKE_SIMULATIONS, p=p)
+                self.find(Code.UNLIKE_SIMULATIONS, p=p_text(p, learned.outside.floor))
         self.diagnostics["p_of_simulations"] = p
         inferred = self.infer(learned.content, trajectories)
         if learned.held_back is None:

@@ -106,7 +106,7 @@ def test_doubts_and_wrong_input() -> None:
     simulator = linear()
     method = ABC(simulator, budget=100, likelihood=QUIET)
     method.fit(seen(5.0, 0.5))
-    assert any("unlike every simulation" in w for w in method.warnings)
+    assert any("unlike every simulation (p <= 0.0099)" in w for w in method.warnings)
     assert any("only 5 simulations" in w for w in method.warnings)
     table: list[tuple[Any, str]] = [
         (lambda: ABC(simulator, accepted=0.0), "accepted: expected a share above 0 and at most 1, got 0.0"),

@@ -1,0 +1,1 @@
+"""What a calibration asks of its fit: each question by itself, kept where a run was interrupted, and counted."""

@@ -1,0 +1,116 @@
+"""A fit as its checks see it: the windows of the training logs at the estimate, and what each log says by itself."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sipe_bayes.calibration.checks.plan import Check, Checks
+from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.checkpoint import Kept
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.agreement import LogEstimates, disagreement, linear_estimates, log_estimates, parts_of
+from sipe_bayes.diagnostics.evaluate import best_starts, fitted_units, white_noise
+from sipe_bayes.diagnostics.records import ChannelNoise
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
+from sipe_bayes.inference.recorded import Tell
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.windows import Linearisation, Windows
+
+
+def from_fitted_states(problem: Problem, method: Estimator) -> Problem:
+    """The problem with the training logs in the states where a fit with a ``StateSpace`` says that they were."""
+    states = method.fitted_states(problem.train) if isinstance(method, Laplace) else None
+    return problem if states is None else replace(problem, train=replace(problem.train, states=states))
+
+
+def tamed(logs: Trajectories, method: Estimator) -> Trajectories:
+    """The logs without the samples that the fit left out."""
+    if not isinstance(method, Laplace) or not len(method.wild):
+        return logs
+    observations = logs.observations.copy()
+    observations[tuple(method.wild.T)] = np.nan
+    return replace(logs, observations=observations)
+
+
+@dataclass(frozen=True)
+class _At:
+    noise: Noise
+    starts: FloatArray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The windows of the training logs at theta (N,): noise, and best starts (W, D).
+
+    ``linear``: whether what changes them to first order is of use: not without windows of the fit's own, nor of bodies
+    that tumble.
+    """
+
+    windows: Windows
+    theta: FloatArray
+    noise: Noise
+    starts: FloatArray
+    linear: bool
+
+    @classmethod
+    def of(cls, problem: Problem, method: Estimator, theta: FloatArray, checks: Checks) -> Fit:
+        """Of a fit that has ended."""
+        windows = bind(problem.segments, problem.simulator, problem.train)
+        if isinstance(method, Laplace):
+            windows.mask(method.wild)
+        chain = isinstance(problem.likelihood, StateSpace)
+
+        def made(tell: Tell, kept: Kept) -> _At:
+            noise = _noise_of(method, windows, theta)
+            if chain:
+                return _At(noise, windows.no_starts())
+            starts = method.fitted_starts(theta) if isinstance(method, Laplace) else None
+            return _At(noise, best_starts(windows, theta, noise) if starts is None else starts)
+
+        at = checks.of(Check.STARTS, _At, made)
+        linear = not (chain or grows(windows) or len(windows.trajectories) < 2)
+        return cls(windows, theta, at.noise, at.starts, linear)
+
+    @functools.cached_property
+    def lin(self) -> Linearisation | None:
+        """What changes the windows to first order, where that is of use."""
+        return self.windows.linearise(self.theta, self.starts) if self.linear else None
+
+    def channel_noise(self) -> dict[str, ChannelNoise]:
+        """Of each fitted channel."""
+        rows = zip(self.noise.sd.tolist(), self.noise.tau.tolist(), fitted_units(self.windows), strict=True)
+        return {channel: ChannelNoise(*row) for channel, row in zip(self.windows.fitted, rows, strict=True)}
+
+
+def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
+    """The residuals' noise: the estimator's, or white of the size that its best point leaves."""
+    if "noise_sd" in method.diagnostics:
+        return Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
+    return white_noise(windows, theta)
+
+
+def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEstimates:
+    """What each of several logs says by itself.
+
+    To first order, and where they then disagree, by a fit of each. Not asked of bodies that tumble: one log says too
+    little of them by itself, and its scatter is in the posterior.
+    """
+
+    def made(tell: Tell, kept: Kept) -> LogEstimates:
+        if grows(fit.windows):
+            return LogEstimates()
+        if fit.lin is not None and fit.lin.valid:
+            alone = linear_estimates(fit.windows, fit.theta, fit.starts, fit.noise, fit.lin, parts_of(fit.windows))
+            if disagreement(problem.environment.space, alone) is None:
+                return LogEstimates(tuple(alone))
+        return log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell, kept)
+
+    return checks.of(Check.LOGS, LogEstimates, made)

@@ -1,0 +1,125 @@
+"""How a calibrated model predicts its logs, held-out ones too: errors, bands, and the logs' place in the prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sipe_bayes.calibration.checks.fitted import Fit
+from sipe_bayes.calibration.checks.plan import Check, Checks
+from sipe_bayes.calibration.gathered import not_better, worse_in_training
+from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.checkpoint import Kept
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.bands import predictive_bands
+from sipe_bayes.diagnostics.evaluate import both_predicted, channel_scores, compare_errors, signals
+from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics
+from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
+from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Signal
+from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.recorded import Tell
+from sipe_bayes.likelihood.replicas import observation_noise
+from sipe_bayes.likelihood.wild_samples import wild_residuals
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import Posterior
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Held-out errors against those of the model as given, and training errors that grew."""
+
+    comparison: Comparison | None
+    worse: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Of the logs at theta (N,), by use: windows from measured starts, the errors there, the held-out ones compared."""
+
+    theta: FloatArray
+    windows: dict[str, Windows]
+    predicted: dict[str, FloatArray]
+    train: list[ChannelScore]
+    holdout: list[ChannelScore]
+    comparison: Comparison | None
+    worse: tuple[Finding, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, theta: FloatArray, checks: Checks) -> Predictions:
+        """Simulate the logs."""
+        logs = {"train": problem.train} | ({} if problem.holdout is None else {"holdout": problem.holdout})
+        windows = {use: every_channel(problem, own) for use, own in logs.items()}
+
+        def simulated(tell: Tell, kept: Kept) -> dict[str, FloatArray]:
+            return {use: both_predicted(one, theta) for use, one in windows.items()}
+
+        predicted = checks.of(Check.PREDICTIONS, dict[str, FloatArray], simulated)
+        for use, one in windows.items():
+            one.mask(wild_residuals(one, np.where(one.observed, one.measured - predicted[use][0], 0.0)))
+        scores = {use: channel_scores(one, theta, predicted[use]) for use, one in windows.items()}
+
+        def compared(tell: Tell, kept: Kept) -> _Compared:
+            comparison = None
+            if "holdout" in windows:
+                tell("held-out logs")
+                comparison = compare_errors(windows["holdout"], theta, predicted=predicted["holdout"])
+            tell("training logs")
+            return _Compared(comparison, tuple(worse_in_training(windows["train"], theta, scores["train"])))
+
+        both = checks.of(Check.COMPARISON, _Compared, compared)
+        return cls(theta, windows, predicted, scores["train"], scores.get("holdout", []), both.comparison, both.worse)
+
+    def findings(self) -> list[Finding]:
+        """Errors that became larger: in training, and held out unless they are mostly those of the measured starts."""
+        of_starts = self.comparison is not None and self.comparison.starts is not None
+        return [*self.worse, *([] if of_starts else not_better(self.holdout))]
+
+    def bands(
+        self, posterior: Posterior, missing: MissingPhysics | None, seed: int, checks: Checks
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """The ends (W, L, C) of 90 % bands by use: of the posterior, or where the model lacks something for that."""
+
+        def made(tell: Tell, kept: Kept) -> dict[str, tuple[FloatArray, FloatArray]]:
+            believed, lacking = (posterior, False) if missing is None else (missing.further, True)
+            return predictive_bands(self.windows, self.predicted, self.theta, believed, seed, lacking)
+
+        return checks.of(Check.BANDS, dict[str, tuple[FloatArray, FloatArray]], made)
+
+    def signals(self, bands: Mapping[str, tuple[FloatArray, FloatArray]]) -> list[Signal]:
+        """What the report draws, held-out logs first; the ends (W, L, C) of their bands by use."""
+        drawn = []
+        for use, windows in reversed(self.windows.items()):
+            drawn += signals(windows, use, self.predicted[use], bands[use])
+        return drawn
+
+
+def every_channel(problem: Problem, logs: Trajectories) -> Windows:
+    """Windows of logs by which they are scored and drawn, in all channels."""
+    return Windows(replace(problem.segments, fit=None), problem.simulator, logs)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Of each log its place among simulations of the prior; findings of why that is unknown."""
+
+    logs: tuple[OutsidePrior, ...]
+    findings: tuple[Finding, ...] = ()
+
+
+def place_in_prior(problem: Problem, method: Estimator, fit: Fit, seen: Predictions, checks: Checks) -> Place:
+    """Whether any parameters within the bounds would give such logs."""
+
+    def made(tell: Tell, kept: Kept) -> Place:
+        followed = follows(seen.windows["train"], seen.predicted["train"][0])
+        noise = observation_noise(method.diagnostics, problem.train, problem.likelihood, fit.windows.simulator)
+        try:
+            looks = outside_prior(fit.windows, problem.prior, noise, seed=method.seed, followed=followed)
+        except ValueError as error:
+            return Place((), (finding(Code.OUTSIDE_PRIOR_UNKNOWN, reason=error),))
+        return Place(tuple(looks))
+
+    return checks.of(Check.PRIOR, Place, made)

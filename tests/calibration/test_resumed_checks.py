@@ -1,0 +1,207 @@
+"""An interrupted calibration goes on with its first unfinished check, to the same bits; how far it is, it says."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sipe_bayes.calibration.checks.plan import Check
+from sipe_bayes.calibration.problem import Problem, prepare
+from sipe_bayes.calibration.run import calibrate
+from sipe_bayes.diagnostics import agreement
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.result import Calibration
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure import probes
+from tests.problems.swings import command, environment, strict_json, swing, text, write_case
+
+
+def said(calibration: Calibration) -> dict[str, object]:
+    """All that a calibration says, but how long it took."""
+    drawn = {f"{s.log} {s.channel} {k}": v for s in calibration.signals for k, v in vars(s).items()}
+    left = {f"{r.log} {r.channel} left {k}": v for r in calibration.residuals for k, v in vars(r).items()}
+    arrays = {k: v.tobytes() for k, v in (drawn | left).items() if isinstance(v, np.ndarray)}
+    further = None if calibration.further is None else calibration.further.theta.numpy().tobytes()
+    return {**calibration.to_dict(), **arrays, "further": further, "seconds": 0}
+
+
+class Stopped:
+    """A progress that notes what is said of checks, and interrupts where it begins so; never where that is empty."""
+
+    def __init__(self, at: str = "") -> None:
+        self.at, self.heard = at, list[str]()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        if what.startswith("check "):
+            self.heard.append(what)
+        if self.at and what.startswith(self.at):
+            raise KeyboardInterrupt
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, place: Any, name: str) -> Callable[[], int]:
+    """How often a function has been called since the last look."""
+    calls, own = [0], getattr(place, name)
+
+    def counting(*arguments: Any, **named: Any) -> Any:
+        calls[0] += 1
+        return own(*arguments, **named)
+
+    def look() -> int:
+        seen, calls[0] = calls[0], 0
+        return seen
+
+    monkeypatch.setattr(place, name, counting)
+    return look
+
+
+@pytest.fixture
+def problem(tmp_path: Path) -> Problem:
+    return prepare(write_case(tmp_path, swing()), 1)
+
+
+@pytest.fixture
+def apart(tmp_path: Path) -> Problem:
+    """Two logs that disagree: the torque of the second is logged 1.2 times too small."""
+    config = write_case(tmp_path, swing())
+    swing().assign(torque=swing()["torque"] / 1.2).to_csv(tmp_path / "other.csv", index=False)
+    text('file = "log.csv"\nname = "rest"\nuse = "holdout"', 'file = "other.csv"\nname = "other"')(tmp_path)
+    return prepare(config, 1)
+
+
+def test_a_run_that_is_stopped_in_every_check(
+    problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each time it goes on with that one, and in the end says what one says that nobody stopped."""
+    checkpoint, count = tmp_path / "out" / "checkpoint.safetensors", len(Check)
+    for number in range(1, count + 1):
+        at = f"check {number} of {count}, "
+        progress = Stopped(at)
+        with pytest.raises(KeyboardInterrupt):
+            calibrate(problem, checkpoint=checkpoint, progress=progress)
+        begun = list(dict.fromkeys(what.partition(",")[0] for what in progress.heard))
+        assert begun == [f"check {k} of {count}" for k in range(max(number - 1, 1), number + 1)]
+    resumed = calibrate(problem, checkpoint=checkpoint)
+    assert said(resumed) == said(calibrate(problem))
+
+
+def test_nothing_is_simulated_again(problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = tmp_path / "out" / "checkpoint.safetensors"
+    first = calibrate(problem, checkpoint=checkpoint)
+    rollouts, predictions = counted(monkeypatch, Simulator, "rollout"), counted(monkeypatch, Windows, "predict")
+    assert said(calibrate(problem, checkpoint=checkpoint)) == said(first)
+    assert (rollouts(), predictions()) == (0, 0)
+
+
+def test_parts_of_a_check_are_kept(problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of extensions, and draws of noise alone; gone when the check is whole."""
+    checkpoint, checking = tmp_path / "out" / "checkpoint.safetensors", f"check 3 of {len(Check)}, what the model lacks"
+    groups, draws = counted(monkeypatch, probes, "_of_group"), counted(monkeypatch, ProbedLogs, "_statistics")
+    whole = calibrate(problem)
+    of_groups, of_draws = groups(), draws()
+    for words, made in (
+        ("simulating what extensions would do, 3 of", (2, 0)),
+        ("comparing with noise alone, draw 20", (of_groups - 2, 1)),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            calibrate(problem, checkpoint=checkpoint, progress=Stopped(f"{checking}: {words}"))
+        assert (groups(), draws()) == made
+    kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
+    assert {"starts.safetensors", "logs.safetensors", "lacking.extensions-0.safetensors"} <= kept
+    assert said(calibrate(problem, checkpoint=checkpoint)) == said(whole)
+    assert (groups(), draws()) == (0, of_draws - 1)
+    kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
+    assert kept == {f"{check.name.lower()}.safetensors" for check in Check}
+
+
+def test_logs_are_not_fitted_again(apart: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint, fits = tmp_path / "out" / "checkpoint.safetensors", counted(monkeypatch, agreement, "_alone")
+    progress = Stopped(f"check 2 of {len(Check)}, what each log says by itself: log other by itself, 2 of 2")
+    with pytest.raises(KeyboardInterrupt):
+        calibrate(apart, checkpoint=checkpoint, progress=progress)
+    assert fits() == 1
+    assert any("log log by itself, 1 of 2, laplace: start 1" in what for what in progress.heard), progress.heard
+    resumed = calibrate(apart, checkpoint=checkpoint)
+    assert fits() == 1
+    assert said(resumed) == said(calibrate(apart))
+
+
+def test_checks_of_another_fit_are_made_again(problem: Problem, tmp_path: Path) -> None:
+    """In the same folder: of a fit that a larger budget let go on, and of files that are damaged."""
+    folder = tmp_path / "out"
+    whole = calibrate(problem)
+    calibrate(problem, budget=whole.rollouts - 3, checkpoint=folder / "checkpoint.safetensors")
+    assert said(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == said(whole)
+    for file in (folder / "checks").iterdir():
+        file.write_bytes(file.read_bytes()[:-3])
+    assert said(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == said(whole)
+
+
+@pytest.mark.parametrize("case", ["problem", "apart"])
+def test_the_forecast_holds_the_checks(
+    case: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No more is simulated after the fit than was said before it, and what is done never exceeds it all."""
+    given, spent, forecast, done_before = request.getfixturevalue(case), [0], [0], [0]
+    spend = Windows.spend
+
+    def counting(self: Windows, batch: int) -> None:
+        spent[0] += batch * len(self.trajectories)
+        spend(self, batch)
+
+    def progress(what: str, done: int, total: int) -> None:
+        before = re.search(r"\(then checks, (\d+) of the rollouts\)", what)
+        if before:
+            forecast[0], spent[0] = int(before[1]), 0
+            assert total - forecast[0] >= done
+        else:
+            assert done_before[0] <= done <= total, what
+            done_before[0] = done
+
+    monkeypatch.setattr(Windows, "spend", counting)
+    calibrate(given, progress=progress)
+    print(spent, forecast)
+    assert 0 < spent[0] <= forecast[0]
+    if case == "problem":  # nothing in it is left undone but fits of single logs
+        assert forecast[0] < 3 * spent[0]
+
+
+def test_killed_in_its_checks(tmp_path: Path) -> None:
+    """A kill -9; the same command again gives what nobody disturbed gives, the report too but for the seconds."""
+    config, broken = write_case(tmp_path, swing()), tmp_path / "broken"
+    quiet: dict[str, Any] = {
+        "env": {**environment(), "MUJOCO_GL": "disabled"},
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.PIPE,
+    }
+    process = subprocess.Popen(command(config, "--out", broken, "--threads", 1), **quiet)
+    try:
+        deadline = time.monotonic() + 300
+        while not (broken / "checks" / "lacking.extensions-1.safetensors").exists():
+            assert process.poll() is None, "it ended before it could be killed"
+            assert time.monotonic() < deadline, "no check in five minutes"
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    finally:
+        process.kill()
+    assert not (broken / "result.json").exists()
+    for folder, threads in ((broken, 2), (tmp_path / "whole", 1)):
+        ended = subprocess.run(command(config, "--out", folder, "--threads", threads), **quiet, check=False)
+        assert ended.returncode == 0, ended.stderr
+    results = [strict_json((tmp_path / k / "result.json").read_text()) for k in ("broken", "whole")]
+    for result in results:
+        del result["seconds"], result["out"]
+    assert json.dumps(results[0]) == json.dumps(results[1])
+    pages = [(tmp_path / k / "report.html").read_text() for k in ("broken", "whole")]
+    broken_page, whole_page = (re.sub(r"\d[\d.]* s</p>|broken|whole", "", page) for page in pages)
+    assert broken_page == whole_page
