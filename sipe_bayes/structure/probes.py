@@ -126,7 +126,7 @@ def _named(effect: Effect) -> list[Probe]:
     targets = [target for parameter in placed.parameters for target in parameter.targets]
     what = "a parameter" if len(targets) == 1 else "parameters"
     by_log = any(parameter.log is not None for parameter in placed.parameters)
-    probe = Probe(placed.sentence, f"make {' and '.join(targets)} {what}, or widen its bounds", by_log, placed.site)
+    probe = Probe(placed.sentence, f"make {' and '.join(targets)} {what} (or widen its bounds)", by_log, placed.site)
     if not placed.extension.tolerance:
         return [probe] * len(effect.probes)
     (parameter,), steps = placed.parameters, (effect.probes - placed.plain)[:, 0]

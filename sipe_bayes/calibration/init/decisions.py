@@ -35,6 +35,8 @@ _POOR = 0.7  # of a straight line's miss, beyond which the nominal model tells n
 _BELIEVED = 0.3  # up to which it decides
 _FAR = np.log(4.0)  # behind the best, up to which combinations are fitted
 _SAME = np.log(1.02)
+_HARDLY = 1.1  # times the miss: as well
+_DOUBLED = 2.0  # times the miss, below which what the model lacks may decide for the wrong unit
 _UNLIKELY = 0.01  # by which what is not likely has to be better
 _FITTED = 4  # units, and combinations of signs with each, that are fitted where the nominal model does not decide
 _FIRST_DELAYS = (0, 1, 2, 4)
@@ -299,8 +301,10 @@ def _with_evidence(
             note, doubt, instead = "", "", ""
             if isinstance(other, Scale):
                 note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
-                if together < ranking.decided:
-                    note, doubt = "", f"{answer} or {other}? simulations follow the log as well with either"
+                if together < ranking.decided or ratio < _DOUBLED:
+                    as_well = together < ranking.decided or ratio < _HARDLY
+                    more = "follow the log as well with either" if as_well else f"miss {times} times as much with that"
+                    note, doubt = "", f"{answer} or {other}? simulations {more}"
                     instead = "\n".join(other.keys)
             elif alone < ranking.decided and together < ranking.decided:
                 doubt, instead = "its sign does not show in these logs", f"sign = {other}"
