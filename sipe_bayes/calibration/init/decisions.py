@@ -294,34 +294,51 @@ def _with_evidence(
     misses = case.misses(sets)
     clearer = followed(misses) - followed(base)
     ratios = (misses / base)[:, base < 1].max(axis=1)
-    out = list(readings)
+    out, rivals = list(readings), list[tuple[Scale, float]]()
     for other, alone, ratio in zip(others, clearer, ratios, strict=True):
         together, times = ranking.gap(q, other), f"{ratio:.2g}"
-        for k in question.readings:
-            note, doubt, instead = "", "", ""
-            if isinstance(other, Scale):
-                note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
-                if together < ranking.decided or ratio < _DOUBLED:
-                    as_well = together < ranking.decided or ratio < _HARDLY
-                    more = "follow the log as well with either" if as_well else f"miss {times} times as much with that"
-                    note, doubt = "", f"{answer} or {other}? simulations {more}"
-                    instead = "\n".join(other.keys)
-            elif alone < ranking.decided and together < ranking.decided:
-                doubt, instead = "its sign does not show in these logs", f"sign = {other}"
-            elif together < ranking.decided:
-                note = (
-                    f"sign {answer}: alone it can not be turned ({times} times the miss), but all moves alike where "
-                    "the others that belong to it are turned too"
-                )
+        note, doubt, instead = "", "", ""
+        if isinstance(other, Scale):
+            if together < ranking.decided or ratio < _DOUBLED:
+                rivals.append((other, float(1.0 if together < ranking.decided else ratio)))
             else:
-                note = f"sign {answer}: turned round, simulated windows miss {times} times as much"
-            out[k] = replace(
-                out[k],
-                notes=(*out[k].notes, *([note] if note else [])),
-                doubts=(*out[k].doubts, *([doubt] if doubt else [])),
-                instead=(*out[k].instead, *instead.splitlines()),
+                note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
+        elif alone < ranking.decided and together < ranking.decided:
+            doubt, instead = "its sign does not show in these logs", f"sign = {other}"
+        elif together < ranking.decided:
+            note = (
+                f"sign {answer}: alone it can not be turned ({times} times the miss), but all moves alike where "
+                "the others that belong to it are turned too"
             )
+        else:
+            note = f"sign {answer}: turned round, simulated windows miss {times} times as much"
+        _put(out, question, note, doubt, instead)
+    if rivals:
+        _put(out, question, "", as_well(answer, rivals), "\n".join(key for other, _ in rivals for key in other.keys))
     return out
+
+
+def as_well(answer: Answer, rivals: Sequence[tuple[Scale, float]]) -> str:
+    """That others may be right, each with its misses over those of the answer."""
+    counts = isinstance(answer, Scale) and answer.factor != 1 and all(other.unit == answer.unit for other, _ in rivals)
+    names = [f"{1 / other.factor:g}" if counts else str(other) for other, _ in sorted(rivals, key=lambda one: one[1])]
+    most = max(ratio for _, ratio in rivals)
+    if most < _HARDLY:
+        how = f"follow the log as well with {'either' if len(rivals) == 1 else 'any'}"
+    else:
+        how = f"miss {'only' if len(rivals) == 1 else 'at most'} {most:.2g} times as much with another"
+    return f"{answer} or {', '.join(names)}? simulations {how}"
+
+
+def _put(out: list[Reading], question: Question, note: str, doubt: str, instead: str) -> None:
+    """Into the question's readings, where there is any."""
+    for k in question.readings:
+        out[k] = replace(
+            out[k],
+            notes=(*out[k].notes, *([note] if note else [])),
+            doubts=(*out[k].doubts, *([doubt] if doubt else [])),
+            instead=(*out[k].instead, *instead.splitlines()),
+        )
 
 
 def _against_names(case: Case, readings: list[Reading], base: FloatArray) -> list[Reading]:

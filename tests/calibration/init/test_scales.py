@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from sipe_bayes.calibration.config import load_config
-from sipe_bayes.calibration.init.draft import Draft
+from sipe_bayes.calibration.init.decisions import as_well
+from sipe_bayes.calibration.init.draft import Draft, Scale
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.problem import prepare
@@ -128,3 +129,22 @@ def test_an_inertial_unit_that_alone_tells_of_a_body_is_fitted_with_its_biases(t
         "sensor:imu",
     }
     assert not any("trunk" in doubt for doubt in draft.open_doubts)
+
+
+@pytest.mark.parametrize(
+    ("answer", "rivals", "words"),
+    [
+        (Scale("m"), [(Scale("mm"), 1.0)], "m or mm? simulations follow the log as well with either"),
+        (Scale("N m"), [(Scale("mN m"), 1.5)], "N m or mN m? simulations miss only 1.5 times as much with another"),
+        (
+            Scale("rev", 1 / 4096),
+            [(Scale("rev", 1 / 8192), 1.6), (Scale("rev", 1 / 4000), 1.0)],
+            "4096 counts a rev or 4000, 8192? simulations miss at most 1.6 times as much with another",
+        ),
+    ],
+)
+def test_what_may_be_right_as_well_stands_in_one_line(
+    answer: Scale, rivals: list[tuple[Scale, float]], words: str
+) -> None:
+    """The nearest first; of counts the number alone."""
+    assert as_well(answer, rivals) == words
