@@ -261,8 +261,8 @@ def findings() -> str:
     return f"""# Findings
 
 What a fit, a check or a log reader may notice, by its code: `findings` of `result.json`. A note is worth knowing; of a
-caution a value or a prediction suffers; where one blocks, no plain interval is to be trusted. Braces stand for what the run
-fills in. `sipe explain CODE` says the same.
+caution a value or a prediction suffers; where one blocks, no plain interval is to be trusted. Braces stand for what the
+run fills in. `sipe explain CODE` says the same.
 
 {chr(10).join(parts)}"""
 

@@ -40,7 +40,7 @@ class ProgressBar:
         self._since = self._began  # when it began
         seen = "ipykernel" in sys.modules or sys.stderr.isatty()
         self._lines = not quiet and not seen
-        self._said: tuple[str, int, int] | None = None
+        self._latest: tuple[str, int, int] | None = None
         self._lock, self._over = threading.Lock(), threading.Event()
         self._beat: threading.Thread | None = None
         if not quiet and seen:
@@ -75,7 +75,7 @@ class ProgressBar:
             self._bar.total, self._bar.n = total, min(done, total)
             self._bar.refresh()
         elif self._lines:
-            self._said = what, done, total
+            self._latest = what, done, total
             if self._beat is None and not self._over.is_set():
                 self._beat = threading.Thread(target=self._go_on, daemon=True)
                 self._beat.start()
@@ -84,14 +84,14 @@ class ProgressBar:
     def _go_on(self) -> None:
         """Say again what is being done, until the end."""
         while not self._over.wait(_CHECKED):
-            assert self._said is not None
-            self._print(*self._said)
+            assert self._latest is not None
+            self._print(*self._latest)
 
     def _print(self, what: str, done: int, total: int) -> None:
         with self._lock:
-            self._print_alone(what, done, total)
+            self._print_line(what, done, total)
 
-    def _print_alone(self, what: str, done: int, total: int) -> None:
+    def _print_line(self, what: str, done: int, total: int) -> None:
         now = time.monotonic()
         if total != self._before[1] or done < self._before[0]:  # another count
             self._first, self._since = (done, total), now

@@ -23,14 +23,15 @@ mean lies beyond it, and the truncated density is right up to the bound.
 **Steps** (``estimator.Laplace``):
 
 1. Choose starting points: the model as given and the best of a few draws from the prior (``screening``); where windows
-   begin at known states, through contact or over long logs, by beginnings that grow (``contact_starts``).
+   begin at known states, through contact or over long logs, by beginnings that grow (``windows.contact_starts``).
 2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
 3. Record where that ends (``windows.optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
    over a handful of weighted noise values; where starts are estimated, ask points two sds away whether it is too narrow
-   and take slopes between them then (``wide_differences``).
-4. Look around (``pattern_search``) and go on from a better place, or from the middle of a ridge.
+   and take slopes between them then (``windows.wide_differences``).
+4. Look around (``windows.pattern_search``) and go on from a better place, or from the middle of a ridge.
 5. Send scouts from draws of the prior: whoever comes to rest as low elsewhere is a further starting point
-   (``scouting``).
+   (``windows.scouting``). Where starts are not measured and the logs are not followed, go on from where longer windows
+   lead (``windows.longer_windows``).
 6. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
 7. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
