@@ -2,10 +2,10 @@
 
 A joint that no channel measures, or several that the same channels tell together, begin a window anywhere. Half a
 second of two channels hardly says where, so that starts take what is theta's, and the search ends where neither is
-right: by the tip of an arm, or by its upper joint alone, in every fifth log, six sds off. A window eight times as long
-has an eighth of the starts. So where the noise that is left is far larger than the samples scatter, such windows are
-fitted by themselves, and the search goes on from their theta and from states along their simulations, if these follow
-the log much better. Nothing is asked where each joint's start is measured.
+right: of eighty logs of an arm, by its tip or its upper joint alone, 23 were more than five sds off. A window eight
+times as long has an eighth of the starts. So where the noise that is left is far larger than the samples scatter, such
+windows are fitted by themselves, and the search goes on from their theta and from states along their simulations, if
+these follow the log much better. Nothing is asked where each joint's start is measured.
 """
 
 from __future__ import annotations
