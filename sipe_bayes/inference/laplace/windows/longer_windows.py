@@ -47,7 +47,8 @@ class Trail:
 def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState | None:
     """A finished search on from where longer windows lead; None where it is not lost, or they are no better."""
     tuning, settings = problem.options.tuning.longer, windows.settings
-    if state.longer or not windows.num_start or windows.starts_measured or settings.window is None:
+    asked = bool(state.optima) and not state.longer and settings.window is not None
+    if not asked or not windows.num_start or windows.starts_measured:
         return None
     best = max(state.optima, key=lambda one: one.evidence)
     if not (best.sd > tuning.lost * level(windows).sd).any():
