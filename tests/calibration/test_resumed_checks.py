@@ -26,7 +26,7 @@ from sipe_bayes.structure import probes
 from tests.problems.swings import command, environment, strict_json, swing, text, write_case
 
 
-def said(calibration: Calibration) -> dict[str, object]:
+def reported(calibration: Calibration) -> dict[str, object]:
     """All that a calibration says, but how long it took."""
     drawn = {f"{s.log} {s.channel} {k}": v for s in calibration.signals for k, v in vars(s).items()}
     left = {f"{r.log} {r.channel} left {k}": v for r in calibration.residuals for k, v in vars(r).items()}
@@ -91,14 +91,14 @@ def test_a_run_that_is_stopped_in_every_check(
         begun = list(dict.fromkeys(what.partition(",")[0] for what in progress.heard))
         assert begun == [f"check {k} of {count}" for k in range(max(number - 1, 1), number + 1)]
     resumed = calibrate(problem, checkpoint=checkpoint)
-    assert said(resumed) == said(calibrate(problem))
+    assert reported(resumed) == reported(calibrate(problem))
 
 
 def test_nothing_is_simulated_again(problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = tmp_path / "out" / "checkpoint.safetensors"
     first = calibrate(problem, checkpoint=checkpoint)
     rollouts, predictions = counted(monkeypatch, Simulator, "rollout"), counted(monkeypatch, Windows, "predict")
-    assert said(calibrate(problem, checkpoint=checkpoint)) == said(first)
+    assert reported(calibrate(problem, checkpoint=checkpoint)) == reported(first)
     assert (rollouts(), predictions()) == (0, 0)
 
 
@@ -117,7 +117,7 @@ def test_parts_of_a_check_are_kept(problem: Problem, tmp_path: Path, monkeypatch
         assert (groups(), draws()) == made
     kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
     assert {"starts.safetensors", "logs.safetensors", "lacking.extensions-0.safetensors"} <= kept
-    assert said(calibrate(problem, checkpoint=checkpoint)) == said(whole)
+    assert reported(calibrate(problem, checkpoint=checkpoint)) == reported(whole)
     assert (groups(), draws()) == (0, of_draws - 1)
     kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
     assert kept == {f"{check.name.lower()}.safetensors" for check in Check}
@@ -132,7 +132,7 @@ def test_logs_are_not_fitted_again(apart: Problem, tmp_path: Path, monkeypatch: 
     assert any("log log by itself, 1 of 2, laplace: start 1" in what for what in progress.heard), progress.heard
     resumed = calibrate(apart, checkpoint=checkpoint)
     assert fits() == 1
-    assert said(resumed) == said(calibrate(apart))
+    assert reported(resumed) == reported(calibrate(apart))
 
 
 def test_checks_of_another_fit_are_made_again(problem: Problem, tmp_path: Path) -> None:
@@ -140,10 +140,10 @@ def test_checks_of_another_fit_are_made_again(problem: Problem, tmp_path: Path) 
     folder = tmp_path / "out"
     whole = calibrate(problem)
     calibrate(problem, budget=whole.rollouts - 3, checkpoint=folder / "checkpoint.safetensors")
-    assert said(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == said(whole)
+    assert reported(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == reported(whole)
     for file in (folder / "checks").iterdir():
         file.write_bytes(file.read_bytes()[:-3])
-    assert said(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == said(whole)
+    assert reported(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == reported(whole)
 
 
 @pytest.mark.parametrize("case", ["problem", "apart"])

@@ -116,7 +116,7 @@ def with_checks(progress: Progress, expected: Mapping[Check, int]) -> Progress:
     """The progress of a fit that the checks come after."""
     later = sum(expected.values())
 
-    def told(what: str, done: int, total: int) -> None:
+    def of_fit(what: str, done: int, total: int) -> None:
         progress(f"{what} (then checks, {later} of the rollouts)", done, total + later)
 
-    return told
+    return of_fit

@@ -158,11 +158,10 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         """Theta and states where long windows without process noise end; None where ``budget`` is too small."""
         chain = self.chain
         settings = Segments(noise="white", fit=chain.settings.fit, noise_sd=chain.settings.noise_sd)
-        quiet = replace(self.problem, find=lambda _: None)
-        trail = trailed(quiet, chain.simulator, chain.trajectories, settings, budget)
+        trail, rollouts = trailed(self.problem, chain.simulator, chain.trajectories, settings, budget)
+        chain.rollouts += rollouts
         if trail is None:
             return None
-        chain.rollouts += trail.rollouts
         away = chain.difference(np.concatenate(trail.states), chain.reference)
         return ChainPoint(trail.theta, chain.moved(chain.reference, away))
 

@@ -36,12 +36,10 @@ class Trail:
     Args:
         theta: (N,).
         states: along each log (T+1, S).
-        rollouts: that it took.
     """
 
     theta: FloatArray
     states: Sequence[FloatArray]
-    rollouts: int
 
 
 def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState | None:
@@ -54,10 +52,10 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
     if not (best.sd > tuning.lost * level(windows).sd).any():
         return None
     budget = tuning.share * (windows.budget - windows.rollouts)
-    trail = trailed(replace(problem, find=lambda _: None), windows.simulator, windows.trajectories, settings, budget)
+    trail, rollouts = trailed(problem, windows.simulator, windows.trajectories, settings, budget)
+    windows.rollouts += rollouts
     if trail is None:
         return None
-    windows.rollouts += trail.rollouts
     begins = np.stack([trail.states[k][s] for k, s in zip(windows.log, windows.start, strict=True)])
     starts = tangents(windows.simulator.model, begins, windows.reference)
     residual, valid = windows.residuals(trail.theta[None], starts[None])
@@ -70,15 +68,18 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
 
 def trailed(
     problem: SearchProblem, simulator: Simulator, trajectories: Trajectories, settings: Segments, budget: float
-) -> Trail | None:
-    """Where windows several times as long as those of ``settings`` end; None where ``budget`` is too small."""
+) -> tuple[Trail | None, int]:
+    """Where windows several times as long as those of ``settings`` end; None where ``budget`` is too small.
+
+    And the rollouts that it took.
+    """
     tuning, shortest = problem.options.tuning.longer, (trajectories.length * trajectories.dt).min()
     length = math.inf if settings.window is None else tuning.times * settings.window
     lengthened = replace(settings, window=None if length > shortest else length, windows=(), seconds=None)
     logs = Trajectories.stack([replace(one, states=None) for one in trajectories])
     windows = bind(lengthened, simulator, logs)
     windows.budget = budget
-    search, optima = WindowSearch(problem, windows), tuple[WindowOptimum, ...]()
+    search, optima = WindowSearch(replace(problem, find=lambda _: None), windows), tuple[WindowOptimum, ...]()
     try:
         state = search.start()
         while not state.done:
@@ -86,8 +87,9 @@ def trailed(
             optima = state.optima
     except BudgetExhausted:
         pass  # what was recorded may do
+    spent = math.ceil(windows.rollouts)
     if not optima:
-        return None
+        return None, spent
     best = max(optima, key=lambda one: one.evidence)
     thetas, begin = np.tile(best.theta, (windows.num_windows, 1)), windows.states(best.starts)
     rollout = simulator.rollout(thetas, windows.actions, begin, windows.dt, windows.names, goals=windows.goals)
@@ -96,5 +98,5 @@ def trailed(
     for w, place in zip(*np.nonzero(windows.owned), strict=True):
         states[windows.log[w]][windows.start[w] + place] = rollout.states[w, place]
     if not all(np.isfinite(one[:, 1:]).all() for one in states):
-        return None
-    return Trail(best.theta, states, math.ceil(windows.rollouts) + 1)
+        return None, spent + 1
+    return Trail(best.theta, states), spent + 1
