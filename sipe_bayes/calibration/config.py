@@ -67,6 +67,9 @@ class Config(Table):
     budget: Budget | None = None
     """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
     afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
+    geometry_tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = 0.05
+    """sd of where centres of mass lie, as a share of their distance from the joint that turns them; wider intervals
+    allow for it where no log tells"""
     search: Search = Search()
     resample: Resample = Resample()
     columns: Columns = Columns()

@@ -23,6 +23,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.foreign.load import ModelError
@@ -75,9 +76,10 @@ class Problem:
         return Findings(self.findings).warnings
 
     @property
-    def tolerances(self) -> dict[str, float]:
-        """The sd of what each actuator delivers, as a share of what its command says."""
-        return {command.actuator: command.tolerance for command in self.config.commands}
+    def tolerances(self) -> Tolerances:
+        """How well forces and geometry are known."""
+        commands = {command.actuator: command.tolerance for command in self.config.commands}
+        return Tolerances(commands, self.config.geometry_tolerance)
 
     @property
     def segments(self) -> Segments:

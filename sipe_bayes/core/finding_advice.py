@@ -155,9 +155,10 @@ ADVICE: dict[Code, str] = {
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
-    Code.COMMAND_SCALE: (
-        "Motion tells masses, inertias and friction only in the scale of the forces. Weigh one part and fix its mass "
-        "with `actuator:NAME.gain` (a servo's `kp`) free, or say by `tolerance` of the command how well it is known."
+    Code.UNTOLD: (
+        "Motion tells masses, inertias and friction only in the scale of the forces, and with where they lie. Weigh "
+        "one part and fix its mass with `actuator:NAME.gain` (a servo's `kp`) free; say by `tolerance` of the command "
+        "how well forces are known, by `geometry_tolerance` how well the drawing is."
     ),
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",

@@ -55,7 +55,6 @@ class Extension(ABC):
     native: ClassVar[bool] = True  # MJCF has an element for it
     nearest: ClassVar[str] = ""  # the element of MJCF that comes nearest, where it has none of its own
     last_resort: ClassVar[bool] = False  # tried only where nothing else helps
-    tolerance: ClassVar[bool] = False  # of a number that no machine has exactly, whatever its logs tell
 
     @abstractmethod
     def sentence(self, site: str) -> str:
@@ -64,6 +63,14 @@ class Extension(ABC):
     @abstractmethod
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Its unknowns, their bounds in SI from the sizes of the machine's motion; none where it does not apply."""
+
+    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+        """Of each parameter, in its unit, what a tolerance is a share of; none of numbers that logs alone tell."""
+        return ()
+
+    def off(self, site: str, share: float) -> str:
+        """What it is where a number with a tolerance is off by this share, in a report."""
+        return f"{self.sentence(site)} ({100 * share:.3g} %)"
 
     def edit(self, machine: Machine, site: str) -> Edit | None:
         """What is changed in the MJCF, where parameters of it are not enough."""
@@ -95,6 +102,7 @@ class Placed:
         parameters: its unknowns, with the model's own values as defaults.
         edit: what it changes in the MJCF.
         probes: theta (G, K, P) at which it is tried, for each of G shapes.
+        wholes: of each parameter, in its unit, what a tolerance is a share of; none of numbers that logs alone tell.
     """
 
     extension: Extension
@@ -102,6 +110,7 @@ class Placed:
     parameters: tuple[Parameter, ...]
     edit: Edit | None
     probes: FloatArray
+    wholes: tuple[float, ...] = ()
 
     @property
     def label(self) -> str:
@@ -159,9 +168,10 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
         own = tuple(space)[count:]
         try:
             probes = _shapes(np.asarray(extension.probes(machine, own), float))
+            wholes = extension.wholes(machine, site)
         except Exception as error:
             raise _failed(extension, site, error) from error
-        yield Placed(extension, site, own, draft.edit, probes)
+        yield Placed(extension, site, own, draft.edit, probes, wholes)
 
 
 def _with_own(machine: Machine, parameter: Parameter) -> Parameter:

@@ -44,6 +44,7 @@ class BodySizes:
         mass: kg.
         centre: x, y and z of the centre of mass in the body's frame, in m.
         gyration: radius of gyration about it, in m.
+        reach: radius of gyration about the nearest joint that turns it, in m; ``gyration`` where none does.
         turned: the axes of the body's frame along which it matters where the centre lies: all but those that every
             joint turns it about.
     """
@@ -51,6 +52,7 @@ class BodySizes:
     mass: float
     centre: tuple[float, float, float]
     gyration: float
+    reach: float
     turned: tuple[bool, bool, bool]
 
 
@@ -97,7 +99,8 @@ class Machine:
             if name and mass > 0 and model.body_weldid[index]:
                 x, y, z = (float(place) for place in model.body_ipos[index])
                 gyration = float(np.sqrt(model.body_inertia[index].max() / mass))
-                sizes[name] = BodySizes(mass, (x, y, z), gyration, _turned(model, data, index))
+                reach = float(np.hypot(gyration, _lever(model, data, index)))
+                sizes[name] = BodySizes(mass, (x, y, z), gyration, reach, _turned(model, data, index))
         return sizes
 
     def is_hinge(self, joint: str) -> bool:
@@ -167,6 +170,21 @@ def _turned(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[bool
         body = int(model.body_parentid[body])
     x, y, z = turned.tolist()
     return x, y, z
+
+
+def _lever(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
+    """How far a body's centre of mass lies from the nearest joint that turns it; 0 where none does."""
+    centre = data.xipos[body]
+    while body:
+        first = int(model.body_jntadr[body])
+        for joint in reversed(range(first, first + int(model.body_jntnum[body]))):
+            kind, apart = int(model.jnt_type[joint]), centre - data.xanchor[joint]
+            if kind == mujoco.mjtJoint.mjJNT_HINGE:
+                return float(np.linalg.norm(np.cross(data.xaxis[joint], apart)))
+            if kind == mujoco.mjtJoint.mjJNT_BALL:
+                return float(np.linalg.norm(apart))
+        body = int(model.body_parentid[body])
+    return 0.0
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.extension import Extension, Placed, extended, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -51,13 +51,16 @@ class Probe:
         remedy: what to do about it.
         by_log: whether it is of one log alone.
         site: where it is.
-        whole: its size where the number that it changes is as large again; nan where that has no tolerance.
+        extension: that it is of.
+        whole: its size where the number that it changes is off by all that a tolerance is a share of; nan where logs
+            alone tell that number.
     """
 
     name: str
     remedy: str
     by_log: bool = False
     site: str = ""
+    extension: Extension | None = None
     whole: float = math.nan
 
 
@@ -126,13 +129,13 @@ def _named(effect: Effect) -> list[Probe]:
     targets = [target for parameter in placed.parameters for target in parameter.targets]
     what = "a parameter" if len(targets) == 1 else "parameters"
     by_log = any(parameter.log is not None for parameter in placed.parameters)
-    probe = Probe(placed.sentence, f"make {' and '.join(targets)} {what} (or widen its bounds)", by_log, placed.site)
-    if not placed.extension.tolerance:
+    remedy = f"make {' and '.join(targets)} {what} (or widen its bounds)"
+    probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension)
+    if not placed.wholes:
         return [probe] * len(effect.probes)
-    (parameter,), steps = placed.parameters, (effect.probes - placed.plain)[:, 0]
-    own = parameter.default or math.nan
-    wholes = _size(effect.change) * own / (steps * (parameter.high - parameter.low))
-    return [replace(probe, whole=whole) for whole in wholes.tolist()]
+    ranges = np.array([parameter.high - parameter.low for parameter in placed.parameters])
+    shares = ((effect.probes - placed.plain) * ranges / np.array(placed.wholes)).sum(-1)
+    return [replace(probe, whole=whole) for whole in (_size(effect.change) / shares).tolist()]
 
 
 def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:

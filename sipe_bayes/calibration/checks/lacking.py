@@ -19,7 +19,7 @@ from sipe_bayes.diagnostics.evaluate import fitted_residuals
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import open_gains, tolerance_findings
+from sipe_bayes.diagnostics.misfit.tolerances import tolerance_findings, untold
 from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.random_effects import LogEstimate
@@ -47,7 +47,7 @@ class Lacking:
         misfit: what they look like; None where that was not asked, or cannot be told.
         missing: theta with what the model lacks, or may lack.
         residuals: of each log and channel; none with a ``StateSpace``, whose process noise takes what the model lacks.
-        findings: of what they cannot tell, and of gains that no motion tells.
+        findings: of what they cannot tell, and of numbers that no motion tells.
     """
 
     misfit: Misfit | None
@@ -126,7 +126,7 @@ def _probed(
         if probed.windows.num_windows < windows.num_windows:
             asked = probed.windows.num_windows
             unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=windows.num_windows))
-        unknown.extend(tolerance_findings(probed, open_gains(probed, problem.tolerances)))
+        unknown.extend(tolerance_findings(probed, untold(probed, problem.tolerances)))
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         return None

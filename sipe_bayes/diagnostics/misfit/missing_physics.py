@@ -15,8 +15,8 @@ and widens what each log asks for.
 Where the corrected residuals pass for noise, the logs are corrected. Else physics are missing that the library does not
 hold, or that are not small: what the logs ask for and what they do when corrected are then mixed in equal parts. The
 few columns that were taken may stand in for others. So half of the interval is that of the posterior with a
-discrepancy that the library spans (``misfit.library_discrepancy``). It is widened by the gains that no motion
-tells (``misfit.tolerances``).
+discrepancy that the library spans (``misfit.library_discrepancy``). It is widened by the gains and the
+centres of mass that no motion tells (``misfit.tolerances``).
 
 Where nothing is seen to be missing, no further log is asked for: the posterior is widened by that discrepancy alone.
 
@@ -30,7 +30,7 @@ Deviations:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +41,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import open_gains, widened
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
@@ -84,7 +84,7 @@ def missing_physics(
     prior: Posterior,
     doubted: bool,
     seed: int = 0,
-    tolerances: Mapping[str, float] | None = None,
+    tolerances: Tolerances = EXACT,
     options: MissingPhysicsOptions = _OPTIONS,
 ) -> MissingPhysics | None:
     """The interval for a model that lacks something, or may; no simulation beside what ``logs`` took.
@@ -95,7 +95,7 @@ def missing_physics(
         prior: of theta.
         doubted: whether the residuals or the logs' disagreement show that something is missing.
         seed: of the draws.
-        tolerances: sd of what each actuator delivers, as a share of what its command says; default exact ones.
+        tolerances: of numbers that no machine has exactly.
         options: of the search for causes.
 
     Returns:
@@ -106,8 +106,7 @@ def missing_physics(
         return None if hidden is None else MissingPhysics(hidden.widened(posterior, seed), hidden.causes, True)
     if len(parts) < 2:
         return None
-    opened = open_gains(logs, tolerances or {})
-    gains = tuple(f"a gain of {one.actuator} that is {100 * one.sd:.3g} % off" for one in opened)
+    numbers = untold(logs, tolerances)
     causes = _Causes.of(logs, options)
     further = random_effects(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed).new_log
     explained = False
@@ -116,10 +115,10 @@ def missing_physics(
         corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
         corrected = causes.widened(corrected, np.random.default_rng(seed))
         further = corrected if explained else _mixed(further, corrected)
-    named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
+    causes_named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
     if hidden is not None:
-        further, named = _mixed(further, hidden.widened(posterior, seed)), named or hidden.causes
-    return MissingPhysics(widened(further, opened, seed), named + gains, explained)
+        further, causes_named = _mixed(further, hidden.widened(posterior, seed)), causes_named or hidden.causes
+    return MissingPhysics(widened(further, numbers, seed), causes_named + named(logs, numbers), explained)
 
 
 def spread_alone(alone: Sequence[LogEstimate], prior: Posterior, doubted: bool, seed: int = 0) -> MissingPhysics | None:

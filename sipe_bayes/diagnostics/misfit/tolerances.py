@@ -1,15 +1,16 @@
-"""What forces that are not quite as large as the commands say do to the values: the scale that no motion tells.
+"""What numbers do to the values that no machine has exactly, and that no motion tells: forces, and centres of mass.
 
 A machine whose motors give a tenth more than the log says, with masses, inertias and friction a tenth larger, moves
-alike. Where theta can imitate another gain but for a small part of what it does, the logs are not asked which it is: at
-that level the linearisation of dry friction is no better. Theta's answer to a gain of one tolerance is then what values
-are unknown by beside all that the logs tell.
+alike; and so does one with a lighter link whose centre of mass lies further out. Where theta can imitate another such
+number but for a small part of what it does, the logs are not asked which it is: at that level the linearisation of dry
+friction is no better. Theta's answer to a number that is off by its tolerance is then what values are unknown by beside
+all that the logs tell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,61 +18,98 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.posterior import Particles
+from sipe_bayes.structure.probes import Probe
 
 IMITATED = 0.05  # of a column's information, that theta leaves
+_NAMED = 3  # numbers
 
 
 @dataclass(frozen=True)
-class Tolerance:
-    """The gain of an actuator that the logs do not tell.
+class Tolerances:
+    """Sds of numbers that no machine has exactly; by default all are exact.
 
     Args:
-        actuator: which.
-        sd: of what it delivers, as a share of what its command says.
-        shift: (N,) of theta where it delivers an sd more.
+        commands: of what each actuator delivers, as a share of what its command says.
+        geometry: of where a body's centre of mass lies, as a share of its ``reach`` (``structure.machine``).
     """
 
-    actuator: str
+    commands: Mapping[str, float] = field(default_factory=dict)
+    geometry: float = 0.0
+
+    def of(self, probe: Probe) -> float:
+        """The sd of the number that a probe changes."""
+        body = probe.extension is not None and probe.extension.kind == "body"
+        return self.geometry if body else self.commands.get(probe.site, 0.0)
+
+
+EXACT = Tolerances()
+
+
+@dataclass(frozen=True)
+class Untold:
+    """A number that the logs do not tell.
+
+    Args:
+        probe: that changes it.
+        sd: of it, as a share.
+        shift: (N,) of theta where it is an sd larger.
+    """
+
+    probe: Probe
     sd: float
     shift: FloatArray
 
+    @property
+    def sentence(self) -> str:
+        """What the model then lacks, in words."""
+        assert self.probe.extension is not None
+        return self.probe.extension.off(self.probe.site, self.sd)
 
-def open_gains(logs: ProbedLogs, tolerances: Mapping[str, float]) -> list[Tolerance]:
-    """The gains that theta can imitate.
+
+def untold(logs: ProbedLogs, tolerances: Tolerances) -> list[Untold]:
+    """The numbers with a tolerance that theta can imitate, of those that move it.
 
     Args:
         logs: linearised at the estimate.
-        tolerances: sd of what each actuator delivers, as a share of what its command says.
+        tolerances: of these numbers.
     """
     seen, n = logs.seen, logs.windows.num_theta
     whole = np.diag(logs.arrow.precision)[n:]
-    opened = []
+    numbers = []
     for k, probe in enumerate(logs.probes):
-        size = probe.whole * tolerances.get(probe.site, 0.0)
+        sd = tolerances.of(probe)
         determined = seen.information[k] < np.inf and seen.information[k] > IMITATED * whole[k]
-        if size and np.isfinite(size) and not determined:
-            opened.append(Tolerance(probe.site, tolerances[probe.site], -seen.answer[:, k] * size))
-    return opened
+        if sd and np.isfinite(probe.whole) and not determined:
+            numbers.append(Untold(probe, sd, -seen.answer[:, k] * probe.whole * sd))
+    return numbers
 
 
-def tolerance_findings(logs: ProbedLogs, opened: list[Tolerance]) -> list[Finding]:
-    """Of each gain by which a value moves more than an sd of what the logs tell."""
+def named(logs: ProbedLogs, numbers: Sequence[Untold]) -> tuple[str, ...]:
+    """Of these numbers, in words, those that move a value by more than the sd that the logs tell, the largest first."""
+    sd = np.sqrt(logs.seen.variance)
+    size: dict[str, float] = {}
+    for one in numbers:
+        size[one.sentence] = max(size.get(one.sentence, 0.0), float(np.abs(one.shift / sd).max()))
+    return tuple(sorted((name for name in size if size[name] > 1), key=lambda name: -size[name])[:_NAMED])
+
+
+def tolerance_findings(logs: ProbedLogs, numbers: Sequence[Untold]) -> list[Finding]:
+    """Of the values that one of these numbers moves by more than an sd of what the logs tell."""
     sd, space = np.sqrt(logs.seen.variance), logs.windows.simulator.space
-    findings = []
-    for one in opened:
-        moved = [j for j in range(len(space)) if abs(one.shift[j]) > sd[j]]
-        if moved:
-            change = np.diff(space.values(np.clip([logs.theta, logs.theta + one.shift], 0, 1)), axis=0)[0]
-            by = [f"{space[j].name} by {change[j]:+.2g} {space[j].unit}" for j in moved]
-            names, percent, words = [space[j].name for j in moved], 100 * one.sd, ", ".join(by)
-            code = Code.COMMAND_SCALE
-            findings.append(finding(code, parameters=names, actuator=one.actuator, percent=percent, moved=words))
-    return findings
+    shifts = np.array([one.shift for one in numbers]).reshape(len(numbers), len(space))
+    off, causes = np.sqrt((shifts**2).sum(0)), named(logs, numbers)
+    if not causes:
+        return []
+    moved = np.flatnonzero(np.abs(shifts).max(0) > sd).tolist()
+    low, high = space.values(np.clip([logs.theta - off, logs.theta + off], 0, 1))
+    by = [f"{space[j].name} by {(high[j] - low[j]) / 2:.2g} {space[j].unit}" for j in moved]
+    names = [space[j].name for j in moved]
+    return [finding(Code.UNTOLD, parameters=names, causes=" or ".join(causes), moved=", ".join(by))]
 
 
-def widened(further: Particles, opened: list[Tolerance], seed: int) -> Particles:
-    """Draws of theta with gains drawn within their tolerances."""
+def widened(further: Particles, numbers: Sequence[Untold], seed: int) -> Particles:
+    """Draws of theta with these numbers drawn within their tolerances."""
     theta = further.theta.numpy()
-    sizes = np.random.default_rng([seed, 1]).standard_normal((len(theta), len(opened)))
-    shifts = np.array([one.shift for one in opened]).reshape(len(opened), theta.shape[1])
+    sizes = np.random.default_rng([seed, 1]).standard_normal((len(theta), len(numbers)))
+    shifts = np.array([one.shift for one in numbers]).reshape(len(numbers), theta.shape[1])
     return Particles(np.clip(theta + sizes @ shifts, 0, 1), further.space, weights=further.weights.numpy())

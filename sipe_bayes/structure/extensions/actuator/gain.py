@@ -14,11 +14,18 @@ class Gain(Extension):
 
     name, kind = "gain", "actuator"
     reference = "-"
-    tolerance = True
 
     def sentence(self, site: str) -> str:
         """What it is."""
         return f"a gain of {site} that is not the model's"
+
+    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+        """All of it."""
+        return (float(machine.model.actuator(site).gainprm[0]),)
+
+    def off(self, site: str, share: float) -> str:
+        """See ``Extension``."""
+        return f"a gain of {site} that is {100 * share:.3g} % off"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """The gain, with a normal prior of a tenth around the model's.

@@ -19,6 +19,15 @@ class CentreOfMass(Extension):
         """What it is."""
         return f"a centre of mass of {site} that is not the model's"
 
+    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+        """How far its mass lies from what turns it."""
+        body = machine.bodies[site]
+        return (body.reach,) * sum(body.turned)
+
+    def off(self, site: str, share: float) -> str:
+        """See ``Extension``."""
+        return f"a centre of mass of {site} that lies {100 * share:.3g} % of its reach elsewhere"
+
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Its place in the body's frame where it matters, with a normal prior around the model's."""
         body = machine.bodies[site]
