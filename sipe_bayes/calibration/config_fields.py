@@ -141,11 +141,11 @@ class MeasurementTarget:
 
     kind: Literal["joint", "body", "sensor"]
     name: str
-    quantity: Literal["position", "velocity", "orientation", "linear_velocity", "angular_velocity", "reading"]
+    quantity: Literal["position", "velocity", "orientation", "linear_velocity", "angular_velocity", "force", "reading"]
     index: int | None = None
 
 
-_JOINT = re.compile(r"joint:(?P<name>.+)\.(?P<quantity>position|velocity)")
+_JOINT = re.compile(r"joint:(?P<name>.+)\.(?P<quantity>position|velocity|force)")
 _BODY = re.compile(
     r"body:(?P<name>[^\[\]]+)\.(?P<quantity>position|orientation|linear_velocity|angular_velocity)"
     r"(\[(?P<index>[0-2])\])?"
@@ -171,7 +171,8 @@ def parse_measurement_target(target: str) -> MeasurementTarget:
             )
     raise ValueError(
         f"expected a measurement target, got {target!r}; write 'joint:NAME.position', 'joint:NAME.velocity', "
-        "'body:NAME.position', 'body:NAME.orientation', 'body:NAME.linear_velocity', 'body:NAME.angular_velocity', "
+        "'joint:NAME.force', 'body:NAME.position', 'body:NAME.orientation', 'body:NAME.linear_velocity', "
+        "'body:NAME.angular_velocity', "
         "'sensor:NAME' or 'sensor:NAME[0]'"
     )
 

@@ -132,9 +132,9 @@ class Measurement(Table):
     quaternion: Literal["wxyz", "xyzw"] | None = None
     """`"wxyz"` or `"xyzw"`: their order; signs are aligned, residuals are rotation vectors (rad)"""
     target: TargetWord
-    """`"joint:NAME.position"`, `"joint:NAME.velocity"`, `"body:NAME.position"`, `.orientation`,
-    `.linear_velocity`, `.angular_velocity` (of a body's frame in the world's axes), `"sensor:NAME"` or
-    `"sensor:NAME[0]"`"""
+    """`"joint:NAME.position"`, `"joint:NAME.velocity"`, `"joint:NAME.force"` (what actuators apply there, such as the
+    effort of a servo), `"body:NAME.position"`, `.orientation`, `.linear_velocity`, `.angular_velocity` (of a body's
+    frame in the world's axes), `"sensor:NAME"` or `"sensor:NAME[0]"`"""
     unit: UnitWord
     """unit of that column; its kind is checked against the model"""
     sign: Sign = 1

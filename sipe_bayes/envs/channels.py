@@ -21,7 +21,7 @@ _QUANTITIES = {  # of a body, in the world's axes: the sensor that reads it, and
     "angular_velocity": (mujoco.mjtSensor.mjSENS_FRAMEANGVEL, "rad/s"),
 }
 _CHANNEL = re.compile(
-    r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity)"
+    r"^(?:joint:(?P<joint>.+)\.(?P<what>position|velocity|force)"
     rf"|(?P<body>body:[^\[\]]+\.(?P<quantity>{'|'.join(_QUANTITIES)}))(?:\[(?P<axis>[0-2])\])?"
     r"|sensor:(?P<turned>[^\[\]]+)\.rotation\[(?P<turn>[0-2])\]"
     r"|sensor:(?P<sensor>[^\[\]]+)(?:\[(?P<item>\d+)\])?)$"
@@ -55,10 +55,11 @@ class Channel:
     """One measured quantity.
 
     Args:
-        target: ``joint:NAME.position``, ``joint:NAME.velocity``, ``sensor:NAME[i]``, or of a body's frame in the
-            world's axes ``body:NAME.position``, ``.orientation``, ``.linear_velocity``, ``.angular_velocity``, three
-            channels ``[i]`` each. An orientation, ``body:NAME.orientation[i]`` or ``sensor:NAME.rotation[i]`` of a
-            sensor that gives a quaternion, is a rotation vector (rad).
+        target: ``joint:NAME.position``, ``joint:NAME.velocity``, ``joint:NAME.force`` (what actuators apply, N m or
+            N), ``sensor:NAME[i]``, or of a body's frame in the world's axes ``body:NAME.position``, ``.orientation``,
+            ``.linear_velocity``, ``.angular_velocity``, three channels ``[i]`` each. An orientation,
+            ``body:NAME.orientation[i]`` or ``sensor:NAME.rotation[i]`` of a sensor that gives a quaternion, is a
+            rotation vector (rad).
         name: what it is called; default the target.
         unit: filled in from the model.
     """
@@ -122,10 +123,13 @@ def expanded(model: mujoco.MjModel, channel: Channel) -> list[Channel]:
     return [channel]
 
 
-def add_body_sensors(spec: mujoco.MjSpec, channels: Sequence[Channel]) -> None:
-    """Give a spec the sensors that read what is measured of bodies, called as the targets are."""
+def add_sensors(spec: mujoco.MjSpec, channels: Sequence[Channel]) -> None:
+    """Give a spec the sensors that read what is measured of bodies, and forces at joints, called as the targets are."""
     for channel in channels:
         match = _CHANNEL.match(channel.target)
+        if match and match["what"] == "force" and spec.joint(match["joint"]) and not spec.sensor(channel.target):
+            kind, joint = mujoco.mjtSensor.mjSENS_JOINTACTFRC, match["joint"]
+            spec.add_sensor(name=channel.target, type=kind, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint)
         if not match or not match["body"] or spec.sensor(match["body"]) is not None:
             continue
         body = _body_name(match["body"])
@@ -145,7 +149,7 @@ def reader_of(model: mujoco.MjModel, channel: Channel) -> Reader:
     if not match:
         raise TargetError(
             f"{where}: target {channel.target!r} is not one of joint:NAME.position, joint:NAME.velocity, "
-            f"sensor:NAME[i], {', '.join(f'body:NAME.{q}' for q in _QUANTITIES)}"
+            f"joint:NAME.force, sensor:NAME[i], {', '.join(f'body:NAME.{q}' for q in _QUANTITIES)}"
         )
     if match["body"]:
         return _of_body(model, match, where)
@@ -161,6 +165,9 @@ def reader_of(model: mujoco.MjModel, channel: Channel) -> Reader:
             )
         if match["what"] == "position":
             return Reader(1 + int(model.jnt_qposadr[joint]), False, "rad" if hinge else "m")
+        if match["what"] == "force":
+            sensor = named(model, "sensor", channel.target, where)
+            return Reader(int(model.sensor_adr[sensor]), True, _sensor_unit(model, sensor))
         return Reader(1 + model.nq + int(model.jnt_dofadr[joint]), False, "rad/s" if hinge else "m/s")
     sensor = named(model, "sensor", match["sensor"], where)
     size, item = int(model.sensor_dim[sensor]), int(match["item"] or 0)

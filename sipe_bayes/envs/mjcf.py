@@ -23,7 +23,7 @@ from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import (
     Channel,
     Reader,
-    add_body_sensors,
+    add_sensors,
     check_sensors,
     expanded,
     read_channels,
@@ -363,7 +363,7 @@ def _prepared(
     spec = load_spec(source)
     for edit in edits:
         edit(spec)
-    add_body_sensors(spec, channels)
+    add_sensors(spec, channels)
     timestep = spec.option.timestep
     for parameter in parameters:
         for target in physical_targets(parameter.targets):

@@ -343,3 +343,21 @@ def test_commands_need_actuators_with_one_control() -> None:
     model = environment.compile()
     assert environment._controls == [0, 1]
     assert isinstance(model, mujoco.MjModel)
+
+
+def test_the_force_at_a_joint_is_what_its_actuators_apply() -> None:
+    """Of a servo on a hinge of gear 2 and a motor on a slide: kp (u - 2 q) times 2 in N m, and the command in N."""
+    xml = """<mujoco><worldbody><body name="b"><joint name="turn" axis="0 1 0"/><geom size=".1" mass="1"/></body>
+    <body name="c"><joint name="push" type="slide" axis="1 0 0"/><geom size=".1" mass="2"/></body></worldbody>
+    <actuator><position name="servo" joint="turn" kp="5" gear="2"/><motor name="motor" joint="push"/></actuator>
+    </mujoco>"""
+    measured = ("joint:turn.force", "joint:turn.position", "joint:push.force")
+    unknown = p("kp", 5, 20, "actuator:servo.kp")
+    environment = MjcfEnvironment.build(xml, [unknown], ["servo", "motor"], measured)
+    assert [c.unit for c in environment.measurements] == ["N m", "rad", "N"]
+    simulator, actions = Simulator(environment, 1), np.array([[0.3, 1.5], [0.3, 1.5], [-0.4, 2.0]])
+    run = simulator.rollout(np.array([1.0]), actions, simulator.default_state(), dt=0.02).observations[0]
+    np.testing.assert_allclose(run[:3, 0], 2 * 20 * (actions[:, 0] - 2 * run[:3, 1]), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run[:3, 2], actions[:, 1])
+    with pytest.raises(TargetError, match="joint 'nothing'"):
+        MjcfEnvironment.build(xml, [unknown], ["servo", "motor"], ["joint:nothing.force"])
