@@ -44,6 +44,7 @@ from sipe_bayes.calibration.readers.many import episodes_of
 from sipe_bayes.core.files import read_text, reading
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST
+from sipe_bayes.diagnostics.misfit.tolerances import GEOMETRY
 
 
 class Config(Table):
@@ -67,7 +68,7 @@ class Config(Table):
     budget: Budget | None = None
     """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
     afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
-    geometry_tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = 0.05
+    geometry_tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = GEOMETRY
     """sd of where centres of mass lie, as a share of their distance from the joint that turns them; wider intervals
     allow for it where no log tells"""
     search: Search = Search()

@@ -31,6 +31,7 @@ from sipe_bayes.calibration.config_fields import (
 )
 from sipe_bayes.calibration.readers.many import matching, names_of
 from sipe_bayes.core.units import find_unit
+from sipe_bayes.diagnostics.misfit.tolerances import COMMANDS
 
 
 class TimeColumn(Table):
@@ -86,7 +87,7 @@ class Command(Table):
     """1 or -1"""
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
-    tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = 0.1
+    tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = COMMANDS
     """sd of what a motor or position servo delivers, as a share of what the column says: a motor constant is known to
     about a tenth, and masses are off by as much. The intervals with what the model lacks allow for it. 0: exact"""
     rate: Positive | None = None

@@ -22,6 +22,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.tolerances import usual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.arguments import without_likelihood
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -78,7 +79,8 @@ class Calibrate:
             if doubted and given.starts == "recorded":
                 fit = self._fit(problem, Segments(), replace(logs, states=None), task.budget - rollouts)
                 rollouts, probed = rollouts + fit.method.rollouts, fit.probed()
-            missing = missing_physics(probed, fit.posterior, problem.prior, doubted, self.seed)
+            known = usual(problem.simulator.environment.actuators)
+            missing = missing_physics(probed, fit.posterior, problem.prior, doubted, self.seed, known)
             posterior = posterior if missing is None else missing.further
         drawn = posterior.values(DRAWS, draws_of(self.seed, problem, case))
         return Estimate(drawn, rollouts, problem.space.values(best))

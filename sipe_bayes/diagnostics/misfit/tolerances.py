@@ -43,6 +43,12 @@ class Tolerances:
 
 
 EXACT = Tolerances()
+COMMANDS, GEOMETRY = 0.1, 0.05  # the usual sds: what motor constants and drawings are known to
+
+
+def usual(actuators: Sequence[str]) -> Tolerances:
+    """Those of machines of which nobody has said more."""
+    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY)
 
 
 @dataclass(frozen=True)
