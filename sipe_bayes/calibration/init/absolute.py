@@ -1,18 +1,186 @@
-"""Angles against the world in place of a joint's own: what cameras and inertial units tell of a chain of links."""
+"""Columns that measure from elsewhere than the model: joints from another zero, links against the world."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.decisions import Case, Layout, ranked
-from sipe_bayes.calibration.init.draft import Draft, questions
-from sipe_bayes.calibration.init.machine import Machine
-from sipe_bayes.calibration.init.trials import Trial
+from sipe_bayes.calibration.init.decisions import Case, Layout, fitted_miss, ranked, scale_of
+from sipe_bayes.calibration.init.draft import Draft, Reading, answered, questions, turned
+from sipe_bayes.calibration.init.machine import Drive, Joint, Machine
+from sipe_bayes.calibration.init.trials import Trial, followed
+from sipe_bayes.core.arrays import FloatArray
 
 _FAR_BETTER = np.log(2.0)  # of the logarithm of misses of all channels together
+_BELIEVED = np.log(0.3)  # of the same of one channel, up to which no zero is looked for
+_ANSWERS = 3  # units and signs with which zeros are tried, those that miss least
+_GRID, _FINER = 61, 9  # zeros that are tried over the range of a joint, and twice around the best
+_UNSURE = 2.0  # steps of the grid, by which a zero may be off that simulations alone tell
+_NONE = 1e-6  # rad or m
+
+Readings = Sequence[Reading]
+
+
+@dataclass(frozen=True)
+class _Zero:
+    """What columns read in SI where a joint is at 0: their places, why that may be, and by how much it may be off."""
+
+    places: tuple[int, ...]
+    value: float
+    why: str
+    unsure: float = 0.0
+
+    def put(self, readings: Readings) -> list[Reading]:
+        """The readings with it, each in its column's unit."""
+        out = list(readings)
+        for k in self.places:
+            out[k] = replace(out[k], zero=float(f"{self.value / scale_of(out[k]):.6g}"), unsure=self.unsure)
+        return out
+
+
+def with_zeros(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Trial, layout: Layout) -> Draft:
+    """The draft with those zeros of joints' columns with which simulations follow the logs far better.
+
+    First what the model names (a body's place in the world, ``ref``, keyframes, quarters of a turn) is tried, then a
+    grid over the joint's range. The unknowns are fitted with and without it: a model that is off speaks for wrong ones.
+
+    Args:
+        draft: of the trial.
+        model: as given.
+        machine: what of it logs hold.
+        trial: windows of the logs.
+        layout: where the draft's readings are in it.
+    """
+    case = Case(draft, machine, trial, layout, trial.theta)
+    joints = {k: j for k, r in enumerate(draft.readings) for j in machine.joints if _measures(r, j)}
+    near, taken = _nearest(case), list[tuple[_Zero, float]]()
+    channels = len(trial.given.observed)
+    miss = fitted_miss(trial, case.assumption(near[0]), rounds=3)[0]
+    while joints and miss > channels * _BELIEVED:
+        best = _first_better(case, model, joints, near, miss)
+        if best is None:
+            break
+        zero, near, better = best
+        taken.append((zero, float(np.exp((miss - better) / channels))))
+        miss = better
+        del joints[zero.places[0]]
+    readings = list(draft.readings)
+    for zero, times in taken:
+        readings = _with_evidence(zero, times, readings, near[0])
+    measured = len(draft.measurements)
+    return replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
+
+
+def _measures(reading: Reading, joint: Joint) -> bool:
+    return reading.match.target == f"joint:{joint.name}.position" and len(reading.match.columns) == 1
+
+
+def _nearest(case: Case) -> list[Readings]:
+    """The readings with the units and signs that miss least, these first; with those of the names too."""
+    asked = questions(case.draft, case.machine)
+    if not asked:
+        return [case.draft.readings]
+    ranking = ranked(case, asked)
+    order = np.argsort(ranking.scores, kind="stable")[:_ANSWERS]
+    return [*(answered(case.draft.readings, asked, ranking.answers[i]) for i in order), case.draft.readings]
+
+
+def _missed(case: Case, sets: Sequence[Readings]) -> FloatArray:
+    """The logarithm of what all channels together miss with each set of readings (H,)."""
+    return np.concatenate([followed(case.misses(sets[i : i + 64])) for i in range(0, len(sets), 64)])
+
+
+def _first_better(
+    case: Case, model: mujoco.MjModel, joints: dict[int, Joint], near: Sequence[Readings], miss: float
+) -> tuple[_Zero, list[Readings], float] | None:
+    """The best zero of those named, else of the grids, that is far better; the readings with it, and what they miss."""
+    for zeros_of in (_named, _searched):
+        tried: list[tuple[float, _Zero, Readings]] = []
+        for k, joint in joints.items():
+            zeros, sets = zeros_of(case, model, k, joint, near)
+            if zeros:
+                misses = _missed(case, sets)
+                best = int(np.argmin(misses))
+                tried.append((float(misses[best]), zeros[best], sets[best]))
+        for _, zero, readings in sorted(tried, key=lambda one: one[0])[:2]:
+            better = fitted_miss(case.trial, case.assumption(readings), rounds=3)[0]
+            if miss - better > _FAR_BETTER:
+                return zero, [readings], better
+    return None
+
+
+Tried = tuple[list[_Zero], list[Readings]]
+
+
+def _named(case: Case, model: mujoco.MjModel, k: int, joint: Joint, near: Sequence[Readings]) -> Tried:
+    """What the model says of where a column may have its zero, with both signs of it."""
+    data, own = mujoco.MjData(model), model.joint(joint.name)
+    mujoco.mj_kinematics(model, data)
+    at, rest = int(own.qposadr[0]), float(model.qpos0[own.qposadr[0]])
+    named = {-float(model.key_qpos[i, at]): f"the keyframe {model.key(i).name!r} is at 0" for i in range(model.nkey)}
+    named |= {-rest: "the model's ref is at 0"}
+    if joint.hinge:
+        named |= {q * np.pi / 2: f"{q} quarters of a turn" if q > 1 else "a quarter of a turn" for q in (1, 2)}
+        named |= {-np.pi / 2: "a quarter of a turn"}
+    else:
+        height = float(data.xanchor[own.id] @ data.xaxis[own.id]) - rest
+        named |= {height: f"where the body {joint.body!r} is in the world"}
+    zeros = [_Zero(p, v, why) for v, why in named.items() if abs(v) > _NONE for p in _places(case, k, joint)]
+    signed = [_signed(readings, k, sign) for readings in near for sign in (readings[k].sign, turned(readings[k].sign))]
+    return [z for z in zeros for _ in signed], [z.put(readings) for z in zeros for readings in signed]
+
+
+def _searched(case: Case, model: mujoco.MjModel, k: int, joint: Joint, near: Sequence[Readings]) -> Tried:
+    """The best zero of a grid that puts the log's motion anywhere in the joint's range, else around its rest."""
+    own = model.joint(joint.name)
+    reach = np.pi if joint.hinge else float(model.stat.extent)
+    low, high = float(model.qpos0[own.qposadr[0]]) - reach, float(model.qpos0[own.qposadr[0]]) + reach
+    if model.jnt_limited[own.id]:
+        low, high = model.jnt_range[own.id].tolist()
+    channel, step = case.layout.channels[k][0], (high - low) / (_GRID - 1)
+    usual = float(np.median(np.concatenate([log.observations[:, channel] for log in case.trial.logs])))
+    best: list[tuple[float, _Zero, Readings]] = []
+    for places in _places(case, k, joint):
+        for readings in near:
+            middle = usual * scale_of(readings[k]) / scale_of(case.draft.readings[k])
+            values, width = middle - np.linspace(low, high, _GRID), step
+            for _ in range(3):
+                zeros = [_Zero(places, float(v), "", _UNSURE * step) for v in values]
+                sets: list[Readings] = [zero.put(readings) for zero in zeros]
+                misses = _missed(case, sets)
+                i = int(np.argmin(misses))
+                best.append((float(misses[i]), zeros[i], sets[i]))
+                values, width = values[i] + width * np.linspace(-1, 1, _FINER), 2 * width / (_FINER - 1)
+    _, zero, last = min(best, key=lambda one: one[0])
+    return [zero], [last]
+
+
+def _places(case: Case, k: int, joint: Joint) -> list[tuple[int, ...]]:
+    """A column alone, and with the set-point of its joint, which a servo counts from the same zero."""
+    servos = [f"actuator:{a.name}" for a in case.machine.actuators if a.drive == Drive.POSITION and a.joint == joint]
+    follows = [i for i, reading in enumerate(case.draft.readings) if reading.match.target in servos]
+    return [(k,), *([(k, *follows)] if follows else [])]
+
+
+def _signed(readings: Readings, k: int, sign: int) -> Readings:
+    return [replace(reading, sign=sign) if i == k else reading for i, reading in enumerate(readings)]
+
+
+def _with_evidence(zero: _Zero, times: float, readings: Readings, by: Readings) -> list[Reading]:
+    """The readings with a zero as the readings ``by`` have it, and what speaks for it."""
+    out = list(readings)
+    for k in zero.places:
+        why = f"zero {by[k].zero:g}, {zero.why}" if zero.why else f"zero {by[k].zero:.3g}, which simulations alone tell"
+        evidence = f"{why}: without it, simulated windows miss {times:.2g} times as much"
+        doubts = () if zero.why else (evidence,)
+        out[k] = replace(
+            out[k], zero=by[k].zero, unsure=by[k].unsure, doubts=(*out[k].doubts, *doubts),
+            notes=(*out[k].notes, *(() if doubts else (evidence,))),
+        )  # fmt: skip
+    return out
 
 
 def absolute_angles(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Trial, layout: Layout) -> list[str]:

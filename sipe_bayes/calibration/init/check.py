@@ -112,7 +112,7 @@ def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
         wraps = isinstance(entry, Measurement) and entry.wraps
         feed = entry.supply if isinstance(entry, Command) and entry.rate is None else None
         supply = None if feed is None else (feed.column, feed.unit)
-        return Reading(match, entry.unit, entry.sign, entry.factor, wraps, supply=supply)
+        return Reading(match, entry.unit, entry.sign, entry.factor, entry.zero, wraps=wraps, supply=supply)
 
     clock = replace(opened.clock, column=config.columns.time.column, unit=config.columns.time.unit)
     return Draft(

@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.absolute import absolute_angles
+from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
@@ -269,6 +269,10 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
     rest = tuple(r for r in draft.measurements if r not in part.measurements)
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
     trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
+    placed = with_zeros(part, model, machine, trial, layout)
+    if placed != part:
+        part = placed
+        trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
     against_world = absolute_angles(part, model, machine, trial, layout)
     part = decide(part, machine, trial, layout)
     logs = loaded(part, sources, folder)

@@ -42,6 +42,8 @@ class Assumption:
         channels: the column that each channel is read from.
         actuators: the column that each actuator is driven by.
         minus: pairs of channels, the second of which is taken off the first.
+        zeros: (O,) SI, what is taken off each channel once it is multiplied; none where empty.
+        rests: (A,) SI, the same of commands.
     """
 
     observed: tuple[float, ...]
@@ -51,6 +53,8 @@ class Assumption:
     channels: tuple[int, ...] = ()
     actuators: tuple[int, ...] = ()
     minus: tuple[tuple[int, int], ...] = ()
+    zeros: tuple[float, ...] = ()
+    rests: tuple[float, ...] = ()
 
     @classmethod
     def as_given(cls, channels: int, actuators: int) -> Assumption:
@@ -131,7 +135,7 @@ class Trial:
 
     def flight(self, assumption: Assumption) -> Flight:
         """What windows start from, are driven by and measured as."""
-        key = replace(assumption, delay=0, driven=(), actuators=())
+        key = replace(assumption, delay=0, driven=(), actuators=(), rests=())
         if key not in self._read:
             logs = [_read_as(log, assumption) for log in self.logs]
             states = [estimate_states(self.simulator, log)[s] for log, s in zip(logs, self.places, strict=True)]
@@ -199,6 +203,7 @@ def _bridged(log: Trajectory, triples: Sequence[tuple[int, int, int]]) -> Trajec
 
 def _read_as(log: Trajectory, assumption: Assumption) -> Trajectory:
     observations = log.observations[:, list(assumption.channels)] * np.array(assumption.observed)
+    observations -= np.array(assumption.zeros or 0.0)
     for one, other in assumption.minus:
         observations[:, one] -= observations[:, other]
     return Trajectory(observations, log.actions, log.dt * assumption.clock)
@@ -206,6 +211,7 @@ def _read_as(log: Trajectory, assumption: Assumption) -> Trajectory:
 
 def _driven_as(log: Trajectory, assumption: Assumption) -> FloatArray:
     actions = log.actions[:, list(assumption.actuators)] * np.array(assumption.driven)
+    actions -= np.array(assumption.rests or 0.0)
     late = min(assumption.delay, len(actions) - 1)
     return np.concatenate([np.repeat(actions[:1], late, axis=0), actions[: len(actions) - late]])
 
