@@ -75,7 +75,7 @@ class Supply(Table):
 
 
 class Command(Table):
-    """The column that drives one actuator; ``sign`` * ``factor`` * (column - ``zero``) in ``unit``, times a duty's supply."""
+    """A column that drives an actuator; ``sign`` * ``factor`` * (column - ``zero``) in ``unit``, times its supply."""
 
     actuator: Text
     """name of the driven actuator in the MJCF; a `[[commands]]` for each"""
@@ -145,7 +145,7 @@ class Measurement(Table):
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
     zero: Number = 0.0
-    """what the column reads where the model has 0, such as a slide's height above the floor; taken off before all else"""
+    """what the column reads where the model has 0, as a height above the floor does; taken off before all else"""
     wraps: Annotated[bool, Strict()] = False
     """`true`: the angle comes round, and jumps by a turn are taken out"""
     fit: Annotated[bool, Strict()] = True

@@ -147,9 +147,7 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
     grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
     held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
     scales = [c.sign * c.factor * to_si(c.unit)[0] for c in commands]
-    columns = [
-        scale * (values[held] - c.zero) for c, scale, values in zip(commands, scales, series, strict=True)
-    ]
+    columns = [scale * (values[held] - c.zero) for c, scale, values in zip(commands, scales, series, strict=True)]
     for command, values in zip(commands, columns, strict=True):
         actuator = model.actuator(command.actuator).id
         low, high = model.actuator_ctrlrange[actuator]

@@ -26,6 +26,8 @@ from sipe_bayes.simulation.tangents import moved
 _WORST = 30.0
 _BEST = 1e-3
 _LONGEST = 60  # physics steps of a control step, beyond which a clock is not believed
+_MOVES = 3.0  # times the noise, that a channel moves which is to be followed
+_UNFOLLOWED = 1.1  # of a straight line's miss
 _PAST = 64  # samples of commands before a window
 _STEPS = 200  # physics steps, on average, of each window that is asked for
 
@@ -132,6 +134,25 @@ class Trial:
         left, whole = self.bent(measured - seen), self.bent(measured)
         misses = np.clip(spread_of(left) / np.maximum(spread_of(whole), 1e-12), _BEST, _WORST)
         return np.where(np.isfinite(seen).any(axis=(1, 2)), misses, _WORST)  # a line explains what was not simulated
+
+    def missed(self, assumptions: Sequence[Assumption], theta: FloatArray) -> FloatArray:
+        """The logarithm of what simulations with theta (N,) miss of each assumption in each window (H, W).
+
+        Of all channels together; each window is compared with its own line, so that those with an impact count as well.
+        """
+        flights = [self.flight(assumption) for assumption in assumptions]
+        measured = np.stack([flight.measured for flight in flights])
+        seen = self.seen(flights, np.tile(theta, (len(flights), 1)))
+        left, whole = ((self.bent(y) ** 2).mean(axis=2) for y in (measured - seen, measured))
+        return 0.5 * followed(np.clip(left / np.maximum(whole, 1e-24), _BEST**2, _WORST))
+
+    def unfollowed(self, assumption: Assumption, theta: FloatArray) -> dict[int, float]:
+        """Channels that move, and that simulations with theta (N,) miss by more than a line does: by how much more."""
+        measured = self.flight(assumption).measured
+        noise = np.sqrt(np.mean(np.diff(measured, 3, axis=1) ** 2, axis=(0, 1)) / 20)  # of white noise; rarely less
+        moves = spread_of(self.bent(measured[None]))[0] > _MOVES * noise
+        misses = self.misses([assumption], theta)[0]
+        return {int(k): float(misses[k]) for k in np.flatnonzero(moves & (misses > _UNFOLLOWED))}
 
     def flight(self, assumption: Assumption) -> Flight:
         """What windows start from, are driven by and measured as."""
