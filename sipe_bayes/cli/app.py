@@ -113,6 +113,10 @@ def _root(
     """Calibrate robot simulators with honest uncertainty."""
 
 
+def _say_early(line: str) -> None:
+    print(f"sipe: {line}", file=sys.stderr, flush=True)
+
+
 def calibrate(
     config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
     estimator: Annotated[
@@ -136,7 +140,7 @@ def calibrate(
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        calibration = run(config, estimator, seed, budget, out, threads, progress, device)
+        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early)
     discovery = None
     if discover:
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:

@@ -46,8 +46,9 @@ class _Zero:
 def with_zeros(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Trial, layout: Layout) -> Draft:
     """The draft with those zeros of joints' columns with which simulations follow the logs clearly better.
 
-    First what the model names (a body's place in the world, ``ref``, keyframes) is tried, then a
-    grid over the joint's range where no simulation follows the logs well. The unknowns are fitted with and without it: a model that is off speaks for wrong ones.
+    First what the model names (a body's place in the world, ``ref``, keyframes) is tried, then a grid over the joint's
+    range where no simulation follows the logs well. The unknowns are fitted with and without a zero: a model that is
+    off speaks for wrong ones.
     Windows count alike, those with an impact too: contacts tell of a zero.
 
     Args:
@@ -120,9 +121,8 @@ def _first_better(
         tried: list[tuple[float, _Zero, Readings]] = []
         for k, joint in joints.items():
             tried += [one for one in zeros_of(cases, model, k, joint, near) if one[0] < now.missed.mean()]
-        after = [
-            (zero, _fitted(case, readings)) for _, zero, readings in sorted(tried, key=lambda one: one[0])[:_FITTED]
-        ]
+        tried = sorted(tried, key=lambda one: one[0])[:_FITTED]
+        after = [(zero, _fitted(case, readings)) for _, zero, readings in tried]
         if not after:
             continue
         zero, then = min(after, key=lambda one: float(one[1].missed.mean()))

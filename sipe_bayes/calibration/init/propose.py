@@ -326,8 +326,8 @@ def _unknowns(
     notes += [*nameless(model, touching - {model.body(body).id for body in machine.bodies})]
     lost = trial.unfollowed(replace(trial.given, delay=left.best), left.theta)
     doubts = [
-        f"nothing that is simulated follows {reading.match.column!r}: windows miss it by {lost[k]:.2g} times what a "
-        "straight line does; look at its zero, unit and sign, and at what the model lacks"
+        f"nothing that is simulated follows {reading.match.column!r}: windows miss {lost[k]:.2g} times what going "
+        "on straight does; look at its zero, unit and sign, and at what the model lacks"
         for reading, channels in zip(draft.measurements, layout.channels, strict=False)
         for k in channels if k in lost
     ]  # fmt: skip

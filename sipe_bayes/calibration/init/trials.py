@@ -14,10 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.rotations import bridged, written_near
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.starts import estimate_states, with_history
 from sipe_bayes.simulation.simulator import Simulator
@@ -26,8 +24,8 @@ from sipe_bayes.simulation.tangents import moved
 _WORST = 30.0
 _BEST = 1e-3
 _LONGEST = 60  # physics steps of a control step, beyond which a clock is not believed
-_MOVES = 3.0  # times the noise, that a channel moves which is to be followed
-_UNFOLLOWED = 1.1  # of a straight line's miss
+_MOVES = 2.0  # times the noise, that a channel moves which is to be followed
+_UNFOLLOWED = 0.8  # of a straight line's miss
 _PAST = 64  # samples of commands before a window
 _STEPS = 200  # physics steps, on average, of each window that is asked for
 
@@ -90,10 +88,7 @@ class Trial:
     """Windows of logs, and what simulations of them miss.
 
     Args:
-        model: path of the MJCF.
-        parameters: unknowns that a fit may move.
-        actuators: that the logs drive.
-        channels: that the logs measure.
+        environment: the model, its unknowns that a fit may move, what the logs drive and measure.
         logs: in SI, as the configuration reads them.
         windows: how many are simulated of all logs together.
         share: how long they are, in terms of the time in which the motion goes to and fro.
@@ -101,15 +96,11 @@ class Trial:
 
     def __init__(
         self,
-        model: str,
-        parameters: Sequence[Parameter],
-        actuators: Sequence[str],
-        channels: Sequence[Channel],
+        environment: MjcfEnvironment,
         logs: Sequence[Trajectory],
         windows: int,
         share: float,
     ) -> None:
-        environment = MjcfEnvironment.build(model, parameters, actuators, channels)
         self.simulator = Simulator(environment, num_threads=1)
         self.logs = tuple(_bridged(log, environment.rotations) for log in logs)
         self.length = _length(self.logs, share)
@@ -119,7 +110,7 @@ class Trial:
         time = np.linspace(-1, 1, self.length + 1)
         self._line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]
         self._read: dict[Assumption, Flight] = {}
-        self.given = Assumption.as_given(len(environment.channels), len(actuators))
+        self.given = Assumption.as_given(len(environment.channels), logs[0].actions.shape[1])
 
     @property
     def theta(self) -> FloatArray:
@@ -147,7 +138,7 @@ class Trial:
         return 0.5 * followed(np.clip(left / np.maximum(whole, 1e-24), _BEST**2, _WORST))
 
     def unfollowed(self, assumption: Assumption, theta: FloatArray) -> dict[int, float]:
-        """Channels that move, and that simulations with theta (N,) miss by more than a line does: by how much more."""
+        """Channels that move, and that simulations with theta (N,) hardly follow, and what they miss, as ``misses``."""
         measured = self.flight(assumption).measured
         noise = np.sqrt(np.mean(np.diff(measured, 3, axis=1) ** 2, axis=(0, 1)) / 20)  # of white noise; rarely less
         moves = spread_of(self.bent(measured[None]))[0] > _MOVES * noise

@@ -19,6 +19,7 @@ from sipe_bayes.calibration.init.unknowns import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 
 FEW, SOME, MANY = 12, 30, 60
 """Windows: for what is clear at once, for zeros, and for delays and unknowns."""
@@ -86,7 +87,8 @@ def trial_of(
     channels = [Channel(*channel) for m in config.measurements for channel in m.channels]
     actuators = [c.actuator for c in config.commands]
     parameters = as_parameters(model, draft.unknowns)
-    trial = Trial(str(config.model), parameters, actuators, channels, logs, windows, share_of(machine))
+    environment = MjcfEnvironment.build(str(config.model), parameters, actuators, channels)
+    trial = Trial(environment, logs, windows, share_of(machine))
     places, at = [], 0
     for m in config.measurements:
         places.append(tuple(range(at, at + len(m.channels))))
