@@ -23,10 +23,9 @@ def not_followed(problem: Problem) -> list[str]:
     lost = trial.unfollowed(trial.given, trial.theta)
     if lost:
         left = fit(trial, trial.given, (0,), _ROUNDS)
-        fitted = trial.unfollowed(trial.given, left.theta)
-        lost = {k: min(by, fitted[k]) for k, by in lost.items() if k in fitted}
+        lost = trial.unfollowed(trial.given, left.theta)
     return [
         f"nothing that is simulated follows {problem.environment.channels[k]!r}: short windows miss {by:.2g} times "
-        "what going on straight does; look at its zero, unit and sign: sipe init --check"
+        "what going on straight does; look at its zero, unit and sign; sipe init tries them"
         for k, by in lost.items()
     ]
