@@ -231,6 +231,13 @@ class Table(BaseModel):
         return data
 
 
+def log_words(value: Any) -> Any:
+    """``logs = "tosses/*.csv"`` as the table that it stands for."""
+    words = [value] if isinstance(value, str) else value
+    is_words = isinstance(words, list) and all(isinstance(word, str) for word in words)
+    return [{"file": word} for word in words] if is_words else value
+
+
 def overlap(a: Pair | None, b: Pair | None) -> bool:
     """Whether two spans in seconds share samples; None is the whole log."""
     return a is None or b is None or (a[0] < b[1] and b[0] < a[1])

@@ -25,6 +25,7 @@ from sipe_bayes.calibration.config_fields import (
     VoltageWord,
     Window,
     check_ordered,
+    log_words,
     overlap,
     parse_measurement_target,
     problem,
@@ -75,7 +76,7 @@ class Supply(Table):
 
 
 class Command(Table):
-    """The column that drives one actuator; ``sign`` * ``factor`` * column in ``unit``, times the supply of a duty."""
+    """A column that drives an actuator; ``sign`` * ``factor`` * (column - ``zero``) in ``unit``, times its supply."""
 
     actuator: Text
     """name of the driven actuator in the MJCF; a `[[commands]]` for each"""
@@ -87,6 +88,8 @@ class Command(Table):
     """1 or -1"""
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
+    zero: Number = 0.0
+    """what the column says where the model's command is 0; taken off before all else"""
     tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = COMMANDS
     """sd of what a motor or position servo delivers, as a share of what the column says: a motor constant is known to
     about a tenth, and masses are off by as much. The intervals with what the model lacks allow for it. 0: exact"""
@@ -121,7 +124,7 @@ class Command(Table):
 
 
 class Measurement(Table):
-    """A column that measures a joint, body or sensor; ``sign`` * ``factor`` * column in ``unit``.
+    """A column that measures a joint, body or sensor; ``sign`` * ``factor`` * (column - ``zero``) in ``unit``.
 
     A vector has three ``columns``; an orientation four, and three channels, its rotation vector (rad).
     """
@@ -142,6 +145,8 @@ class Measurement(Table):
     """1 or -1"""
     factor: Positive = 1.0
     """what the column is multiplied by beside its unit"""
+    zero: Number = 0.0
+    """what the column reads where the model has 0, as a height above the floor does; taken off before all else"""
     wraps: Annotated[bool, Strict()] = False
     """`true`: the angle comes round, and jumps by a turn are taken out"""
     fit: Annotated[bool, Strict()] = True
@@ -196,6 +201,8 @@ class Measurement(Table):
             raise problem(message, "columns")
         if self.wraps and (find_unit(self.unit).dimension != "angle" or self.columns):
             raise problem(f"only one angle comes round, got {self.unit!r} and {list(self.sources)}; drop it", "wraps")
+        if self.columns and self.zero:
+            raise problem("a vector has none; move the frame in the MJCF instead", "zero")
         if turns and (self.sign, self.factor) != (1, 1.0):
             raise problem("a quaternion has none; turn the frame in the MJCF instead", "sign")
         return self
@@ -245,15 +252,6 @@ class LogEntry(Table):
         return not apart and overlap(self.span, other.span)
 
 
-def _log_words(value: Any) -> Any:
-    """``logs = "tosses/*.csv"`` as the table that it stands for."""
-    return [{"file": word} for word in ([value] if isinstance(value, str) else value)] if _is_words(value) else value
-
-
-def _is_words(value: Any) -> bool:
-    return isinstance(value, str) or (isinstance(value, list) and all(isinstance(word, str) for word in value))
-
-
 def _matched(logs: tuple[LogEntry, ...], info: ValidationInfo) -> tuple[LogEntry, ...]:
     """Each log whose file is a pattern as the files that match it."""
     entries: list[LogEntry] = []
@@ -269,7 +267,7 @@ def _matched(logs: tuple[LogEntry, ...], info: ValidationInfo) -> tuple[LogEntry
     return tuple(entries)
 
 
-Logs = Annotated[tuple[LogEntry, ...], Field(min_length=1), BeforeValidator(_log_words), AfterValidator(_matched)]
+Logs = Annotated[tuple[LogEntry, ...], Field(min_length=1), BeforeValidator(log_words), AfterValidator(_matched)]
 
 
 class NormalPrior(Table):

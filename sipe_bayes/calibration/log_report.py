@@ -52,7 +52,8 @@ def report_of(
     signals = {name: y.values for name, (m, _), y in measured if not m.quaternion}
     signals |= {c.target: y.values for c, y in zip(config.drives, raw.commands, strict=True)}
     missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
-    clipped = {name: count_clipped(values) for name, values in signals.items()}
+    driven = {command.target for command in config.drives}
+    clipped = {name: count_clipped(values, name in driven) for name, values in signals.items()}
     saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
     commands = zip(config.drives, raw.commands, strict=True)
     blank = {c.target: int((~np.isfinite(y.values[:-1])).sum()) for c, y in commands}
@@ -142,12 +143,12 @@ def _jitter(time: FloatArray) -> float:
     return float(np.abs(periods - median * np.maximum(1.0, np.round(periods / median))).max())
 
 
-def count_clipped(values: FloatArray) -> int:
+def count_clipped(values: FloatArray, command: bool = False) -> int:
     """Samples of a signal (n,) stuck at its largest or smallest value, in runs of five or more.
 
     A quantised signal that rests or turns there also repeats itself; clipping cuts off a moving one. So a run
     counts only if two samples before or after it the signal is at least three quanta away, a quantum being
-    its smallest step. Switched and constant signals have none.
+    its smallest step. Switched and constant signals have none, and a command that is 0 there rests: an idle rotor.
     """
     values = values[np.isfinite(values)]
     if len(np.unique(values)) < _SATURATION.levels:
@@ -155,7 +156,7 @@ def count_clipped(values: FloatArray) -> int:
     low, high = float(values.min()), float(values.max())
     steps = np.abs(np.diff(values))
     far = _SATURATION.quanta * float(steps[steps > 1e-6 * (high - low)].min())
-    return sum(_stuck(values, extreme, far) for extreme in (low, high))
+    return sum(_stuck(values, extreme, far) for extreme in (low, high) if extreme or not command)
 
 
 def _stuck(values: FloatArray, extreme: float, far: float) -> int:

@@ -152,7 +152,7 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         column = _column(log, table, name)
         time = time_of(name)
         values = _fitted(name, column, len(time))
-        values = convert(np.where(np.isfinite(values), values, np.nan), entry.unit)
+        values = convert(np.where(np.isfinite(values), values, np.nan) - entry.zero, entry.unit)
         if isinstance(entry, Measurement) and entry.wraps:
             known = np.isfinite(values)
             values[known] = np.unwrap(entry.factor * values[known]) / entry.factor

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sipe_bayes.calibration.checks.fitted import Fit, from_fitted_states, one_by_one, tamed
+from sipe_bayes.calibration.checks.followed import not_followed
 from sipe_bayes.calibration.checks.lacking import lacking
 from sipe_bayes.calibration.checks.plan import Checks, expected_rollouts, with_checks
 from sipe_bayes.calibration.checks.predictions import Predictions, every_channel, place_in_prior
@@ -180,6 +182,7 @@ def run(
     num_threads: int | None = None,
     progress: Progress | None = None,
     device: str = "cpu",
+    tell: Callable[[str], None] | None = None,
 ) -> Calibration:
     """What the command does: read, claim the output folder, fit with a checkpoint, write everything.
 
@@ -194,6 +197,7 @@ def run(
         num_threads: native ones; default all cores.
         progress: called along the way.
         device: that it simulates on, as ``Simulator`` has them.
+        tell: called with a line for each column that no simulation follows, before the fit takes its time.
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.
@@ -204,6 +208,9 @@ def run(
     bind(problem.likelihood, problem.simulator, problem.train)
     if problem.holdout is not None:
         every_channel(problem, problem.holdout)
+    if tell is not None:
+        for line in not_followed(problem):
+            tell(line)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
     folder = Path("runs") / f"{run_name(problem.config.path)}-{name}" if out is None else out

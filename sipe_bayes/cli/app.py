@@ -61,7 +61,6 @@ _PIPED_WIDTH = 120
 _AXES = ("_x", "_y", "_z")
 _LINES, _SENTENCES, _WARNINGS, _CHANNELS = 20, 3, 3, 3  # that a calibration may fill, and of each kind of line
 _NAMED = 4  # of the parameters that the table has no room for
-_SDS = 3.3  # in a 90 % interval
 _LONGEST, _VERDICT = 300, 44  # characters of a sentence on the terminal, and of a verdict in the table
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
@@ -113,6 +112,10 @@ def _root(
     """Calibrate robot simulators with honest uncertainty."""
 
 
+def _say_early(line: str) -> None:
+    print(f"sipe: {line}", file=sys.stderr, flush=True)
+
+
 def calibrate(
     config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
     estimator: Annotated[
@@ -136,7 +139,7 @@ def calibrate(
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        calibration = run(config, estimator, seed, budget, out, threads, progress, device)
+        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early)
     discovery = None
     if discover:
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
@@ -263,11 +266,10 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
     shown = calibration.parameters
     shown = shown if len(shown) < lines else shown[: lines - 2]
     for p in shown:
-        scale = max(abs(p.q05), abs(p.q95))  # one way of writing for the whole row
+        scale = max(map(abs, (p.q05, p.q95, *(p.further or ()))))  # one way of writing for the whole row
         value, low, high = (significant(x, p.sd, scale) for x in (p.mode, p.q05, p.q95))
         verdict = parameter_verdict(p, findings)
-        wide = p.sd if p.further is None else max((p.further[1] - p.further[0]) / _SDS, 1e-300)
-        ends = [] if p.further is None else [significant(x, wide, max(map(abs, p.further))) for x in p.further]
+        ends = [significant(x, p.sd, scale) for x in p.further or ()]
         cells = [value, *[" .. ".join(ends)] * wider, f"{low} .. {high}"]
         # brackets of a name are not markup
         table.add_row(

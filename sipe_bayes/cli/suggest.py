@@ -147,7 +147,7 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
     grid = np.arange(0.0, seconds[-1] + 0.5 * dt, dt)
     held = np.clip(np.searchsorted(seconds, grid + 1e-9, side="right") - 1, 0, None)
     scales = [c.sign * c.factor * to_si(c.unit)[0] for c in commands]
-    columns = [scale * values[held] for scale, values in zip(scales, series, strict=True)]
+    columns = [scale * (values[held] - c.zero) for c, scale, values in zip(commands, scales, series, strict=True)]
     for command, values in zip(commands, columns, strict=True):
         actuator = model.actuator(command.actuator).id
         low, high = model.actuator_ctrlrange[actuator]
@@ -180,5 +180,5 @@ def _write(problem: Problem, plan: Plan, out: Path) -> None:
     clock = problem.config.columns.time
     columns: dict[str, Any] = {clock.column: np.arange(len(plan.actions)) * plan.dt / to_si(clock.unit)[0]}
     for command, column in zip(problem.config.commands, plan.actions.T, strict=True):
-        columns[command.column] = command.sign * column / (command.factor * to_si(command.unit)[0])
+        columns[command.column] = command.sign * column / (command.factor * to_si(command.unit)[0]) + command.zero
     write_text(out, pd.DataFrame(columns).to_csv(index=False, float_format="%.9g"))

@@ -223,7 +223,9 @@ def _margin(comparison: Comparison) -> str:
         ratio, low, high = 1 / ratio, 1 / high, 1 / low
     digits = 3 if ratio < THRESHOLDS.alike else 2
     word = "smaller" if comparison.ratio >= 1 else "larger"
-    return f"{number(ratio, digits)} times {word} (95 % interval {number(low, digits)} to {number(high, digits)}"
+    short = 10 ** (digits - 1)  # below it zeros are digits too: 1.0 to 19
+    ratio_text, *ends = (f"{x:#.{digits}g}" if 1 <= x < short else number(x, digits) for x in (ratio, low, high))
+    return f"{ratio_text} times {word} (95 % interval {' to '.join(ends)}"
 
 
 def lack(calibration: Calibration) -> Verdict | None:

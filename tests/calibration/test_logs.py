@@ -262,6 +262,9 @@ def test_clipping_is_counted_and_rest_is_not(tmp_path: Path, quantum: float) -> 
     assert count_clipped(np.sign(clean)) == count_clipped(np.zeros(50)) == 0
     _, report = load(tmp_path, {"t": t, "u": clean, "q": clipped})
     assert report.clipped["q"] > 100
+    idle = np.maximum(clean - 0.5, 0.0)
+    assert count_clipped(idle) > 100
+    assert count_clipped(idle, command=True) == 0, "a rotor that idles at 0 is not clipped"
     assert report.clipped["actuator:motor"] == 0
     assert any(note.startswith("q: ") and "saturated" in note for note in report.notes)
 

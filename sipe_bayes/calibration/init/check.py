@@ -15,14 +15,14 @@ from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.init.decisions import AGAINST, decide, fitted_miss
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
 from sipe_bayes.calibration.init.fits import fit
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.names import read_name
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.signals import turn_of
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
-from sipe_bayes.calibration.init.unknowns import Sizes, delay_of, springs
+from sipe_bayes.calibration.init.unknowns import delay_of, springs
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,
@@ -112,7 +112,7 @@ def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
         wraps = isinstance(entry, Measurement) and entry.wraps
         feed = entry.supply if isinstance(entry, Command) and entry.rate is None else None
         supply = None if feed is None else (feed.column, feed.unit)
-        return Reading(match, entry.unit, entry.sign, entry.factor, wraps, supply=supply)
+        return Reading(match, entry.unit, entry.sign, entry.factor, entry.zero, wraps=wraps, supply=supply)
 
     clock = replace(opened.clock, column=config.columns.time.column, unit=config.columns.time.unit)
     return Draft(

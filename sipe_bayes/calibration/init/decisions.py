@@ -51,16 +51,26 @@ class Layout:
     minus: tuple[tuple[int, int], ...] = ()  # as assumptions have it
 
     def assumption(self, trial: Trial, draft: Draft, readings: Sequence[Reading]) -> Assumption:
-        """What other units and signs mean for what was read as the draft says."""
+        """What other units, signs and zeros mean for what was read as the draft says."""
         observed, driven = list(trial.given.observed), list(trial.given.driven)
+        zeros, rests = [0.0] * len(observed), [0.0] * len(driven)
         for k, (now, then) in enumerate(zip(readings, draft.readings, strict=True)):
-            factor = scale_of(now) / scale_of(then)
+            factor, zero = scale_of(now) / scale_of(then), scale_of(now) * (now.zero - then.zero)
             for channel in self.channels[k]:
                 observed[channel] *= factor
+                zeros[channel] = zero
             command = self.commands[k]
             if command is not None:
                 driven[command] *= factor
-        return replace(trial.given, observed=tuple(observed), driven=tuple(driven), minus=self.minus)
+                rests[command] = zero
+        return replace(
+            trial.given,
+            observed=tuple(observed),
+            driven=tuple(driven),
+            minus=self.minus,
+            zeros=tuple(zeros) if any(zeros) else (),
+            rests=tuple(rests) if any(rests) else (),
+        )
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ class Reading:
         unit: unit word.
         sign: 1 or -1.
         factor: beside the unit.
+        zero: what the column says where the model has 0.
+        unsure: SI, by how much that may be wrong where simulations alone tell it.
         wraps: whether jumps by a turn are taken out.
         fit: False for what only starts windows.
         scales: what it may be besides units of its kind: counts.
@@ -57,6 +59,8 @@ class Reading:
     unit: str
     sign: int = 1
     factor: float = 1.0
+    zero: float = 0.0
+    unsure: float = 0.0
     wraps: bool = False
     fit: bool = True
     scales: tuple[Scale, ...] = ()
@@ -84,6 +88,7 @@ class Reading:
         row["unit"] = self.unit
         row |= {"sign": self.sign} if self.sign != 1 else {}
         row |= {"factor": self.factor} if self.factor != 1 else {}
+        row |= {"zero": self.zero} if self.zero else {}
         row |= {"wraps": True} if self.wraps else {}
         row |= {"supply": {"column": self.supply[0], "unit": self.supply[1]}} if self.supply else {}
         return row | ({} if self.fit else {"fit": False})

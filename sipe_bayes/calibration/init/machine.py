@@ -8,6 +8,10 @@ from enum import Enum
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.arrays import FloatArray
+
+_GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
+
 
 class Drive(Enum):
     """What an actuator is given."""
@@ -104,6 +108,48 @@ class Machine:
         return cls(tuple(joints), tuple(actuators), tuple(b for b in bodies if b), tuple(s for s in sensors if s[1]))
 
 
+@dataclass(frozen=True)
+class Sizes:
+    """Of each joint by name: force or torque, speed and inertia that are usual in the logs, in SI."""
+
+    force: dict[str, float]
+    speed: dict[str, float]
+    inertia: dict[str, float]
+
+    @classmethod
+    def of(
+        cls, model: mujoco.MjModel, machine: Machine, states: FloatArray | None, controls: FloatArray | None
+    ) -> Sizes:
+        """Read from states (n, S) and controls (n, nu) of the logs; from the model alone where there are none."""
+        data = mujoco.MjData(model)
+        forces, speeds, inertias = [], [], []
+        rows = 1 if states is None else len(states)
+        for k in range(rows):
+            if states is not None:
+                data.qpos[:] = states[k, 1 : 1 + model.nq]
+                data.qvel[:] = states[k, 1 + model.nq : 1 + model.nq + model.nv]
+            if controls is not None:
+                data.ctrl[:] = controls[k]
+            mujoco.mj_forward(model, data)
+            full = np.zeros((model.nv, model.nv))
+            mujoco.mj_fullM(model, data, full)
+            inertia = np.diag(full).copy()
+            speed = np.abs(data.qvel.copy())
+            moving = _BRISK * inertia if states is None else np.zeros(model.nv)
+            gravity = np.abs(data.qfrc_bias) + (0.5 * _GRAVITY * np.sqrt(inertia) if states is None else 0.0)
+            forces.append(np.abs(data.qfrc_actuator) + gravity + moving)
+            speeds.append(speed if states is not None else np.full(model.nv, 3.0))
+            inertias.append(inertia)
+        force, speed = np.quantile(forces, 0.9, axis=0), np.quantile(speeds, 0.9, axis=0)
+        inertia = np.mean(inertias, axis=0)
+        at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
+
+        def by_name(values: FloatArray, least: float) -> dict[str, float]:
+            return {name: max(float(values[i]), least) for name, i in at.items()}
+
+        return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
+
+
 def drive_of(model: mujoco.MjModel, index: int) -> Drive:
     """What an actuator of a compiled model is given."""
     kind, inputs = int(model.actuator_gaintype[index]), int(model.actuator_ctrlspec[index])
@@ -158,6 +204,18 @@ def touched_by(model: mujoco.MjModel, geom: int) -> list[int]:
     kinds, with_kinds = model.geom_contype, model.geom_conaffinity
     meets = (kinds[geom] & with_kinds) | (kinds & with_kinds[geom])
     return [g for g in range(model.ngeom) if meets[g] and int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+
+
+def touching_bodies(model: mujoco.MjModel, states: FloatArray) -> set[int]:
+    """Ids of the bodies that touch what stands still in states (n, S)."""
+    data, out = mujoco.MjData(model), set[int]()
+    for state in states:
+        data.qpos[:] = state[1 : 1 + model.nq]
+        mujoco.mj_fwdPosition(model, data)
+        bodies = model.geom_bodyid[data.contact.geom]  # (C, 2)
+        still = model.body_weldid[bodies] == 0
+        out |= set(bodies[~still & still[:, ::-1]].tolist())
+    return out
 
 
 def own_friction(model: mujoco.MjModel, geom: int) -> float:

@@ -10,11 +10,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.absolute import absolute_angles
+from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
 from sipe_bayes.calibration.init.matching import Matches, match_columns
 from sipe_bayes.calibration.init.names import TURNS, pieces_of
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
@@ -22,7 +22,6 @@ from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.unknowns import (
     RELATIVE,
-    Sizes,
     candidates,
     delay_of,
     nameless,
@@ -34,6 +33,7 @@ from sipe_bayes.calibration.init.unknowns import (
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,
+    SOME,
     Source,
     delays_of,
     loaded,
@@ -52,6 +52,7 @@ from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.likelihood.starts import estimate_states
 
+_PASSED = 300  # states of each log, of which it is looked what they touch
 _LOOKED_AT = 3  # logs that are simulated
 _CHECKED = 60  # logs whose columns are looked at
 _HELD = 0.75  # share of a single log that trains
@@ -88,7 +89,7 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
         doubts=(*dropped, *matches.doubts, *_unmatched(model, machine, matches, commands)),
-        notes=(*_unused(matches, commands), *nameless(model, machine)),
+        notes=(*_unused(matches, commands), *nameless(model, {model.body(body).id for body in machine.bodies})),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     trained = _decided(draft, model, machine, sources, folder) if positions else _undecided(draft, model, machine)
@@ -270,14 +271,20 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
     trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
     against_world = absolute_angles(part, model, machine, trial, layout)
+    if not against_world:
+        wide, _ = trial_of(part, model, machine, trial.logs, folder, SOME)
+        placed = with_zeros(part, model, machine, wide, layout)
+        if placed != part:
+            part = placed
+            trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
     part = decide(part, machine, trial, layout)
     logs = loaded(part, sources, folder)
-    unknowns, delay, notes = _unknowns(part, model, machine, logs, folder)
+    unknowns, delay, notes, lost = _unknowns(part, model, machine, logs, folder)
     unknowns, doubts = _some(unknowns)
     window, why = _window(machine, logs, trial)
     return replace(
         part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
-        notes=(*draft.notes, *notes), doubts=(*against_world, *part.doubts, *doubts), delay=delay,
+        notes=(*draft.notes, *notes), doubts=(*against_world, *part.doubts, *lost, *doubts), delay=delay,
     )  # fmt: skip
 
 
@@ -290,18 +297,24 @@ def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
 
 def _unknowns(
     draft: Draft, model: mujoco.MjModel, machine: Machine, logs: Sequence[Trajectory], folder: Path
-) -> tuple[list[Unknown], float, list[str]]:
-    """Parameters with bounds of the size of the motion, the delay, and which of them these logs tell apart."""
+) -> tuple[list[Unknown], float, list[str], list[str]]:
+    """Parameters that these logs tell apart, the delay in samples, notes, and doubts of columns that nothing follows.
+
+    Bounds are of the size of the motion.
+    """
     trial, _ = trial_of(draft, model, machine, logs, folder, FEW)
-    states, controls = [], []
-    for log, starts in zip(logs, trial.places, strict=True):
-        states.append(estimate_states(trial.simulator, log)[starts])
-        controls.append(trial.simulator.environment.control(trial.simulator.model, states[-1], log.actions[starts]))
+    passed = [estimate_states(trial.simulator, log) for log in logs]
+    states = [own[starts] for own, starts in zip(passed, trial.places, strict=True)]
+    control, compiled = trial.simulator.environment.control, trial.simulator.model
+    controls = [
+        control(compiled, own, log.actions[starts]) for own, log, starts in zip(states, logs, trial.places, strict=True)
+    ]
     sizes = Sizes.of(model, machine, np.concatenate(states), np.concatenate(controls))
-    unknowns = candidates(model, machine, draft.readings, sizes)
+    touching = touching_bodies(model, np.concatenate([own[:: 1 + len(own) // _PASSED] for own in passed]))
+    unknowns = candidates(model, machine, draft.readings, sizes, sorted(touching))
     beside = springs(model, machine, draft.readings, sizes)
     windows = _TURNING if trial.simulator.environment.rotations else MANY
-    trial, _ = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, windows)
+    trial, layout = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, windows)
     names = list(trial.simulator.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
@@ -310,7 +323,15 @@ def _unknowns(
     samples = left.finer if late else 0.0
     shown = told_apart(unknowns, left, scale_is_open(model, machine, draft.readings))
     notes = [note] if note and not late else []
-    return [*late, *shown], samples, [*notes, *sprung(unknowns, beside, left)]
+    notes += [*nameless(model, touching - {model.body(body).id for body in machine.bodies})]
+    lost = trial.unfollowed(replace(trial.given, delay=left.best), left.theta)
+    doubts = [
+        f"nothing that is simulated follows {reading.match.column!r}: windows miss {lost[k]:.2g} times what going "
+        "on straight does; look at its zero, unit and sign, and at what the model lacks"
+        for reading, channels in zip(draft.measurements, layout.channels, strict=False)
+        for k in channels if k in lost
+    ]  # fmt: skip
+    return [*late, *shown], samples, [*notes, *sprung(unknowns, beside, left)], doubts
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:

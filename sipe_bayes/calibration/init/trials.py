@@ -14,10 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.rotations import bridged, written_near
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.starts import estimate_states, with_history
 from sipe_bayes.simulation.simulator import Simulator
@@ -26,6 +24,8 @@ from sipe_bayes.simulation.tangents import moved
 _WORST = 30.0
 _BEST = 1e-3
 _LONGEST = 60  # physics steps of a control step, beyond which a clock is not believed
+_MOVES = 2.0  # times the noise, that a channel moves which is to be followed
+_UNFOLLOWED = 0.8  # of a straight line's miss
 _PAST = 64  # samples of commands before a window
 _STEPS = 200  # physics steps, on average, of each window that is asked for
 
@@ -42,6 +42,8 @@ class Assumption:
         channels: the column that each channel is read from.
         actuators: the column that each actuator is driven by.
         minus: pairs of channels, the second of which is taken off the first.
+        zeros: (O,) SI, what is taken off each channel once it is multiplied; none where empty.
+        rests: (A,) SI, the same of commands.
     """
 
     observed: tuple[float, ...]
@@ -51,6 +53,8 @@ class Assumption:
     channels: tuple[int, ...] = ()
     actuators: tuple[int, ...] = ()
     minus: tuple[tuple[int, int], ...] = ()
+    zeros: tuple[float, ...] = ()
+    rests: tuple[float, ...] = ()
 
     @classmethod
     def as_given(cls, channels: int, actuators: int) -> Assumption:
@@ -84,10 +88,7 @@ class Trial:
     """Windows of logs, and what simulations of them miss.
 
     Args:
-        model: path of the MJCF.
-        parameters: unknowns that a fit may move.
-        actuators: that the logs drive.
-        channels: that the logs measure.
+        environment: the model, its unknowns that a fit may move, what the logs drive and measure.
         logs: in SI, as the configuration reads them.
         windows: how many are simulated of all logs together.
         share: how long they are, in terms of the time in which the motion goes to and fro.
@@ -95,15 +96,11 @@ class Trial:
 
     def __init__(
         self,
-        model: str,
-        parameters: Sequence[Parameter],
-        actuators: Sequence[str],
-        channels: Sequence[Channel],
+        environment: MjcfEnvironment,
         logs: Sequence[Trajectory],
         windows: int,
         share: float,
     ) -> None:
-        environment = MjcfEnvironment.build(model, parameters, actuators, channels)
         self.simulator = Simulator(environment, num_threads=1)
         self.logs = tuple(_bridged(log, environment.rotations) for log in logs)
         self.length = _length(self.logs, share)
@@ -113,7 +110,7 @@ class Trial:
         time = np.linspace(-1, 1, self.length + 1)
         self._line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]
         self._read: dict[Assumption, Flight] = {}
-        self.given = Assumption.as_given(len(environment.channels), len(actuators))
+        self.given = Assumption.as_given(len(environment.channels), logs[0].actions.shape[1])
 
     @property
     def theta(self) -> FloatArray:
@@ -129,9 +126,28 @@ class Trial:
         misses = np.clip(spread_of(left) / np.maximum(spread_of(whole), 1e-12), _BEST, _WORST)
         return np.where(np.isfinite(seen).any(axis=(1, 2)), misses, _WORST)  # a line explains what was not simulated
 
+    def missed(self, assumptions: Sequence[Assumption], theta: FloatArray) -> FloatArray:
+        """The logarithm of what simulations with theta (N,) miss of each assumption in each window (H, W).
+
+        Of all channels together; each window is compared with its own line, so that those with an impact count as well.
+        """
+        flights = [self.flight(assumption) for assumption in assumptions]
+        measured = np.stack([flight.measured for flight in flights])
+        seen = self.seen(flights, np.tile(theta, (len(flights), 1)))
+        left, whole = ((self.bent(y) ** 2).mean(axis=2) for y in (measured - seen, measured))
+        return 0.5 * followed(np.clip(left / np.maximum(whole, 1e-24), _BEST**2, _WORST))
+
+    def unfollowed(self, assumption: Assumption, theta: FloatArray) -> dict[int, float]:
+        """Channels that move, and that simulations with theta (N,) hardly follow, and what they miss, as ``misses``."""
+        measured = self.flight(assumption).measured
+        noise = np.sqrt(np.mean(np.diff(measured, 3, axis=1) ** 2, axis=(0, 1)) / 20)  # of white noise; rarely less
+        moves = spread_of(self.bent(measured[None]))[0] > _MOVES * noise
+        misses = self.misses([assumption], theta)[0]
+        return {int(k): float(misses[k]) for k in np.flatnonzero(moves & (misses > _UNFOLLOWED))}
+
     def flight(self, assumption: Assumption) -> Flight:
         """What windows start from, are driven by and measured as."""
-        key = replace(assumption, delay=0, driven=(), actuators=())
+        key = replace(assumption, delay=0, driven=(), actuators=(), rests=())
         if key not in self._read:
             logs = [_read_as(log, assumption) for log in self.logs]
             states = [estimate_states(self.simulator, log)[s] for log, s in zip(logs, self.places, strict=True)]
@@ -199,6 +215,7 @@ def _bridged(log: Trajectory, triples: Sequence[tuple[int, int, int]]) -> Trajec
 
 def _read_as(log: Trajectory, assumption: Assumption) -> Trajectory:
     observations = log.observations[:, list(assumption.channels)] * np.array(assumption.observed)
+    observations -= np.array(assumption.zeros or 0.0)
     for one, other in assumption.minus:
         observations[:, one] -= observations[:, other]
     return Trajectory(observations, log.actions, log.dt * assumption.clock)
@@ -206,6 +223,7 @@ def _read_as(log: Trajectory, assumption: Assumption) -> Trajectory:
 
 def _driven_as(log: Trajectory, assumption: Assumption) -> FloatArray:
     actions = log.actions[:, list(assumption.actuators)] * np.array(assumption.driven)
+    actions -= np.array(assumption.rests or 0.0)
     late = min(assumption.delay, len(actions) - 1)
     return np.concatenate([np.repeat(actions[:1], late, axis=0), actions[: len(actions) - late]])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import takewhile
 
 import mujoco
@@ -17,6 +17,7 @@ from sipe_bayes.calibration.init.machine import (
     Drive,
     Joint,
     Machine,
+    Sizes,
     counts,
     friction_of,
     own_friction,
@@ -24,8 +25,8 @@ from sipe_bayes.calibration.init.machine import (
     touched_by,
 )
 from sipe_bayes.calibration.init.names import Kind
-from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.sensing import of_sensor
 from sipe_bayes.envs.targets import bind
 
 RELATIVE = "no force is known, so that all others are relative to it; weigh it"
@@ -34,7 +35,6 @@ _SPRING = "a spring that the model does not have"
 _STIFF, _PER_METRE = 4.0, 10.0  # of the usual force, the force of a spring that is turned by 1 rad, or is 0.1 m long
 _NOTABLE = 0.03  # of its range, from which a spring is told
 _MOST = 20  # parameters that are asked for: what shows and is left out is in all others
-_GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
 _APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
@@ -44,49 +44,13 @@ _TELLING = 0.02  # of the squared miss, from which a delay is asked for
 _LITTLE = 1.1  # times the miss without a delay, below which it is uncertain
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Of each joint by name: force or torque, speed and inertia that are usual in the logs, in SI."""
-
-    force: dict[str, float]
-    speed: dict[str, float]
-    inertia: dict[str, float]
-
-    @classmethod
-    def of(
-        cls, model: mujoco.MjModel, machine: Machine, states: FloatArray | None, controls: FloatArray | None
-    ) -> Sizes:
-        """Read from states (n, S) and controls (n, nu) of the logs; from the model alone where there are none."""
-        data = mujoco.MjData(model)
-        forces, speeds, inertias = [], [], []
-        rows = 1 if states is None else len(states)
-        for k in range(rows):
-            if states is not None:
-                data.qpos[:] = states[k, 1 : 1 + model.nq]
-                data.qvel[:] = states[k, 1 + model.nq : 1 + model.nq + model.nv]
-            if controls is not None:
-                data.ctrl[:] = controls[k]
-            mujoco.mj_forward(model, data)
-            full = np.zeros((model.nv, model.nv))
-            mujoco.mj_fullM(model, data, full)
-            inertia = np.diag(full).copy()
-            speed = np.abs(data.qvel.copy())
-            moving = _BRISK * inertia if states is None else np.zeros(model.nv)
-            gravity = np.abs(data.qfrc_bias) + (0.5 * _GRAVITY * np.sqrt(inertia) if states is None else 0.0)
-            forces.append(np.abs(data.qfrc_actuator) + gravity + moving)
-            speeds.append(speed if states is not None else np.full(model.nv, 3.0))
-            inertias.append(inertia)
-        force, speed = np.quantile(forces, 0.9, axis=0), np.quantile(speeds, 0.9, axis=0)
-        inertia = np.mean(inertias, axis=0)
-        at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
-
-        def by_name(values: FloatArray, least: float) -> dict[str, float]:
-            return {name: max(float(values[i]), least) for name, i in at.items()}
-
-        return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
-
-
-def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
+def candidates(
+    model: mujoco.MjModel,
+    machine: Machine,
+    readings: Sequence[Reading],
+    sizes: Sizes,
+    touching: Sequence[int] = (),
+) -> list[Unknown]:
     """Parameters that may be unknown, those first that show most.
 
     Args:
@@ -94,6 +58,7 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
         machine: what of it logs hold.
         readings: measurements and commands.
         sizes: of the motion.
+        touching: ids of bodies that touch what stands still in the logs, beside those that move freely.
     """
     measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
     joints = [joint for joint in machine.joints if joint.name in measured]
@@ -106,8 +71,20 @@ def candidates(model: mujoco.MjModel, machine: Machine, readings: Sequence[Readi
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
-    proposed = gains + masses + of_joints + attached + _contacts(model, machine)
+    proposed = gains + masses + of_joints + attached + _zeros(readings)
+    proposed += _contacts(model, {*bodies, *touching})
     return proposed or _masses(model, bodies)[0]
+
+
+def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
+    """What is left of zeros that simulations alone tell."""
+    return [
+        Unknown(
+            f"{_word(r.match.column)}_zero", (f"sensor:{r.match.column}.bias",), -r.unsure, r.unsure, False,
+            f"SI, what is left of the zero error of {r.match.column!r}",
+        )
+        for r in readings if r.unsure and not r.commanded
+    ]  # fmt: skip
 
 
 def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
@@ -209,12 +186,11 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
     return out
 
 
-def _contacts(model: mujoco.MjModel, machine: Machine) -> list[Unknown]:
-    """Friction and bounce of free bodies, and of what moves with them, with what stands still.
+def _contacts(model: mujoco.MjModel, tops: set[int]) -> list[Unknown]:
+    """Friction and bounce of bodies, and of what moves with them, with what stands still.
 
     Geoms whose friction with it is one number share a parameter: wheels, feet.
     """
-    tops = {model.body(body).id for body in machine.bodies}
     touching = {g: s for g in range(model.ngeom) if top_of(model, g, tops) and (s := touched_by(model, g))}
     groups: dict[tuple[float, ...], list[int]] = {}
     for geom, still in touching.items():
@@ -251,9 +227,8 @@ def _contacts(model: mujoco.MjModel, machine: Machine) -> list[Unknown]:
     return out
 
 
-def nameless(model: mujoco.MjModel, machine: Machine) -> list[str]:
-    """What is to be said of free bodies of which no geom that may touch what stands still has a name."""
-    tops = {model.body(body).id for body in machine.bodies}
+def nameless(model: mujoco.MjModel, tops: set[int]) -> list[str]:
+    """What is to be said of bodies of which no geom that may touch what stands still has a name."""
     named: dict[int, bool] = {}
     for geom in range(model.ngeom):
         if (top := top_of(model, geom, tops)) and touched_by(model, geom):
@@ -311,7 +286,7 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
     """Unknowns as parameters of an environment; those that the model can not have are left out."""
     out = []
     for unknown in unknowns:
-        values = [bind(model, target).value for target in unknown.targets]
+        values = [0.0 if of_sensor(target) else bind(model, target).value for target in unknown.targets]
         own = values[0] if np.isfinite(values[0]) else None
         if unknown.relative:
             if own:

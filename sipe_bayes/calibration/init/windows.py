@@ -13,15 +13,16 @@ from sipe_bayes.calibration.config_fields import ConfigError, one_line
 from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.init.decisions import Layout
 from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
-from sipe_bayes.calibration.init.machine import Drive, Machine
+from sipe_bayes.calibration.init.machine import Drive, Machine, Sizes
 from sipe_bayes.calibration.init.trials import Trial
-from sipe_bayes.calibration.init.unknowns import Sizes, as_parameters, candidates
+from sipe_bayes.calibration.init.unknowns import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.channels import Channel
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 
-FEW, MANY = 12, 60
-"""Windows: for what is clear at once, and for delays and unknowns."""
+FEW, SOME, MANY = 12, 30, 60
+"""Windows: for what is clear at once, for zeros, and for delays and unknowns."""
 _SAMPLES = 20_000  # of a log that are looked at
 _DELAYS = (0, 1, 2, 3, 4, 6, 8, 12, 16)
 _LATEST = 0.2  # s, of a delay
@@ -86,7 +87,8 @@ def trial_of(
     channels = [Channel(*channel) for m in config.measurements for channel in m.channels]
     actuators = [c.actuator for c in config.commands]
     parameters = as_parameters(model, draft.unknowns)
-    trial = Trial(str(config.model), parameters, actuators, channels, logs, windows, share_of(machine))
+    environment = MjcfEnvironment.build(str(config.model), parameters, actuators, channels)
+    trial = Trial(environment, logs, windows, share_of(machine))
     places, at = [], 0
     for m in config.measurements:
         places.append(tuple(range(at, at + len(m.channels))))

@@ -87,7 +87,8 @@ def _said(reading: Reading) -> str:
     columns = ", ".join(reading.match.columns)
     sign = "-" if reading.sign < 0 else ""
     unit = f"quaternion {reading.match.quaternion}" if reading.match.quaternion else f"{sign}{reading.unit}"
-    extra = ", wraps" * reading.wraps + ", starts windows only" * (not reading.fit)
+    extra = f", zero {reading.zero:.4g}" * bool(reading.zero) + ", wraps" * reading.wraps
+    extra += ", starts windows only" * (not reading.fit)
     return _short(f"{reading.match.target} <- {columns} [{unit}]{extra}")
 
 
