@@ -2,6 +2,10 @@
 
 Every extension is simulated a small step away from the plain model, from the same starts. Those that need no more than
 parameters are simulated in one batch, laws and those that change the model's states each by itself.
+
+Where a parameter of the model does about the same as an extension (its ``imitators``: a delay beside a lag), a small
+step shows nothing but what that parameter explains. A probe then goes as far as it can take from the parameter what it
+adds, and what that changes grows about with the square of how far it goes: a trade.
 """
 
 from __future__ import annotations
@@ -15,11 +19,12 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.extension import Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -35,11 +40,13 @@ class Effect:
         placed: which.
         change: (W, L, C, K) of the predictions along each of its probes; a share of one gives a share of it.
         probes: theta (K, P) of these probes.
+        trades: (K, N) by which they change theta itself: a trade's size then goes with the root of its share.
     """
 
     placed: Placed
     change: FloatArray
     probes: FloatArray
+    trades: FloatArray
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,7 @@ class Probe:
         by_log: whether it is of one log alone.
         site: where it is.
         whole: its size where the number that it changes is as large again; nan where that has no tolerance.
+        trade: (N,) by which it changes theta itself at size 1, and with the root of any other; none where not at all.
     """
 
     name: str
@@ -59,6 +67,7 @@ class Probe:
     by_log: bool = False
     site: str = ""
     whole: float = math.nan
+    trade: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,7 @@ class _Change:
     number: int
     change: FloatArray
     probes: FloatArray
+    trades: FloatArray
 
 
 def probes_cost(windows: Windows, theta: FloatArray) -> int:
@@ -127,6 +137,9 @@ def _named(effect: Effect) -> list[Probe]:
     what = "a parameter" if len(targets) == 1 else "parameters"
     by_log = any(parameter.log is not None for parameter in placed.parameters)
     probe = Probe(placed.sentence, f"make {' and '.join(targets)} {what} (or widen its bounds)", by_log, placed.site)
+    if effect.trades.any():
+        sized = effect.trades / np.sqrt(_size(effect.change))[:, None]
+        return [replace(probe, trade=tuple(row)) for row in sized.tolist()]
     if not placed.extension.tolerance:
         return [probe] * len(effect.probes)
     (parameter,), steps = placed.parameters, (effect.probes - placed.plain)[:, 0]
@@ -166,14 +179,14 @@ def effects(
     def changes(group: list[Placed], kept: Kept) -> tuple[_Change, ...]:
         seen = _of_group(windows, theta, starts, group)
         number = {id(one): k for k, one in enumerate(group)}
-        return tuple(_Change(number[id(effect.placed)], effect.change, effect.probes) for effect in seen)
+        return tuple(_Change(number[id(e.placed)], e.change, e.probes, e.trades) for e in seen)
 
     out: list[Effect] = []
     groups = _groups(placed)
     for number, group in enumerate(groups):
         tell(f"simulating what extensions would do, {number + 1} of {len(groups)}")
         made = kept.of(f"extensions-{number}", tuple[_Change, ...], partial(changes, group))
-        out += [Effect(group[one.number], one.change, one.probes) for one in made]
+        out += [Effect(group[one.number], one.change, one.probes, one.trades) for one in made]
     return out
 
 
@@ -182,7 +195,8 @@ def _groups(placed: Sequence[Placed]) -> list[list[Placed]]:
     groups: dict[str, list[Placed]] = {}
     for one in placed:
         # a law costs steps of its own, an edit the cube's other models: these are simulated by themselves
-        key = "" if one.edit is None and one.extension.native else one.label
+        together = one.edit is None and one.extension.native and len(members(one.site)) == 1
+        key = "" if together else one.label
         if any(parameter.log is not None for parameter in one.parameters):
             key = key or "by log"  # which writes what others write for all logs
         groups.setdefault(key, []).append(one)
@@ -220,12 +234,14 @@ def _simulated(
     bound = Windows(windows.settings, simulator, windows.trajectories, windows)
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
-    for one in group:
-        for probe in one.probes.reshape(-1, len(one.plain)):
+    tried = [_traded(windows.simulator.space, theta, one) for one in group]
+    for probes, trade in tried:
+        for probe in probes.reshape(-1, probes.shape[-1]):
             row = plain.copy()
+            row[: len(theta)] += trade
             row[first : first + len(probe)] = probe
             rows.append(row)
-        first += len(one.plain)
+        first += probes.shape[-1]
     mapped = mapped_starts(windows.simulator.model, simulator.model, starts)
     pieces = np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS))
     runs = []
@@ -235,13 +251,28 @@ def _simulated(
     predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
     windows.rollouts += bound.rollouts
     out, at = [], 1
-    for one in group:
-        for shape in one.probes:
+    for one, (probes, trade) in zip(group, tried, strict=True):
+        for shape in probes:
             mine = np.arange(at, at + len(shape))
             at += len(shape)
             with np.errstate(invalid="ignore"):
                 change = np.where(windows.observed, predicted[mine] - predicted[0], 0.0)
             use = valid[mine] & np.isfinite(change).all((1, 2, 3)) & (np.abs(change).max((1, 2, 3)) > 0)
             if valid[0] and use.any():
-                out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use]))
+                trades = np.tile(trade, (int(use.sum()), 1))
+                out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use], trades))
     return out
+
+
+def _traded(space: ParameterSpace, theta: FloatArray, one: Placed) -> tuple[FloatArray, FloatArray]:
+    """An extension's probes (G, K, P) and what they take from theta (N,): of a trade one, as far as it can go."""
+    trade, k = np.zeros_like(theta), imitating(one.extension, one.site, tuple(space))
+    if k is None or len(one.parameters) != 1:
+        return one.probes, trade
+    (own,), value = one.parameters, float(space[k].value(theta[k]))
+    begin = float(own.value(one.plain[0]))
+    step = min(value - space[k].low, own.high - begin)
+    if step < float(own.value(one.probes.flat[0])) - begin:
+        return one.probes, trade
+    trade[k] = float(space[k].normalise(value - step)) - theta[k]
+    return np.array([[[float(own.normalise(begin + step))]]]), trade

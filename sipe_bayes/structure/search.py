@@ -43,7 +43,7 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates
 from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, unexplained
-from sipe_bayes.structure.extension import Extension, Placed, placements
+from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.rivals import rivals
@@ -177,7 +177,7 @@ class StructureSearch:
         self._machine = machine_of(windows, plain.theta, plain.starts)
         every = (p for e in self.extensions for p in placements(e, self._machine))
         allowed = None if self.joints is None else set(self.joints)
-        self._placed = {p.label: p for p in every if allowed is None or p.site in allowed}
+        self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
@@ -235,7 +235,7 @@ class StructureSearch:
         if len(state.present) >= self.options.most:
             return replace(state, phase=Phase.PRUNE)
         ranked = self._ranked(here, last_resort=False)
-        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
+        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if state.of([*state.present, c.placed.label]) is None]
         queue = tuple(c.placed.label for c in self._worth(untried))
@@ -265,7 +265,7 @@ class StructureSearch:
     def _fit(self, state: DiscoverState) -> DiscoverState:
         label, *rest = state.queue
         offer = next(o for o in reversed(state.offers) if o.label == label and o.at == state.present)
-        state = self._fitted(state, (*state.present, label), np.concatenate([state.here.theta, offer.theta]))
+        state = self._fitted(state, (*state.present, label), np.concatenate([offer.others, offer.theta]))
         state = replace(state, queue=tuple(rest))
         if rest:
             return state
@@ -353,7 +353,7 @@ class StructureSearch:
 
     def _residual(self, state: DiscoverState) -> DiscoverState:
         ranked = self._ranked(state.here, last_resort=True)
-        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
+        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         state = replace(state, offers=state.offers + offers)
         if ranked and ranked[0].gain > self.cost + self.options.least_gain:
             labels = (*state.present, ranked[0].placed.label)

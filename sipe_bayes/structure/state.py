@@ -34,12 +34,14 @@ class Offer:
         label: of the extension.
         gain: promised log-likelihood in nats.
         theta: (P,), where its parameters are to start.
+        others: (N,), where those of the structure then are to.
     """
 
     at: tuple[str, ...]
     label: str
     gain: float
     theta: FloatArray
+    others: FloatArray
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,16 @@ class ProbedLogs:
             out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
         return out
 
+    def traded(self, sizes: FloatArray) -> FloatArray:
+        """By how much sizes (..., K) of the probes change theta itself (..., N), where they trade with it."""
+        return np.sqrt(np.maximum(sizes, 0.0)) @ self._trades
+
+    @functools.cached_property
+    def _trades(self) -> FloatArray:
+        """(K, N) of each probe at size 1."""
+        nothing = (0.0,) * self.windows.num_theta
+        return np.array([probe.trade or nothing for probe in self.probes]).reshape(-1, len(nothing))
+
     def moments(self, columns: IntArray) -> Moments:
         """Products of the logs' own residual with some columns of theta and probes, and the starts."""
         starts = np.arange(self.count, self.jacobian.shape[-1])
