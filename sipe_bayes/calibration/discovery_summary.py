@@ -41,6 +41,7 @@ from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.state import Phase
 from sipe_bayes.structure.structures import Structures
 
+_NAMED = 3  # of what was not tried
 _LARGER = 2  # times the budget that did not reach: what to try next
 _BEFORE = {
     Phase.COLUMNS: "any piece was tried",
@@ -105,10 +106,25 @@ def _budget_spent(structures: Structures) -> list[Finding]:
     state, budget, noticed = structures.state, structures.search.budget, []
     about = functools.partial(finding, budget=budget, larger=_LARGER * budget)
     if state.cut in _BEFORE:
-        noticed.append(about(Code.STRUCTURES_CUT_SHORT, before=_BEFORE[state.cut]))
+        noticed.append(about(Code.STRUCTURES_CUT_SHORT, before=_BEFORE[state.cut], untried=_untried(structures)))
     if state.untried:
         noticed.append(about(Code.COLUMNS_UNTRIED, count=len(state.untried), example=state.untried[0].sentence))
     return noticed
+
+
+def _untried(structures: Structures) -> str:
+    """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
+    state, search = structures.state, structures.search
+    if state.cut is Phase.FIT:
+        names = [search.placed[label].sentence for label in state.queue]
+    elif state.cut in (Phase.COLUMNS, Phase.RANK):
+        names = [one.sentence for one in search.placed.values() if one.label not in state.present]
+    else:
+        names = []
+    if not names:
+        return ""
+    more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+    return f" (left open: {'; '.join([*names[:_NAMED], *more])})"
 
 
 def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:

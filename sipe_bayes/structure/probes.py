@@ -232,6 +232,7 @@ def _simulated(
 ) -> list[Effect]:
     """Effects of extensions that the simulator's model has."""
     bound = Windows(windows.settings, simulator, windows.trajectories, windows)
+    bound.budget = windows.budget - windows.rollouts
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
     tried = [_traded(windows.simulator.space, theta, one) for one in group]
@@ -245,11 +246,13 @@ def _simulated(
     mapped = mapped_starts(windows.simulator.model, simulator.model, starts)
     pieces = np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS))
     runs = []
-    for piece in pieces:
-        begun = carried_starts(windows.simulator.model, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
-        runs.append(bound.predict(piece, begun))
+    try:
+        for piece in pieces:
+            begun = carried_starts(windows.simulator.model, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
+            runs.append(bound.predict(piece, begun))
+    finally:
+        windows.rollouts += bound.rollouts
     predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
-    windows.rollouts += bound.rollouts
     out, at = [], 1
     for one, (probes, trade) in zip(group, tried, strict=True):
         for shape in probes:
