@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +37,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
+from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.state import Phase
 from sipe_bayes.structure.structures import Structures
@@ -67,7 +68,10 @@ def summarise(
         seconds: that the search took.
         tell: called with what is being done.
     """
-    before, after = (_Model(problem, structures, one, tell) for one in (structures.plain, structures.best))
+    after = _Model(problem, structures, structures.best, tell)
+    before = after
+    if structures.best is not structures.plain:  # whose intervals are not asked for
+        before = _Model(problem, structures, structures.plain, tell, structures.search.extensions)
     logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
     compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
     averaged = Marginals.of(structures.posterior, problem.prior, seed)
@@ -138,12 +142,16 @@ def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True)
 class _Model:
-    """A fitted structure bound to the problem's logs."""
+    """A fitted structure bound to the problem's logs.
+
+    extensions: that its residuals are compared with; default all that the registry has.
+    """
 
     problem: Problem
     structures: Structures
     one: FittedStructure
     tell: Tell
+    extensions: Sequence[Extension] | None = None
 
     def windows(self, logs: Trajectories) -> Windows:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
@@ -175,7 +183,9 @@ class _Model:
         windows = fitting.windows(self.structures.simulator(one))
         prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
         try:
-            return ProbedLogs(windows, one.theta, one.noise, one.starts, prior, tell=self.tell)
+            return ProbedLogs(
+                windows, one.theta, one.noise, one.starts, prior, tell=self.tell, extensions=self.extensions
+            )
         except ValueError:  # LinAlgError is one
             return None
 

@@ -24,7 +24,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Placed, extended, imitating, members, placements
+from sipe_bayes.structure.extension import Extension, Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -90,9 +90,14 @@ def probes_cost(windows: Windows, theta: FloatArray) -> int:
 
 
 def probes(
-    windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell = silent, kept: Kept = NOTHING_KEPT
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    tell: Tell = silent,
+    kept: Kept = NOTHING_KEPT,
+    extensions: Sequence[Extension] | None = None,
 ) -> tuple[list[Probe], FloatArray, BoolArray]:
-    """Probes of all extensions that the registry has; none where the environment is no user's MJCF.
+    """Probes of extensions; none where the environment is no user's MJCF.
 
     Args:
         windows: the logs, W windows of L samples and C channels.
@@ -100,6 +105,7 @@ def probes(
         starts: (W, D) of the windows.
         tell: called with what is being done.
         kept: keeps what extensions do, group by group.
+        extensions: default all that the registry has.
 
     Returns:
         The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
@@ -107,7 +113,7 @@ def probes(
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
-    seen = effects(windows, theta, starts, _placed(windows, theta, starts), tell, kept)
+    seen = effects(windows, theta, starts, _placed(windows, theta, starts, extensions), tell, kept)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     nothing = np.zeros((*windows.observed.shape, 0))
@@ -115,10 +121,13 @@ def probes(
     return named, changes, np.concatenate([np.zeros(0, bool), *one_sided])
 
 
-def _placed(windows: Windows, theta: FloatArray, starts: FloatArray) -> list[Placed]:
-    """All extensions that the registry has, but those of last resort, wherever they have a place."""
+def _placed(
+    windows: Windows, theta: FloatArray, starts: FloatArray, extensions: Sequence[Extension] | None = None
+) -> list[Placed]:
+    """Extensions, by default all that the registry has, but those of last resort, wherever they have a place."""
     machine = machine_of(windows, theta, starts)
-    every = (p for name in EXTENSIONS for p in placements(get_extension(name), machine))
+    chosen = (get_extension(name) for name in EXTENSIONS) if extensions is None else extensions
+    every = (p for extension in chosen for p in placements(extension, machine))
     return [p for p in every if not p.extension.last_resort]
 
 
