@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,10 +37,12 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
+from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.state import Phase
 from sipe_bayes.structure.structures import Structures
 
+_NAMED = 3  # of what was not tried
 _LARGER = 2  # times the budget that did not reach: what to try next
 _BEFORE = {
     Phase.COLUMNS: "any piece was tried",
@@ -66,7 +68,10 @@ def summarise(
         seconds: that the search took.
         tell: called with what is being done.
     """
-    before, after = (_Model(problem, structures, one, tell) for one in (structures.plain, structures.best))
+    after = _Model(problem, structures, structures.best, tell)
+    before = after
+    if structures.best is not structures.plain:  # whose intervals are not asked for
+        before = _Model(problem, structures, structures.plain, tell, structures.search.extensions)
     logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
     compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
     averaged = Marginals.of(structures.posterior, problem.prior, seed)
@@ -105,10 +110,25 @@ def _budget_spent(structures: Structures) -> list[Finding]:
     state, budget, noticed = structures.state, structures.search.budget, []
     about = functools.partial(finding, budget=budget, larger=_LARGER * budget)
     if state.cut in _BEFORE:
-        noticed.append(about(Code.STRUCTURES_CUT_SHORT, before=_BEFORE[state.cut]))
+        noticed.append(about(Code.STRUCTURES_CUT_SHORT, before=_BEFORE[state.cut], untried=_untried(structures)))
     if state.untried:
         noticed.append(about(Code.COLUMNS_UNTRIED, count=len(state.untried), example=state.untried[0].sentence))
     return noticed
+
+
+def _untried(structures: Structures) -> str:
+    """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
+    state, search = structures.state, structures.search
+    if state.cut is Phase.FIT:
+        names = [search.placed[label].sentence for label in state.queue]
+    elif state.cut in (Phase.COLUMNS, Phase.RANK):
+        names = [one.sentence for one in search.placed.values() if one.label not in state.present]
+    else:
+        names = []
+    if not names:
+        return ""
+    more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+    return f" (left open: {'; '.join([*names[:_NAMED], *more])})"
 
 
 def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:
@@ -122,12 +142,16 @@ def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True)
 class _Model:
-    """A fitted structure bound to the problem's logs."""
+    """A fitted structure bound to the problem's logs.
+
+    extensions: that its residuals are compared with; default all that the registry has.
+    """
 
     problem: Problem
     structures: Structures
     one: FittedStructure
     tell: Tell
+    extensions: Sequence[Extension] | None = None
 
     def windows(self, logs: Trajectories) -> Windows:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
@@ -159,7 +183,9 @@ class _Model:
         windows = fitting.windows(self.structures.simulator(one))
         prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
         try:
-            return ProbedLogs(windows, one.theta, one.noise, one.starts, prior, tell=self.tell)
+            return ProbedLogs(
+                windows, one.theta, one.noise, one.starts, prior, tell=self.tell, extensions=self.extensions
+            )
         except ValueError:  # LinAlgError is one
             return None
 

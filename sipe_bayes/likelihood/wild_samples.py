@@ -46,6 +46,7 @@ class WildOptions(Options):
 
 
 WILD = WildOptions()
+_NO_EDGES = np.zeros(0, np.int64)
 
 
 def jumps(values: FloatArray) -> IntArray:
@@ -103,7 +104,8 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
         for number in np.unique(log[at]):
             first, past = np.searchsorted(log, [number, number + 1])
             own, rows = at[(at >= first) & (at < past)] - first, series[first:past, None]
-            wild[first:past] = _away(rows, own, WILD.longest)
+            edges = np.flatnonzero(np.diff(sequence.window[first:past]))  # there a start of its own moves a residual
+            wild[first:past] = _away(rows, own, WILD.longest, edges)
             own, longest = sudden[(sudden >= first) & (sudden < past)] - first, int(WILD.longest_share * len(rows))
             wild[first:past] |= _away(rows, own, max(longest, WILD.longest))
         if wild.any() and wild.sum() <= WILD.most * len(index):
@@ -137,8 +139,11 @@ def _least(windows: Windows, channel: int) -> float:
     return WILD.residual_share if column <= model.nq else WILD.velocity_share
 
 
-def _away(rows: FloatArray, at: IntArray, longest: int) -> BoolArray:
-    """Which of rows (n, K) lie between a jump ``at`` k -> k + 1 and the one that comes home, or at an end."""
+def _away(rows: FloatArray, at: IntArray, longest: int, edges: IntArray = _NO_EDGES) -> BoolArray:
+    """Which of rows (n, K) lie between a jump ``at`` k -> k + 1 and the one that comes home, or at an end.
+
+    A jump at one of ``edges`` alone puts nothing away.
+    """
     away = np.zeros(len(rows), bool)
     here = 0
     while here < len(at):
@@ -148,6 +153,8 @@ def _away(rows: FloatArray, at: IntArray, longest: int) -> BoolArray:
         if len(home):
             away[at[here] + 1 : later[home[0]] + 1] = True
             here += int(home[0]) + 1
+        elif at[here] in edges:
+            pass
         elif at[here] < WILD.longest and not away.any():
             away[: at[here] + 1] = True
         elif at[here] >= len(rows) - 1 - WILD.longest:

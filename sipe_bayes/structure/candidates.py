@@ -37,12 +37,14 @@ class Candidate:
         gain: log-likelihood that it is to gain, in nats.
         theta: (P,) its parameters where a fit is to start.
         amplitude: (K,) of its probes.
+        others: (N,) where the parameters beside it are to start.
     """
 
     placed: Placed
     gain: float
     theta: FloatArray
     amplitude: FloatArray
+    others: FloatArray
 
 
 def candidates(
@@ -115,13 +117,16 @@ class _Around:
             use &= ~wrong
             amplitude[:] = 0.0
         amplitude = np.clip(amplitude, low, high)
+        if effect.trades.any():  # what they change goes with the square of their size
+            amplitude = np.sqrt(amplitude)
+        others = np.clip(self.theta + amplitude @ effect.trades, 0.0, 1.0)
         size = np.abs(amplitude).sum()
         value = at + amplitude @ (probes - at)
         shaped = np.abs(probes - at).max(0) > _SHAPED  # what a probe had beside its size
         shaped |= (len(probes) > 1) & (np.ptp(probes, axis=0) == 0)
-        if size > 0:
+        if size > 0 and not effect.trades.any():
             value = np.where(shaped, np.abs(amplitude) / size @ probes, value)
-        return Candidate(effect.placed, level - plain.level, np.clip(value, *_INSIDE), amplitude)
+        return Candidate(effect.placed, level - plain.level, np.clip(value, *_INSIDE), amplitude, others)
 
     def fitted(self, change: FloatArray) -> _Fitted:
         """The best noise, and what the probes' changes (W, L, C, K) amount to with all else following."""

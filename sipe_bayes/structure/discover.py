@@ -93,7 +93,7 @@ def discover(
         likelihood: how logs are cut into windows; the noise is coloured whatever it says.
         restriction: which extensions may be tried, and where.
         options: of the search.
-        budget: rollouts of all fits.
+        budget: rollouts at most.
         seed: of the searches.
         checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits.
         progress: called along the way.

@@ -41,6 +41,7 @@ Kind = Literal["joint", "actuator", "body", "channel", "world"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PROBE = 0.03  # of a parameter's range, how far a probe goes: an effect that is still about linear
 WORLD = "world"  # the one site of an extension of the world
+_AND = " and "  # between the names of a site that is several
 
 
 class Extension(ABC):
@@ -76,6 +77,14 @@ class Extension(ABC):
         """What is changed in the MJCF, where parameters of it are not enough."""
         return None
 
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """Targets, in its one parameter's unit, that do about the same, such as a delay beside a lag; none by default.
+
+        Where one parameter of the model writes them, a probe takes from it what it adds: what is left to tell the two
+        apart grows with the square of that. Where one writes those of several sites, these are a site together.
+        """
+        return ()
+
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """Theta (K, P) of its P parameters at which it is tried: directions away from the plain model, their defaults.
 
@@ -85,6 +94,18 @@ class Extension(ABC):
         """
         plain = plain_theta(parameters)
         return plain + np.diag(np.where(plain > 1 - 2 * PROBE, -PROBE, PROBE))
+
+
+def members(site: str) -> tuple[str, ...]:
+    """The names of a site, of which one that is several has more than one."""
+    return tuple(site.split(_AND))
+
+
+def imitating(extension: Extension, site: str, parameters: Sequence[Parameter]) -> int | None:
+    """Number of the parameter that writes nothing but what imitates an extension at a site; None without one."""
+    alike = set(extension.imitators(site))
+    own = (k for k, p in enumerate(parameters) if p.targets and p.log is None and set(p.targets) <= alike)
+    return next(own, None)
 
 
 def plain_theta(parameters: Sequence[Parameter]) -> FloatArray:
@@ -98,7 +119,7 @@ class Placed:
 
     Args:
         extension: which.
-        site: name of the joint, actuator, body or channel; ``WORLD``.
+        site: name of the joint, actuator, body or channel, or of several that are moved alike; ``WORLD``.
         parameters: its unknowns, with the model's own values as defaults.
         edit: what it changes in the MJCF.
         probes: theta (G, K, P) at which it is tried, for each of G shapes.
@@ -150,7 +171,7 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
         "world": (WORLD,),
     }
     taken, count = machine.written(), len(machine.environment.parameters)
-    for site in sites[extension.kind]:
+    for site in (*sites[extension.kind], *_together(extension, sites[extension.kind], machine)):
         try:
             parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
             if not parameters or any(t in taken for p in parameters for t in p.targets):
@@ -172,6 +193,14 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
         except Exception as error:
             raise _failed(extension, site, error) from error
         yield Placed(extension, site, own, draft.edit, probes, wholes)
+
+
+def _together(extension: Extension, sites: tuple[str, ...], machine: Machine) -> Iterator[str]:
+    """Sites that the user takes to be alike: one parameter writes what imitates the extension there."""
+    for parameter in machine.environment.parameters:
+        alike = [site for site in sites if set(parameter.targets) & set(extension.imitators(site))]
+        if len(alike) > 1:
+            yield _AND.join(alike)
 
 
 def _with_own(machine: Machine, parameter: Parameter) -> Parameter:

@@ -136,8 +136,10 @@ class Fitting:
         """
         simulator = self.simulator(placed)
         prior = self.prior_of(simulator)
-        optimum = self._optimum(simulator, prior, self.trajectories, initial, budget, progress)
-        best, windows = optimum.best, self.windows(simulator)
+        windows = self.windows(simulator)
+        left = max(budget - _scoring(windows), 1)
+        optimum = self._optimum(simulator, prior, self.trajectories, initial, left, progress)
+        best = optimum.best
         both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         labels = tuple(one.label for one in placed)
         rollouts, settled = optimum.rollouts + windows.rollouts, best.finding is None
@@ -156,7 +158,12 @@ class Fitting:
         )
 
     def log_score(
-        self, placed: Sequence[Placed], one: FittedStructure, budget: int, progress: Progress | None = None
+        self,
+        placed: Sequence[Placed],
+        one: FittedStructure,
+        budget: int,
+        left: int,
+        progress: Progress | None = None,
     ) -> tuple[float | None, int]:
         """Log p of the held-out logs given the others, their noise estimated from themselves; and the rollouts.
 
@@ -167,15 +174,19 @@ class Fitting:
             placed: the structure's extensions.
             one: fitted to the other logs.
             budget: rollouts at most, or 300 of each log if that is more.
+            left: rollouts at most, however many logs.
             progress: called along the way.
         """
         assert self.holdout is not None
         simulator = self.simulator(placed)
         prior = GaussianMixture(torch.zeros(1), one.mean[None], one.covariance[None], simulator.space)
+        windows = Windows(self.likelihood, simulator, self.holdout)
+        most = min(max(budget, 300 * len(self.holdout)), left) - _scoring(windows)
+        if most < 1:
+            return None, 0
         try:
-            most = max(budget, 300 * len(self.holdout))
             optimum = self._optimum(simulator, prior, self.holdout, one.theta, most, progress)
-            windows, best = Windows(self.likelihood, simulator, self.holdout), optimum.best
+            best = optimum.best
             both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
         except BudgetTooSmall:
             return None, most  # so many at most
@@ -211,6 +222,11 @@ class Fitting:
         best = distinct(laplace.state.search.optima)[0]
         assert isinstance(best, WindowOptimum)
         return _Optimum(best, laplace.rollouts)
+
+
+def _scoring(windows: Windows) -> int:
+    """Rollouts that the scores of an optimum take."""
+    return (windows.num_theta + windows.num_start + 1) * len(windows.trajectories)
 
 
 @dataclass(frozen=True)

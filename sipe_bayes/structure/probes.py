@@ -2,6 +2,10 @@
 
 Every extension is simulated a small step away from the plain model, from the same starts. Those that need no more than
 parameters are simulated in one batch, laws and those that change the model's states each by itself.
+
+Where a parameter of the model does about the same as an extension (its ``imitators``: a delay beside a lag), a small
+step shows nothing but what that parameter explains. A probe then goes as far as it can take from the parameter what it
+adds, and what that changes grows about with the square of how far it goes: a trade.
 """
 
 from __future__ import annotations
@@ -15,11 +19,12 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Extension, Placed, extended, placements
+from sipe_bayes.structure.extension import Extension, Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -35,11 +40,13 @@ class Effect:
         placed: which.
         change: (W, L, C, K) of the predictions along each of its probes; a share of one gives a share of it.
         probes: theta (K, P) of these probes.
+        trades: (K, N) by which they change theta itself: a trade's size then goes with the root of its share.
     """
 
     placed: Placed
     change: FloatArray
     probes: FloatArray
+    trades: FloatArray
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,7 @@ class Probe:
         extension: that it is of.
         whole: its size where the number that it changes is off by all that a tolerance is a share of; nan where logs
             alone tell that number.
+        trade: (N,) by which it changes theta itself at size 1, and with the root of any other; none where not at all.
     """
 
     name: str
@@ -62,6 +70,7 @@ class Probe:
     site: str = ""
     extension: Extension | None = None
     whole: float = math.nan
+    trade: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,6 +80,7 @@ class _Change:
     number: int
     change: FloatArray
     probes: FloatArray
+    trades: FloatArray
 
 
 def probes_cost(windows: Windows, theta: FloatArray) -> int:
@@ -83,9 +93,14 @@ def probes_cost(windows: Windows, theta: FloatArray) -> int:
 
 
 def probes(
-    windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell = silent, kept: Kept = NOTHING_KEPT
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    tell: Tell = silent,
+    kept: Kept = NOTHING_KEPT,
+    extensions: Sequence[Extension] | None = None,
 ) -> tuple[list[Probe], FloatArray, BoolArray]:
-    """Probes of all extensions that the registry has; none where the environment is no user's MJCF.
+    """Probes of extensions; none where the environment is no user's MJCF.
 
     Args:
         windows: the logs, W windows of L samples and C channels.
@@ -93,6 +108,7 @@ def probes(
         starts: (W, D) of the windows.
         tell: called with what is being done.
         kept: keeps what extensions do, group by group.
+        extensions: default all that the registry has.
 
     Returns:
         The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
@@ -100,7 +116,7 @@ def probes(
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
-    seen = effects(windows, theta, starts, _placed(windows, theta, starts), tell, kept)
+    seen = effects(windows, theta, starts, _placed(windows, theta, starts, extensions), tell, kept)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     nothing = np.zeros((*windows.observed.shape, 0))
@@ -108,10 +124,13 @@ def probes(
     return named, changes, np.concatenate([np.zeros(0, bool), *one_sided])
 
 
-def _placed(windows: Windows, theta: FloatArray, starts: FloatArray) -> list[Placed]:
-    """All extensions that the registry has, but those of last resort, wherever they have a place."""
+def _placed(
+    windows: Windows, theta: FloatArray, starts: FloatArray, extensions: Sequence[Extension] | None = None
+) -> list[Placed]:
+    """Extensions, by default all that the registry has, but those of last resort, wherever they have a place."""
     machine = machine_of(windows, theta, starts)
-    every = (p for name in EXTENSIONS for p in placements(get_extension(name), machine))
+    chosen = (get_extension(name) for name in EXTENSIONS) if extensions is None else extensions
+    every = (p for extension in chosen for p in placements(extension, machine))
     return [p for p in every if not p.extension.last_resort]
 
 
@@ -131,6 +150,9 @@ def _named(effect: Effect) -> list[Probe]:
     by_log = any(parameter.log is not None for parameter in placed.parameters)
     remedy = f"make {' and '.join(targets)} {what} (or widen its bounds)"
     probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension)
+    if effect.trades.any():
+        sized = effect.trades / np.sqrt(_size(effect.change))[:, None]
+        return [replace(probe, trade=tuple(row)) for row in sized.tolist()]
     if not placed.wholes:
         return [probe] * len(effect.probes)
     ranges = np.array([parameter.high - parameter.low for parameter in placed.parameters])
@@ -169,14 +191,14 @@ def effects(
     def changes(group: list[Placed], kept: Kept) -> tuple[_Change, ...]:
         seen = _of_group(windows, theta, starts, group)
         number = {id(one): k for k, one in enumerate(group)}
-        return tuple(_Change(number[id(effect.placed)], effect.change, effect.probes) for effect in seen)
+        return tuple(_Change(number[id(e.placed)], e.change, e.probes, e.trades) for e in seen)
 
     out: list[Effect] = []
     groups = _groups(placed)
     for number, group in enumerate(groups):
         tell(f"simulating what extensions would do, {number + 1} of {len(groups)}")
         made = kept.of(f"extensions-{number}", tuple[_Change, ...], partial(changes, group))
-        out += [Effect(group[one.number], one.change, one.probes) for one in made]
+        out += [Effect(group[one.number], one.change, one.probes, one.trades) for one in made]
     return out
 
 
@@ -185,7 +207,8 @@ def _groups(placed: Sequence[Placed]) -> list[list[Placed]]:
     groups: dict[str, list[Placed]] = {}
     for one in placed:
         # a law costs steps of its own, an edit the cube's other models: these are simulated by themselves
-        key = "" if one.edit is None and one.extension.native else one.label
+        together = one.edit is None and one.extension.native and len(members(one.site)) == 1
+        key = "" if together else one.label
         if any(parameter.log is not None for parameter in one.parameters):
             key = key or "by log"  # which writes what others write for all logs
         groups.setdefault(key, []).append(one)
@@ -221,30 +244,50 @@ def _simulated(
 ) -> list[Effect]:
     """Effects of extensions that the simulator's model has."""
     bound = Windows(windows.settings, simulator, windows.trajectories, windows)
+    bound.budget = windows.budget - windows.rollouts
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
-    for one in group:
-        for probe in one.probes.reshape(-1, len(one.plain)):
+    tried = [_traded(windows.simulator.space, theta, one) for one in group]
+    for probes, trade in tried:
+        for probe in probes.reshape(-1, probes.shape[-1]):
             row = plain.copy()
+            row[: len(theta)] += trade
             row[first : first + len(probe)] = probe
             rows.append(row)
-        first += len(one.plain)
+        first += probes.shape[-1]
     mapped = mapped_starts(windows.simulator.model, simulator.model, starts)
     pieces = np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS))
     runs = []
-    for piece in pieces:
-        begun = carried_starts(windows.simulator.model, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
-        runs.append(bound.predict(piece, begun))
+    try:
+        for piece in pieces:
+            begun = carried_starts(windows.simulator.model, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
+            runs.append(bound.predict(piece, begun))
+    finally:
+        windows.rollouts += bound.rollouts
     predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
-    windows.rollouts += bound.rollouts
     out, at = [], 1
-    for one in group:
-        for shape in one.probes:
+    for one, (probes, trade) in zip(group, tried, strict=True):
+        for shape in probes:
             mine = np.arange(at, at + len(shape))
             at += len(shape)
             with np.errstate(invalid="ignore"):
                 change = np.where(windows.observed, predicted[mine] - predicted[0], 0.0)
             use = valid[mine] & np.isfinite(change).all((1, 2, 3)) & (np.abs(change).max((1, 2, 3)) > 0)
             if valid[0] and use.any():
-                out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use]))
+                trades = np.tile(trade, (int(use.sum()), 1))
+                out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use], trades))
     return out
+
+
+def _traded(space: ParameterSpace, theta: FloatArray, one: Placed) -> tuple[FloatArray, FloatArray]:
+    """An extension's probes (G, K, P) and what they take from theta (N,): of a trade one, as far as it can go."""
+    trade, k = np.zeros_like(theta), imitating(one.extension, one.site, tuple(space))
+    if k is None or len(one.parameters) != 1:
+        return one.probes, trade
+    (own,), value = one.parameters, float(space[k].value(theta[k]))
+    begin = float(own.value(one.plain[0]))
+    step = min(value - space[k].low, own.high - begin)
+    if step < float(own.value(one.probes.flat[0])) - begin:
+        return one.probes, trade
+    trade[k] = float(space[k].normalise(value - step)) - theta[k]
+    return np.array([[[float(own.normalise(begin + step))]]]), trade

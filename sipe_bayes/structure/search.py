@@ -40,16 +40,16 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import BudgetTooSmall
+from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates
 from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, unexplained
-from sipe_bayes.structure.extension import Extension, Placed, placements
+from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.rivals import rivals
 from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
 
-BUDGET = 30_000  # rollouts of all fits by default: structures with two pieces of a machine with two joints
+BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine with two joints
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ class DiscoverOptions(Options):
     column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
     column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
+    plain_share: float = option(0.5, "of the budget, for the model as it is at most", above=0, below=1)
     fit_budget: int = option(2000, "rollouts of one fit", least=1)
     physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
 
@@ -80,7 +81,7 @@ class StructureSearch:
         extensions: that may be used.
         joints: names of joints, actuators and channels at which they may be placed; default all.
         options: of the search.
-        budget: rollouts of all fits.
+        budget: rollouts at most.
         progress: called along the way.
     """
 
@@ -177,11 +178,11 @@ class StructureSearch:
         self._machine = machine_of(windows, plain.theta, plain.starts)
         every = (p for e in self.extensions for p in placements(e, self._machine))
         allowed = None if self.joints is None else set(self.joints)
-        self._placed = {p.label: p for p in every if allowed is None or p.site in allowed}
+        self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
-        plain, _ = self._try([])
+        plain, _ = self._try([], min(self.options.fit_budget, int(self.options.plain_share * self.budget)))
         return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS)
 
     def _columns(self, state: DiscoverState) -> DiscoverState:
@@ -202,7 +203,7 @@ class StructureSearch:
         while number < len(columns) and spent + options.column_budget <= most:
             column, number = columns[number], number + 1
             self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"
-            one, rollouts = self._try([column])
+            one, rollouts = self._try([column], options.column_budget)
             spent += rollouts
             if one is not None:
                 tried.append((self._of_given(one, [column]), column, one))
@@ -216,13 +217,17 @@ class StructureSearch:
         # evidences are in the corrected logs' units from here on
         return replace(state, fitted=(best[2],), columns=(best[1],), column_rollouts=spent)
 
-    def _try(self, columns: Sequence[Column]) -> tuple[FittedStructure | None, int]:
-        """The plain model fitted to logs with columns multiplied, None where it cannot be; and the rollouts."""
-        budget = self.options.column_budget if columns else self.options.fit_budget
+    def _try(self, columns: Sequence[Column], budget: int) -> tuple[FittedStructure | None, int]:
+        """The plain model fitted to logs with columns multiplied, None where it cannot be; and the rollouts.
+
+        Raises BudgetTooSmall for the logs as they are.
+        """
         self._rollouts, self._fit_rollouts = self._rollouts + self._fit_rollouts, 0
         try:
-            one = self.given.corrected(columns).fit([], None, budget, self._tell)
-        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError):
+            one = self.given.corrected(columns).fit([], None, max(budget, 1), self._tell)
+        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
+            if not columns and isinstance(error, BudgetTooSmall):
+                raise
             return None, self._fit_rollouts  # as far as it told
         return one, one.rollouts
 
@@ -231,11 +236,12 @@ class StructureSearch:
         return one.evidence + log_jacobian(self.given.trajectories, columns)
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
-        here = state.here
         if len(state.present) >= self.options.most:
             return replace(state, phase=Phase.PRUNE)
-        ranked = self._ranked(here, last_resort=False)
-        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
+        state, ranked = self._ranked(state, last_resort=False)
+        if state.cut is not None:
+            return state
+        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if state.of([*state.present, c.placed.label]) is None]
         queue = tuple(c.placed.label for c in self._worth(untried))
@@ -248,8 +254,9 @@ class StructureSearch:
         level = (1 - self.options.tied) * ranked[0].gain if ranked else 0.0
         return ranked[:width] + [c for c in ranked[width : 2 * width] if c.gain >= level]
 
-    def _ranked(self, here: FittedStructure, last_resort: bool) -> list[Candidate]:
-        fitting, own = self.fitting, self.structure(here.labels)
+    def _ranked(self, state: DiscoverState, last_resort: bool) -> tuple[DiscoverState, list[Candidate]]:
+        """What the extensions promise, best first, and the state with what that took; cut where too little is left."""
+        here, fitting, own = state.here, self.fitting, self.structure(state.present)
         simulator = fitting.simulator(own)
         windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
         targets = {t for p in own for q in p.parameters for t in q.targets}
@@ -260,12 +267,25 @@ class StructureSearch:
             and p.extension.last_resort == last_resort
             and not targets & {t for q in p.parameters for t in q.targets}
         ]
-        return candidates(windows, here.theta, here.starts, here.noise, prior, rest, self._tell)
+        if not rest:
+            return state, []
+        windows.budget = self._left(state)
+        try:
+            ranked, cut = candidates(windows, here.theta, here.starts, here.noise, prior, rest, self._tell), None
+        except BudgetExhausted:
+            ranked, cut = [], state.phase
+        return replace(state, rank_rollouts=state.rank_rollouts + windows.rollouts, cut=cut), ranked
+
+    def _left(self, state: DiscoverState) -> int:
+        """Rollouts of the budget."""
+        return max(self.budget - state.rollouts, 0)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
         label, *rest = state.queue
         offer = next(o for o in reversed(state.offers) if o.label == label and o.at == state.present)
-        state = self._fitted(state, (*state.present, label), np.concatenate([state.here.theta, offer.theta]))
+        state = self._fitted(state, (*state.present, label), np.concatenate([offer.others, offer.theta]))
+        if state.cut is not None:
+            return state
         state = replace(state, queue=tuple(rest))
         if rest:
             return state
@@ -290,7 +310,8 @@ class StructureSearch:
         for each in (state.here, one) if self.fitting.holdout is not None else ():
             if state.judgement(each.labels) is None:
                 own = self.structure(each.labels)
-                log_score, rollouts = self.fitting.log_score(own, each, self.options.fit_budget, self._tell)
+                most = self.options.fit_budget, self._left(state)
+                log_score, rollouts = self.fitting.log_score(own, each, *most, self._tell)
                 state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
         return state
 
@@ -352,8 +373,10 @@ class StructureSearch:
         return replace(state, present=best.labels)
 
     def _residual(self, state: DiscoverState) -> DiscoverState:
-        ranked = self._ranked(state.here, last_resort=True)
-        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta) for c in ranked)
+        state, ranked = self._ranked(state, last_resort=True)
+        if state.cut is not None:
+            return state
+        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         state = replace(state, offers=state.offers + offers)
         if ranked and ranked[0].gain > self.cost + self.options.least_gain:
             labels = (*state.present, ranked[0].placed.label)
@@ -367,10 +390,11 @@ class StructureSearch:
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
-        left = min(self.options.fit_budget, self.budget - state.rollouts)
+        left = min(self.options.fit_budget, self._left(state))
         try:
             one = self.fitting.fit(self.structure(labels), initial, max(left, 1), self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             short = isinstance(error, BudgetTooSmall) and left < self.options.fit_budget
             return replace(state, failed=(*state.failed, labels), cut=state.phase if short else None)
-        return replace(state, fitted=(*state.fitted, one))
+        short = not one.settled and left < self.options.fit_budget
+        return replace(state, fitted=(*state.fitted, one), cut=state.phase if short else None)

@@ -34,12 +34,14 @@ class Offer:
         label: of the extension.
         gain: promised log-likelihood in nats.
         theta: (P,), where its parameters are to start.
+        others: (N,), where those of the structure then are to.
     """
 
     at: tuple[str, ...]
     label: str
     gain: float
     theta: FloatArray
+    others: FloatArray
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class DiscoverState:
         failed: labels of structures that could not be fitted.
         columns: of the logs that are multiplied, since then the plain model fits far better.
         column_rollouts: of the trials of signs and units.
+        rank_rollouts: of the rankings.
         untried: signs and units that their share of the budget did not reach.
         judged: what held-out logs say of structures.
         refused: labels of structures that they speak against.
@@ -87,6 +90,7 @@ class DiscoverState:
     failed: tuple[tuple[str, ...], ...] = ()
     columns: tuple[Column, ...] = ()
     column_rollouts: int = 0
+    rank_rollouts: int = 0
     untried: tuple[Column, ...] = ()
     judged: tuple[Judgement, ...] = ()
     refused: tuple[tuple[str, ...], ...] = ()
@@ -99,8 +103,8 @@ class DiscoverState:
 
     @property
     def rollouts(self) -> int:
-        """Of all fits, those with other signs and units among them, and of the looks at held-out logs."""
-        fits = sum(one.rollouts for one in self.fitted) + self.column_rollouts
+        """Of all fits, those with other signs and units among them, of rankings, and of looks at held-out logs."""
+        fits = sum(one.rollouts for one in self.fitted) + self.column_rollouts + self.rank_rollouts
         return fits + sum(one.rollouts for one in self.judged)
 
     def of(self, labels: Sequence[str]) -> FittedStructure | None:

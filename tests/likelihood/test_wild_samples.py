@@ -100,6 +100,19 @@ def test_noise_loses_no_sample() -> None:
         assert not len(wild_residuals(windows, coloured + 0.05 * np.sin(0.3 * np.arange(shape[1]))[:, None]))
 
 
+def test_where_a_short_last_window_starts_is_not_wild_and_what_jumps_within_one_is() -> None:
+    """Windows of a model that lacks something end far off; one of two samples has a start of its own, and follows."""
+    simulator = pendulums.pendulum()
+    recorded = pendulums.log(simulator, [0.6, 0.08], 3, steps=101)
+    windows = Windows(Segments(0.5), simulator, Trajectories.stack([recorded]))
+    assert windows.steps.tolist() == [50, 50, 1]
+    drift = np.linspace(0, 0.5, windows.observed.shape[1]) ** 2 * (windows.steps[:, None] > 1)
+    residual = drift[..., None] + np.random.default_rng(0).normal(0, 1e-3, windows.observed.shape)
+    assert not len(wild_residuals(windows, residual))
+    residual[1, 49] += 3.0  # the sample before the last window
+    assert wild_residuals(windows, residual).tolist() == [[0, 99, 0]]
+
+
 @pytest.mark.parametrize(("share", "size"), [(0.005, 0.15), (0.003, 20.0)])
 def test_a_fit_is_as_good_without_wild_samples(share: float, size: float) -> None:
     """Intervals as wide to 5 %, and where they were to .3 sd: what half a percent of the samples says."""

@@ -20,7 +20,7 @@ FRICTION = piece("friction", kept=True)
 LAW = piece("stribeck", kept=True, native=False, nearest="LuGre", parameters=("hinge.size", "hinge.speed"))
 GAINS = piece("gain", "motor", kept=True, parameters=tuple(f"motor.gain[{k}]" for k in range(6)))
 
-CUT = finding(Code.STRUCTURES_CUT_SHORT, budget=30000, larger=60000, before="any piece was tried")
+CUT = finding(Code.STRUCTURES_CUT_SHORT, budget=30000, larger=60000, before="any piece was tried", untried="")
 
 
 def changed(*pieces: Any, **changes: Any) -> Discovery:

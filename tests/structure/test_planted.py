@@ -35,7 +35,7 @@ class Plant:
 ELASTIC = Elastic(stiffest=200.0, idle=0.02, start=(0.1, 1.0))
 PLANTED = [
     Plant(
-        "lag:motor", {"actuator:motor.lag": 0.05}, ("offset", "dry_friction"), edits=(FilteredCommand("motor", 0.6),)
+        "lag:motor", {"actuator:motor.lag": 0.05}, ("offset", "dry_friction"), edits=(FilteredCommand(("motor",), 0.6),)
     ),
     Plant(
         "presliding:hinge",

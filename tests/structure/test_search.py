@@ -12,7 +12,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
 from sipe_bayes.structure.columns import choices, moving, unexplained
@@ -163,7 +163,7 @@ def test_columns_that_are_tried_in_vain_count() -> None:
     assert structures.rollouts >= done[-1] > 500
     assert structures.state.column_rollouts > 500 > structures.plain.rollouts
     of_fits = sum(one.rollouts for one in structures.fitted)
-    assert structures.rollouts == of_fits + structures.state.column_rollouts
+    assert structures.rollouts == of_fits + structures.state.column_rollouts + structures.state.rank_rollouts
 
 
 def test_signs_and_units_leave_the_budget_to_physics() -> None:
@@ -198,15 +198,21 @@ def test_the_least_explained_columns_are_tried_first() -> None:
     assert len(set(columns)) == len(columns) == 5 * 6
 
 
-def test_a_budget_that_ends_before_the_physics_is_no_settled_search() -> None:
+def test_a_budget_is_a_bound_and_where_it_ends_the_search_is_not_settled() -> None:
     recorded = Trajectories.stack([log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)])
     given = recorded, Restriction(only=("dry_friction",))
-    spent = discover(pendulum(), given[0], restriction=given[1], budget=1)
-    assert (spent.best.labels, spent.offers(), spent.settled) == ((), [], False)
-    assert spent.state.cut is Phase.COLUMNS
-    ranked = discover(pendulum(), given[0], restriction=given[1], budget=spent.rollouts + 2)
-    assert ranked.offers()
-    assert (len(ranked.fitted), ranked.settled, ranked.state.cut) == (1, False, Phase.FIT)
+    with pytest.raises(BudgetTooSmall, match="raise it"):
+        discover(pendulum(), given[0], restriction=given[1], budget=1)
+    cuts = []
+    for budget in (80, 110, 160, 240):
+        structures = discover(pendulum(), given[0], restriction=given[1], budget=budget)
+        cuts.append(structures.state.cut)
+        assert structures.rollouts <= budget
+        assert structures.offers()  # half of it is left to what the model may lack
+        assert structures.settled == (cuts[-1] in (None, Phase.RESIDUAL))
+    print(cuts)
+    assert cuts[0] is Phase.FIT
+    assert cuts[-1] in (None, Phase.RESIDUAL)
 
 
 @pytest.mark.parametrize("same", [True, False])

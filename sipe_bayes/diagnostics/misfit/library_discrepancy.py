@@ -23,7 +23,8 @@ theta flat and integrated out,
     p(r \mid t) &\propto |I + D S D|^{-1/2} e^{q' D (I + D S D)^{-1} D q / 2}, \qquad
     D = \operatorname{diag}(t / \sqrt{c_k S_{kk}}),
 
-b is then (half) normal, and moves theta by its linear answer. The interval widens as the evidence for a discrepancy
+b is then (half) normal, and moves theta by its linear answer, and by the trade of a probe that takes from theta what it
+adds (``structure.probes``), whose size is the root of b. The interval widens as the evidence for a discrepancy
 grows, no alarm decides, and it is hardly widened where the residuals show none.
 
 Deviations:
@@ -109,28 +110,25 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
     seen, n = logs.seen, logs.windows.num_theta
     whole, cross = logs.arrow.precision[n:, n:], logs.arrow.precision[n:, :n]
     information = whole - cross @ seen.answer
-    size, most = np.diag(information), np.diag(whole)
-    able = [not p.by_log and m > _NOTHING and s > IMITATED * m for p, s, m in zip(logs.probes, size, most, strict=True)]
+    size, full = np.diag(information), np.diag(whole)
+    able = [not p.by_log and f > _NOTHING and s > IMITATED * f for p, s, f in zip(logs.probes, size, full, strict=True)]
     kept = np.flatnonzero(able)
     if not len(kept):
         return None
     names = [logs.probes[k].name for k in kept]
     columns = Columns(names, information[np.ix_(kept, kept)], seen.score[kept], logs.one_sided[kept])
     drawn, _ = columns.draws(options, np.random.default_rng(seed))
-    moved = -seen.answer[:, kept]
-    return Discrepancy(drawn @ moved.T, _largest(names, drawn, moved, seen.variance, options))
+    sizes = np.zeros((len(drawn), len(logs.probes)))
+    sizes[:, kept] = drawn
 
+    def moved(name: str | None = None) -> FloatArray:
+        """Theta (M, N), by all extensions or by one."""
+        own = np.where([name in (None, probe.name) for probe in logs.probes], sizes, 0.0)
+        return np.asarray(logs.traded(own) - own @ seen.answer.T)
 
-def _largest(
-    names: Sequence[str], drawn: FloatArray, moved: FloatArray, variance: FloatArray, options: DiscrepancyOptions
-) -> tuple[str, ...]:
-    """Of the extensions, those that move theta most: draws (M, K), answers (N, K)."""
-    share = {}
-    for name in dict.fromkeys(names):
-        mine = np.array([other == name for other in names])
-        square = ((drawn[:, mine] @ moved[:, mine].T) ** 2).mean(0)
-        share[name] = float((square / np.maximum(variance, 1e-300)).sum())
-    return tuple(sorted(share, key=lambda name: -share[name])[: options.causes])
+    square = {name: (moved(name) ** 2).mean(0) / np.maximum(seen.variance, 1e-300) for name in dict.fromkeys(names)}
+    most = sorted(square, key=lambda name: -float(square[name].sum()))
+    return Discrepancy(moved(), tuple(most[: options.causes]))
 
 
 @dataclass(frozen=True)

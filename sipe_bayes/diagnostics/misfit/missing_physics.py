@@ -113,7 +113,7 @@ def missing_physics(
     if len(causes.kept):
         explained = causes.explain(logs, seed)
         corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
-        corrected = causes.widened(corrected, np.random.default_rng(seed))
+        corrected = causes.widened(logs, corrected, np.random.default_rng(seed))
         further = corrected if explained else _mixed(further, corrected)
     causes_named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
     if hidden is not None:
@@ -208,11 +208,14 @@ class _Causes:
         odd, largest = ((seen - middle) / spread).max(), ((null - middle) / spread).max(1)
         return bool((1 + (largest >= odd).sum()) / (1 + len(null)) > THRESHOLDS.misfit)
 
-    def widened(self, further: Particles, random: np.random.Generator) -> Particles:
-        """With what is not known of their sizes."""
+    def widened(self, logs: ProbedLogs, further: Particles, random: np.random.Generator) -> Particles:
+        """With what is not known of their sizes, and what they trade with theta."""
         theta = further.theta.numpy()
-        sizes = random.multivariate_normal(np.zeros(len(self.kept)), self.covariance, len(theta))
-        return Particles(np.clip(theta + sizes @ self.response.T, 0, 1), further.space, weights=further.weights.numpy())
+        away = random.multivariate_normal(np.zeros(len(self.kept)), self.covariance, len(theta))
+        sizes = np.tile(self.sizes(logs), (len(theta), 1))
+        sizes[:, self.kept] += away
+        theta = theta + away @ self.response.T + logs.traded(sizes)
+        return Particles(np.clip(theta, 0, 1), further.space, weights=further.weights.numpy())
 
 
 def sparse(

@@ -99,7 +99,8 @@ class _Named:
         before, after = ((x**2).sum((0, 1)) for x in (seen.left, explained))
         share = np.clip(1 - after / np.maximum(before, 1e-300), 0, 1)
         sd = np.sqrt(seen.variance) if self.sd is None else self.sd
-        shift = (np.clip(logs.theta + step[:n] - seen.step[:n], 0, 1) - logs.theta) / np.maximum(sd, 1e-12)
+        moved = step[:n] - seen.step[:n] + logs.traded(step[n:])
+        shift = (np.clip(logs.theta + moved, 0, 1) - logs.theta) / np.maximum(sd, 1e-12)
         causes = self._alike(probe, seen)
         cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
         return self._placed(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +27,7 @@ from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.probes import probes
 
 FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
@@ -101,6 +103,7 @@ class ProbedLogs:
         lin: at theta and starts, where it is known.
         tell: called with what is being done.
         kept: keeps what extensions do, and draws of the null.
+        extensions: that are probed; default all that the registry has.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -116,6 +119,7 @@ class ProbedLogs:
         lin: Linearisation | None = None,
         tell: Tell = silent,
         kept: Kept = NOTHING_KEPT,
+        extensions: Sequence[Extension] | None = None,
     ) -> None:
         some = spread_windows(windows, MISFIT.steps)
         if len(some) < windows.num_windows:
@@ -129,7 +133,7 @@ class ProbedLogs:
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
         self.tell, self.kept = tell, kept
-        self.probes, effects, self.one_sided = probes(windows, theta, starts, tell, kept)
+        self.probes, effects, self.one_sided = probes(windows, theta, starts, tell, kept, extensions)
         n = windows.num_theta
         parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
         self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
@@ -180,6 +184,16 @@ class ProbedLogs:
             column[s.index] = self.noise.sd[c] * flat
             out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
         return out
+
+    def traded(self, sizes: FloatArray) -> FloatArray:
+        """By how much sizes (..., K) of the probes change theta itself (..., N), where they trade with it."""
+        return np.sqrt(np.maximum(sizes, 0.0)) @ self._trades
+
+    @functools.cached_property
+    def _trades(self) -> FloatArray:
+        """(K, N) of each probe at size 1."""
+        nothing = (0.0,) * self.windows.num_theta
+        return np.array([probe.trade or nothing for probe in self.probes]).reshape(-1, len(nothing))
 
     def moments(self, columns: IntArray) -> Moments:
         """Products of the logs' own residual with some columns of theta and probes, and the starts."""

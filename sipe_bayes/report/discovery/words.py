@@ -80,12 +80,17 @@ def headline(discovery: Discovery) -> Verdict:
         f"{p.sentence}, {found_values(discovery, p)}, with probability {probability_text(p.probability)}"
         for p in discovery.kept
     ]
+    if kept and cut_short(discovery):
+        among = f"Of the {len(discovery.rows)} structures that were fitted before the budget was spent"
+        return Verdict("bad", f"{among}, the best has {'; and '.join(kept)} among these.")
     if kept:
         return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
     if not discovery.pieces and cut_short(discovery):
         return Verdict("bad", "The residuals are not noise; no piece was tried, so what the model lacks is not known.")
+    if cut_short(discovery):
+        return Verdict("bad", "The residuals are not noise; of what was fitted nothing is shown to be lacking yet.")
     tried = "no piece that was tried is shown to be" if alternatives(discovery) else "nothing that was tried is"
     return Verdict("bad", f"The residuals are not noise, and {tried} what the model lacks.")
 

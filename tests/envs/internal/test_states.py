@@ -19,7 +19,7 @@ from tests.problems.machines import MACHINES, environment
 def test_a_models_own_states_have_any_states_prior_and_declared_ones_theirs() -> None:
     spec = mujoco.MjSpec.from_string(MACHINES["double"].xml)
     declare_start(spec, "joint:elbow", [0.1, 2.0])
-    FilteredCommand("m2", 0.3)(spec)
+    FilteredCommand(("m2",), 0.3)(spec)
     declare_start(spec, "actuator:m2", [7.0])  # said already
     model = mujoco.MjModel.from_xml_string(spec.compile() and spec.to_xml())
     wide = np.array([10.0, 10.0, 100.0, 100.0, 10.0])
@@ -31,7 +31,7 @@ def test_a_models_own_states_have_any_states_prior_and_declared_ones_theirs() ->
 
 def test_windows_start_at_the_command_before_them() -> None:
     drive = MACHINES["double"]
-    simulator = Simulator(environment(drive, edits=[FilteredCommand("m2", 0.3)]), 1)
+    simulator = Simulator(environment(drive, edits=[FilteredCommand(("m2",), 0.3)]), 1)
     actions = np.random.default_rng(0).normal(size=(60, 2))
     run = simulator.rollout(np.full(1, 0.5), actions, simulator.default_state(), 0.008)
     channels = simulator.environment.channels

@@ -6,7 +6,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 
@@ -27,10 +27,14 @@ class Delay(Extension):
                 f"{site}.delay",
                 0.0,
                 min(0.1, 20 * machine.dt),
-                targets=(f"actuator:{site}.delay",),
+                targets=tuple(f"actuator:{name}.delay" for name in members(site)),
                 description="from command to force",
             ),
         )
+
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """A first-order lag."""
+        return tuple(f"actuator:{name}.lag" for name in members(site))
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """One sample, and at least two physics steps."""

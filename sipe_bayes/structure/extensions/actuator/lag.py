@@ -10,7 +10,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.internal.states import declare_start
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 _LONGEST, _SAMPLES = 0.2, 50  # seconds, or so many samples
@@ -19,24 +19,25 @@ _UNSETTLED = 0.3  # of the largest command: how far the filter may be from the l
 
 @dataclass(frozen=True)
 class FilteredCommand:
-    """An actuator that follows its command through a first-order lag, exactly integrated, none by default.
+    """Actuators that follow their commands through a first-order lag, exactly integrated, none by default.
 
     Args:
-        actuator: its name.
+        actuators: their names.
         unsettled: how far a window may start from the command before it.
     """
 
-    actuator: str
+    actuators: tuple[str, ...]
     unsettled: float
 
     def __call__(self, spec: mujoco.MjSpec) -> None:
-        """Give it the filter; raises ValueError for one that has dynamics of its own."""
-        actuator = spec.actuator(self.actuator)
-        if int(actuator.dyntype) != int(mujoco.mjtDyn.mjDYN_NONE):
-            raise ValueError(f"actuator {self.actuator!r}: has dynamics of its own; make its lag a parameter")
-        actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
-        actuator.dynprm = np.zeros(len(actuator.dynprm))
-        declare_start(spec, f"actuator:{self.actuator}", [self.unsettled])
+        """Give them the filter; raises ValueError for one that has dynamics of its own."""
+        for name in self.actuators:
+            actuator = spec.actuator(name)
+            if int(actuator.dyntype) != int(mujoco.mjtDyn.mjDYN_NONE):
+                raise ValueError(f"actuator {name!r}: has dynamics of its own; make its lag a parameter")
+            actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+            actuator.dynprm = np.zeros(len(actuator.dynprm))
+            declare_start(spec, f"actuator:{name}", [self.unsettled])
 
 
 class Lag(Extension):
@@ -56,14 +57,19 @@ class Lag(Extension):
                 f"{site}.lag",
                 0.0,
                 min(_LONGEST, _SAMPLES * machine.dt),
-                targets=(f"actuator:{site}.lag",),
+                targets=tuple(f"actuator:{name}.lag" for name in members(site)),
                 description="time constant from command to force",
             ),
         )
 
     def edit(self, machine: Machine, site: str) -> FilteredCommand:
         """The filter."""
-        return FilteredCommand(site, _UNSETTLED * (machine.commands[site] or 1.0))
+        names = members(site)
+        return FilteredCommand(names, _UNSETTLED * (max(machine.commands[name] for name in names) or 1.0))
+
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """A delay."""
+        return tuple(f"actuator:{name}.delay" for name in members(site))
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
         """One sample, and at least two physics steps."""

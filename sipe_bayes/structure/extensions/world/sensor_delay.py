@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 
@@ -28,7 +28,11 @@ class SensorDelay(Extension):
                 f"{site}.delay",
                 0.0,
                 min(0.1, 20 * machine.dt),
-                targets=(f"sensor:{site}.delay",),
+                targets=tuple(f"sensor:{name}.delay" for name in members(site)),
                 description="age of the measurement",
             ),
         )
+
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """A low-pass filter."""
+        return tuple(f"sensor:{name}.filter" for name in members(site))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 
@@ -28,7 +28,11 @@ class SensorFilter(Extension):
                 f"{site}.filter",
                 0.0,
                 min(0.1, 20 * machine.dt),
-                targets=(f"sensor:{site}.filter",),
+                targets=tuple(f"sensor:{name}.filter" for name in members(site)),
                 description="time constant of a low-pass filter",
             ),
         )
+
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """A delay."""
+        return tuple(f"sensor:{name}.delay" for name in members(site))
