@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Use
+from sipe_bayes.calibration.init.columns.match import Match
+from sipe_bayes.calibration.init.columns.names import Kind
 from sipe_bayes.calibration.init.machine import Drive, Machine
-from sipe_bayes.calibration.init.matching import Match
-from sipe_bayes.calibration.init.names import Kind
 from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]

@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
+from sipe_bayes.calibration.init.columns.match import Matches
+from sipe_bayes.calibration.init.columns.matching import match_columns
+from sipe_bayes.calibration.init.columns.names import TURNS, pieces_of
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
-from sipe_bayes.calibration.init.matching import Matches, match_columns
-from sipe_bayes.calibration.init.names import TURNS, pieces_of
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from sipe_bayes.calibration.init.columns.match import Match, Matches
+from sipe_bayes.calibration.init.columns.names import Kind, read_name
+from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
-from sipe_bayes.calibration.init.matching import Match, Matches
-from sipe_bayes.calibration.init.names import Kind, read_name
-from sipe_bayes.calibration.init.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit, unit_words

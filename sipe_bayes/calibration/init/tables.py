@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sipe_bayes.calibration.config_fields import listed
-from sipe_bayes.calibration.init.names import Kind, read_name
-from sipe_bayes.calibration.init.signals import time_unit
+from sipe_bayes.calibration.init.columns.names import Kind, read_name
+from sipe_bayes.calibration.init.columns.signals import time_unit
 from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.numbered import gathered, numbered

@@ -10,6 +10,7 @@ from itertools import takewhile
 import mujoco
 import numpy as np
 
+from sipe_bayes.calibration.init.columns.names import Kind
 from sipe_bayes.calibration.init.draft import Reading, Unknown
 from sipe_bayes.calibration.init.fits import Fit
 from sipe_bayes.calibration.init.machine import (
@@ -24,7 +25,6 @@ from sipe_bayes.calibration.init.machine import (
     top_of,
     touched_by,
 )
-from sipe_bayes.calibration.init.names import Kind
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.sensing import of_sensor
 from sipe_bayes.envs.targets import bind

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.draft import Draft, questions
 from sipe_bayes.calibration.init.machine import Machine
-from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.windows import rough_unknowns

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sipe_bayes.calibration.init.names import Kind, alike, read_name
+from sipe_bayes.calibration.init.columns.names import Kind, alike, read_name
 
 
 @pytest.mark.parametrize(

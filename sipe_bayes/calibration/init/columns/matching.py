@@ -3,72 +3,25 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy.optimize
 
+from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
+from sipe_bayes.calibration.init.columns.names import OF_BODIES, Kind, Label, alike, number_of, pieces_of, read_name
+from sipe_bayes.calibration.init.columns.signals import slope_of
+from sipe_bayes.calibration.init.columns.vectors import held_open, match_vectors
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
-from sipe_bayes.calibration.init.names import (
-    OF_BODIES,
-    Kind,
-    Label,
-    alike,
-    is_accelerometer,
-    is_gyro,
-    is_spin,
-    is_turn,
-    number_of,
-    pieces_of,
-    read_name,
-    two_ways,
-)
-from sipe_bayes.calibration.init.signals import slope_of
 from sipe_bayes.core.arrays import FloatArray
 
 Table = Mapping[str, FloatArray]
 Families = Mapping[str, list[Label]]
 
-_SURE = 1.0  # a score from which names alone decide
 _NEVER = -2.0
 _CALLED = 0.65  # how alike a column and a joint are, from which it is called after it
 _RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
-
-
-@dataclass(frozen=True)
-class Match:
-    """Columns that are taken for a quantity of the model; score: how well the names agree."""
-
-    columns: tuple[str, ...]
-    target: str
-    label: Label
-    score: float
-    quaternion: str = ""
-
-    @property
-    def column(self) -> str:
-        """The one column, or the first."""
-        return self.columns[0]
-
-    @property
-    def sure(self) -> bool:
-        """Whether names alone tell it."""
-        return self.score >= _SURE
-
-
-@dataclass(frozen=True)
-class Matches:
-    """Every quantity of the model that has a column; rivals: commands that would do as well; doubts: of all columns."""
-
-    positions: tuple[Match, ...]
-    velocities: tuple[Match, ...]
-    commands: tuple[Match, ...]
-    vectors: tuple[Match, ...]
-    rivals: tuple[Match, ...]
-    left: tuple[str, ...]
-    doubts: tuple[str, ...] = ()
 
 
 def match_columns(machine: Machine, table: Table) -> Matches:
@@ -76,17 +29,20 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     own = _own_words(machine)
     labels = [read_name(name, own) for name in table]
     labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
-    vectors, labels = _vectors(machine, labels)
-    vectors, open_vectors = _held_open(vectors)
+    vectors, labels = match_vectors(machine, labels)
+    vectors, open_vectors = held_open(vectors)
     labels, open_commands = _unravelled(machine, _called_as_joints(machine, labels), table)
     offsets = _ordinals(labels)
     positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
     velocities = _by_position(positions, _assigned(machine.joints, labels, Kind.VELOCITY, offsets), table)
     commands, rivals = _commands(machine, labels, offsets)
-    used = {c for m in (*positions, *velocities, *commands, *vectors) for c in m.columns}
+    forces = _forces(machine, labels, offsets, commands)
+    used = {c for m in (*positions, *velocities, *commands, *vectors, *forces) for c in m.columns}
     left = tuple(name for name in table if name not in used)
     doubts = (*open_vectors, *open_commands)
-    return Matches(tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts)
+    return Matches(
+        tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts, tuple(forces)
+    )
 
 
 def _own_words(machine: Machine) -> set[str]:
@@ -146,13 +102,13 @@ def _solved(scores: FloatArray) -> list[tuple[int, int]]:
 
 
 def _assigned(joints: Sequence[Joint], labels: Sequence[Label], kind: Kind, places: Mapping[str, int]) -> list[Match]:
-    """Columns of positions or velocities, each to the joint that it fits best."""
+    """Columns of positions, velocities or forces, each to the joint that it fits best."""
     labels = [label for label in labels if label.kind == kind]
     if not labels or not joints:
         return []
     scores = np.array([[_of_joint(x, j, places.get(x.column), len(joints)) for j in joints] for x in labels])
     scores += [[0.05 * x.measured - 0.002 * k] for k, x in enumerate(labels)]
-    word = "position" if kind == Kind.POSITION else "velocity"
+    word = {Kind.POSITION: "position", Kind.TORQUE: "force"}.get(kind, "velocity")
     alone = len(labels) == len(joints) == 1
     pairs = sorted(_solved(scores), key=lambda pair: pair[1])
     return [
@@ -164,7 +120,7 @@ def _assigned(joints: Sequence[Joint], labels: Sequence[Label], kind: Kind, plac
 def _surety(scores: FloatArray, i: int, j: int, alone: bool) -> float:
     """By how much a pair is better than the next best object for its column."""
     if alone:
-        return _SURE
+        return SURE
     others = np.delete(scores[i], j)
     return float(min(scores[i, j], scores[i, j] - others.max()) if others.size else scores[i, j] + 0.5)
 
@@ -221,13 +177,27 @@ def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, in
     commands, rivals = [], []
     for i, j in pairs:
         target = f"actuator:{actuators[j].name}"
-        surety = _surety(scores, i, j, False) if not alone else _SURE
+        surety = _surety(scores, i, j, False) if not alone else SURE
         commands.append(Match((labels[i].column,), target, labels[i], surety))
         for k in np.argsort(-scores[:, j]):
             free = k not in {i for i, _ in pairs}
             if free and scores[k, j] > max(scores[i, j] - _RIVAL, -0.5):
                 rivals.append(Match((labels[k].column,), target, labels[k], float(scores[k, j])))
     return commands, rivals
+
+
+def _forces(
+    machine: Machine, labels: Sequence[Label], places: Mapping[str, int], commands: Sequence[Match]
+) -> list[Match]:
+    """Columns of what actuators apply at joints, of those that another column commands."""
+    driven = {m.target: m.label for m in commands}
+    joints = [
+        a.joint for a in machine.actuators
+        if a.joint and (label := driven.get(f"actuator:{a.name}")) and label.kind != Kind.TORQUE
+    ]  # fmt: skip
+    taken = {label.column for label in driven.values()}
+    felt = [x for x in labels if x.kind == Kind.TORQUE and x.column not in taken and not x.commanded]
+    return _assigned(list(dict.fromkeys(joints)), felt, Kind.TORQUE, places)
 
 
 def _called_as_joints(machine: Machine, labels: list[Label]) -> list[Label]:
@@ -322,78 +292,3 @@ def _by_slopes(family: Sequence[Label], labels: Sequence[Label], table: Table) -
             elif any(slope_of(table[o], table[label.column]).share > 0.8 for o in others):
                 kinds[label.column] = Kind.VELOCITY
     return list(kinds.values())
-
-
-def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[Label]]:
-    """Poses of free bodies and readings of inertial sensors: groups of three or four columns; and what is left."""
-    groups: dict[str, list[Label]] = defaultdict(list)
-    for label in labels:
-        if label.axis or label.number is not None:
-            groups[label.vector if label.axis else label.stem].append(label)
-    out: list[Match] = []
-    taken: set[str] = set()
-    for wanted, size, target_of in _wanted(machine):
-        for stem, group in groups.items():
-            part = [x for x in group if x.column not in taken]
-            fitting = [x for x in part if wanted(x, stem)]
-            if len(fitting) != size:
-                continue
-            order = "xyz" if size == 3 else ("wxyz" if fitting[0].axis in ("w", "") else "xyzw")
-            if fitting[0].axis:
-                fitting = sorted(fitting, key=lambda x: order.index(x.axis))
-            else:
-                fitting = sorted(fitting, key=lambda x: x.number or 0)
-            target, score = target_of(stem)
-            if any(m.target == target for m in out):
-                continue
-            quaternion = order if size == 4 else ""
-            columns = tuple(x.column for x in fitting)
-            taken |= set(columns)
-            sure = score if fitting[0].axis or size == 3 else 0.0
-            out.append(Match(columns, target, fitting[0], sure, quaternion))
-    return out, [x for x in labels if x.column not in taken]
-
-
-Wanted = tuple[Callable[[Label, str], bool], int, Callable[[str], tuple[str, float]]]
-
-
-def _wanted(machine: Machine) -> list[Wanted]:
-    """What vectors a model may have: whether a column is one of them, how many, and the target of a stem."""
-    out: list[Wanted] = [
-        (is_gyro if kind == "gyro" else is_accelerometer, 3, partial(_sensor, name)) for name, kind in machine.sensors
-    ]
-    if machine.bodies:
-        out.append((is_turn, 4, partial(_body, machine, "orientation")))
-        out.append((lambda x, s: x.kind == Kind.POSITION and not is_turn(x, s), 3, partial(_body, machine, "position")))
-        out.append((is_spin, 3, partial(_body, machine, "angular_velocity")))
-        out.append(
-            (lambda x, s: x.kind == Kind.VELOCITY and not is_spin(x, s), 3, partial(_body, machine, "linear_velocity"))
-        )
-    return out
-
-
-def _held_open(vectors: list[Match]) -> tuple[list[Match], list[str]]:
-    """Vectors, of which none that may be another one is sure unless that one is there; and what is to be said."""
-    reasons = [two_ways(m.label, m.target) if m.target.startswith("body:") else "" for m in vectors]
-    clear = {match.target for match, why in zip(vectors, reasons, strict=True) if not why}
-    other = {"linear_velocity": "angular_velocity", "angular_velocity": "linear_velocity"}
-    out, doubts = [], []
-    for match, why in zip(vectors, reasons, strict=True):
-        body, _, quantity = match.target.rpartition(".")
-        if why and ("<gyro>" in why or f"{body}.{other[quantity]}" not in clear):
-            names = ", ".join(map(repr, match.columns))
-            doubts.append(f"{names} are taken for {match.target}: {why}")
-            match = replace(match, score=0.0)
-        out.append(match)
-    return out, doubts
-
-
-def _sensor(name: str, stem: str) -> tuple[str, float]:
-    return f"sensor:{name}", _SURE
-
-
-def _body(machine: Machine, quantity: str, stem: str) -> tuple[str, float]:
-    """The free body that a stem speaks of, and how sure that is."""
-    words = read_name(stem).words
-    best = max(machine.bodies, key=lambda name: alike(words, name))
-    return f"body:{best}.{quantity}", _SURE if len(machine.bodies) == 1 or alike(words, best) > 0.5 else 0.0

@@ -45,6 +45,7 @@ class Label:
         axis: "x", "y", "z" or "w".
         vector: the name without that axis; columns of one are its components.
         measured: whether it says so, as in ``tau_measured``.
+        commanded: whether it says so, as in ``tau_cmd``.
     """
 
     column: str
@@ -57,6 +58,7 @@ class Label:
     axis: str = ""
     vector: str = ""
     measured: bool = False
+    commanded: bool = False
 
 
 _GREEK = str.maketrans(
@@ -160,7 +162,8 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     number = numbers[-1] if numbers else None
     stem = column if number is None else re.sub(r"\d+(?=\D*$)", "#", column)
     vector = _without_axis(column, words[-1]) if axis else ""
-    return Label(column, kind, tuple(rest), number, stem, unit, angular, axis, vector, bool(flags & {"measured"}))
+    says = bool(flags & {"measured"}), bool(flags & {"command", "desired"})
+    return Label(column, kind, tuple(rest), number, stem, unit, angular, axis, vector, *says)
 
 
 def pieces_of(name: str) -> list[str]:

@@ -1,0 +1,1 @@
+"""What the columns of a log are: by their names, their numbers, and each other."""
