@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
-from sipe_bayes.calibration.init.columns.match import Matches
+from sipe_bayes.calibration.init.columns.match import Match, Matches
 from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import TURNS, pieces_of
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.forces import with_forces
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
@@ -93,7 +94,11 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
         notes=(*_unused(matches, commands), *nameless(model, {model.body(body).id for body in machine.bodies})),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
-    trained = _decided(draft, model, machine, sources, folder) if positions else _undecided(draft, model, machine)
+    trained = (
+        _decided(draft, model, machine, sources, folder, matches.forces)
+        if positions
+        else _undecided(draft, model, machine)
+    )
     trained = replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
     return _felt(trained) if _is_felt(machine, matches) else trained
 
@@ -265,7 +270,14 @@ def _spread(count: int) -> list[int]:
     return np.unique(np.round(np.linspace(0, count - 1, min(count, _LOOKED_AT))).astype(int)).tolist()
 
 
-def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: list[Source], folder: Path) -> Draft:
+def _decided(
+    draft: Draft,
+    model: mujoco.MjModel,
+    machine: Machine,
+    sources: list[Source],
+    folder: Path,
+    forces: Sequence[Match],
+) -> Draft:
     """Units, signs, delay, unknowns and the window's length, by simulations of the logs."""
     part = tried_part(draft)
     rest = tuple(r for r in draft.measurements if r not in part.measurements)
@@ -279,13 +291,14 @@ def _decided(draft: Draft, model: mujoco.MjModel, machine: Machine, sources: lis
             part = placed
             trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
     part = decide(part, machine, trial, layout)
+    part, unlike = with_forces(part, forces, model, machine, sources, folder)
     logs = loaded(part, sources, folder)
     unknowns, delay, notes, lost = _unknowns(part, model, machine, logs, folder)
     unknowns, doubts = _some(unknowns)
     window, why = _window(machine, logs, trial)
     return replace(
         part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
-        notes=(*draft.notes, *notes), doubts=(*against_world, *part.doubts, *lost, *doubts), delay=delay,
+        notes=(*draft.notes, *unlike, *notes), doubts=(*against_world, *part.doubts, *lost, *doubts), delay=delay,
     )  # fmt: skip
 
 

@@ -109,8 +109,9 @@ def scale_is_open(model: mujoco.MjModel, machine: Machine, readings: Sequence[Re
     """Whether no force is known: with all forces and masses as many times larger, everything moves alike."""
     driven = _driven(machine, readings)
     known_force = any(r.match.label.kind == Kind.TORQUE or r.unit in ("N m", "N") for _, r in driven)
+    known_force |= any(r.match.target.endswith(".force") for r in readings)
     gains = [unknown for a, r in driven for unknown in _of_actuator(model, a, r)]
-    return not driven or (bool(gains) and not known_force and any(a.drive != Drive.POSITION for a, _ in driven))
+    return not driven or (bool(gains) and not known_force)
 
 
 def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) -> list[Unknown]:
