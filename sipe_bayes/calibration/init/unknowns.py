@@ -174,7 +174,7 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
     )
     word = _word(name)
     rows = (
-        ("damping", _round(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
+        ("damping", _round(max(4 * damping, force / speed)), damping, "viscous friction"),
         ("frictionloss", _round(max(4 * dry, 0.4 * force)), dry, "dry friction"),
         ("armature", _round(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
     )
