@@ -231,11 +231,12 @@ class Table(BaseModel):
         return data
 
 
-def log_words(value: Any) -> Any:
+def log_words(value: object) -> object:
     """``logs = "tosses/*.csv"`` as the table that it stands for."""
     words = [value] if isinstance(value, str) else value
-    is_words = isinstance(words, list) and all(isinstance(word, str) for word in words)
-    return [{"file": word} for word in words] if is_words else value
+    if isinstance(words, list) and all(isinstance(word, str) for word in words):
+        return [{"file": word} for word in words]
+    return value
 
 
 def overlap(a: Pair | None, b: Pair | None) -> bool:
