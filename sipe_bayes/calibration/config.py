@@ -69,8 +69,8 @@ class Config(Table):
     """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
     afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
     geometry_tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = GEOMETRY
-    """sd of where centres of mass lie, as a share of their distance from the joint that turns them; wider intervals
-    allow for it where no log tells"""
+    """sd of where centres of mass lie, as a share of the body's radius of gyration about the joint that turns it;
+    intervals with what the model lacks allow for it where no log tells. 0: exact"""
     search: Search = Search()
     resample: Resample = Resample()
     columns: Columns = Columns()

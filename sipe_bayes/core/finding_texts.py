@@ -260,7 +260,7 @@ class Code(Enum):
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"
     )
     MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
-    UNTOLD = note("these logs can not tell {causes}; then values are off by more than their plain intervals: {moved}")
+    UNTOLD = note("these logs can not tell {causes}; then values are off by more than the sd that they have: {moved}")
     CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "

@@ -116,9 +116,9 @@ class _Around:
                 break
             use &= ~wrong
             amplitude[:] = 0.0
-        amplitude = np.clip(amplitude, low, high)
         if effect.trades.any():  # what they change goes with the square of their size
-            amplitude = np.sqrt(amplitude)
+            amplitude = np.sqrt(np.maximum(amplitude, 0.0))
+        amplitude = np.clip(amplitude, low, high)
         others = np.clip(self.theta + amplitude @ effect.trades, 0.0, 1.0)
         size = np.abs(amplitude).sum()
         value = at + amplitude @ (probes - at)

@@ -41,7 +41,7 @@ Kind = Literal["joint", "actuator", "body", "channel", "world"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PROBE = 0.03  # of a parameter's range, how far a probe goes: an effect that is still about linear
 WORLD = "world"  # the one site of an extension of the world
-_AND = " and "  # between the names of a site that is several
+_AND = " and\u00a0"  # between the names of a site that is several: no name of one holds a no-break space
 
 
 class Extension(ABC):

@@ -282,7 +282,7 @@ def _simulated(
 def _traded(space: ParameterSpace, theta: FloatArray, one: Placed) -> tuple[FloatArray, FloatArray]:
     """An extension's probes (G, K, P) and what they take from theta (N,): of a trade one, as far as it can go."""
     trade, k = np.zeros_like(theta), imitating(one.extension, one.site, tuple(space))
-    if k is None or len(one.parameters) != 1:
+    if k is None or len(one.parameters) != 1 or space[k].scale != "linear":  # a root of a size is a share of SI
         return one.probes, trade
     (own,), value = one.parameters, float(space[k].value(theta[k]))
     begin = float(own.value(one.plain[0]))

@@ -312,6 +312,7 @@ class StructureSearch:
                 own = self.structure(each.labels)
                 most = self.options.fit_budget, self._left(state)
                 log_score, rollouts = self.fitting.log_score(own, each, *most, self._tell)
+                rollouts = self._fit_rollouts if log_score == -np.inf else rollouts
                 state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
         return state
 
@@ -326,12 +327,13 @@ class StructureSearch:
         here, larger = state.here, state.of(state.larger)
         assert larger is not None
         keep = [i for i, label in enumerate(self._owners(larger)) if label in (None, *here.labels)]
-        refitted = self._fitted(state, here.labels, larger.theta[keep])
-        if len(refitted.fitted) > len(state.fitted):
+        refitted, fitted = self._fitted(state, here.labels, larger.theta[keep]), state.fitted
+        if len(refitted.fitted) > len(fitted):
             *_, once_more = refitted.fitted
             better = once_more if once_more.evidence > here.evidence else here
             better = replace(better, rollouts=here.rollouts + once_more.rollouts)
-            state = replace(state, fitted=tuple(better if one is here else one for one in state.fitted))
+            fitted = tuple(better if one is here else one for one in fitted)
+        state = replace(refitted, fitted=fitted, failed=state.failed)
         best = self._best_grown(state)
         if best is not None and self._speaks_against(state := self._judged(state, best), best):
             return self._settled(replace(state, refused=(*state.refused, best.labels), larger=()))
@@ -395,6 +397,7 @@ class StructureSearch:
             one = self.fitting.fit(self.structure(labels), initial, max(left, 1), self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             short = isinstance(error, BudgetTooSmall) and left < self.options.fit_budget
-            return replace(state, failed=(*state.failed, labels), cut=state.phase if short else None)
+            spent, cut = state.failed_rollouts + self._fit_rollouts, state.phase if short else None
+            return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
         short = not one.settled and left < self.options.fit_budget
         return replace(state, fitted=(*state.fitted, one), cut=state.phase if short else None)

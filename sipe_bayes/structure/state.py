@@ -75,6 +75,7 @@ class DiscoverState:
         columns: of the logs that are multiplied, since then the plain model fits far better.
         column_rollouts: of the trials of signs and units.
         rank_rollouts: of the rankings.
+        failed_rollouts: of fits that failed, as far as they told.
         untried: signs and units that their share of the budget did not reach.
         judged: what held-out logs say of structures.
         refused: labels of structures that they speak against.
@@ -91,6 +92,7 @@ class DiscoverState:
     columns: tuple[Column, ...] = ()
     column_rollouts: int = 0
     rank_rollouts: int = 0
+    failed_rollouts: int = 0
     untried: tuple[Column, ...] = ()
     judged: tuple[Judgement, ...] = ()
     refused: tuple[tuple[str, ...], ...] = ()
@@ -103,9 +105,9 @@ class DiscoverState:
 
     @property
     def rollouts(self) -> int:
-        """Of all fits, those with other signs and units among them, of rankings, and of looks at held-out logs."""
-        fits = sum(one.rollouts for one in self.fitted) + self.column_rollouts + self.rank_rollouts
-        return fits + sum(one.rollouts for one in self.judged)
+        """Of all fits, those that failed or had other signs and units too, of rankings, of looks at held-out logs."""
+        beside = self.column_rollouts + self.rank_rollouts + self.failed_rollouts
+        return sum(one.rollouts for one in self.fitted) + sum(one.rollouts for one in self.judged) + beside
 
     def of(self, labels: Sequence[str]) -> FittedStructure | None:
         """The fit of a structure, whatever the order of its extensions."""

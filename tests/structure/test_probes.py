@@ -81,11 +81,11 @@ def double(*targets: str) -> Windows:
 
 
 SHARED = [
-    (Lag(), ["actuator:m1.delay", "actuator:m2.delay"], "m1 and m2", "actuator:{}.lag"),
+    (Lag(), ["actuator:m1.delay", "actuator:m2.delay"], "m1 and\u00a0m2", "actuator:{}.lag"),
     (
         SensorFilter(),
         ["sensor:joint:shoulder.position.delay", "sensor:joint:elbow.position.delay"],
-        "joint:shoulder.position and joint:elbow.position",
+        "joint:shoulder.position and\u00a0joint:elbow.position",
         "sensor:{}.filter",
     ),
 ]
@@ -120,4 +120,4 @@ def test_nothing_is_taken_from_a_parameter_at_its_bound_nor_from_one_of_other_ta
             (effect,) = effects(windows, at, starts, [one])
             assert float(one.parameters[0].value(effect.probes[0, 0])) == pytest.approx(step)
             np.testing.assert_allclose(effect.trades, [[0.0, trade]])
-    assert [imitating(Lag(), site, tuple(space)) for site in ("m1", "m2", "m1 and m2")] == [1, None, 1]
+    assert [imitating(Lag(), site, tuple(space)) for site in ("m1", "m2", "m1 and\u00a0m2")] == [1, None, 1]

@@ -17,7 +17,7 @@ from sipe_bayes.core.arrays import FloatArray
 
 _FAR_BETTER = np.log(2.0)  # of the logarithm of misses of all channels together
 _BETTER, _CLEAR = np.log(1.3), 3.0  # of the same, where the model names a zero; and standard errors of it
-_BELIEVED = np.log(0.3)  # of the same of one channel, up to which no zero is looked for
+_BELIEVED = 0.3  # of the miss of one channel, up to which it has no zero that is looked for
 _FITTED = 3  # zeros with which the unknowns are fitted, those that miss least
 _GRID, _FINER = 31, 9  # zeros that are tried over the range of a joint, and twice around the best
 _UNSURE = 2.0  # steps of the grid, by which a zero may be off that simulations alone tell
@@ -94,11 +94,15 @@ def _nearest(case: Case) -> list[Readings]:
 
 @dataclass(frozen=True)
 class _Fitted:
-    """Readings, the unknowns that fit them (N,), and the logarithm of what is missed in each window (W,)."""
+    """Readings, the unknowns that fit them (N,), the logarithm of what is missed in each window (W,), and by channel.
+
+    misses: (C,) as of ``Trial.misses``.
+    """
 
     readings: Readings
     theta: FloatArray
     missed: FloatArray
+    misses: FloatArray
 
 
 def _fitted(case: Case, readings: Readings) -> _Fitted:
@@ -106,9 +110,8 @@ def _fitted(case: Case, readings: Readings) -> _Fitted:
     left = fit(case.trial, assumption, (0, 1, 2, 4), rounds=3)
     late = replace(assumption, delay=left.best)
     nominal, fitted = case.trial.missed([late], case.trial.theta)[0], case.trial.missed([late], left.theta)[0]
-    if nominal.mean() < fitted.mean():
-        return _Fitted(readings, case.trial.theta, nominal)
-    return _Fitted(readings, left.theta, fitted)
+    theta, missed = (case.trial.theta, nominal) if nominal.mean() < fitted.mean() else (left.theta, fitted)
+    return _Fitted(readings, theta, missed, case.trial.misses([late], theta)[0])
 
 
 def _first_better(
@@ -116,10 +119,10 @@ def _first_better(
 ) -> tuple[_Zero, _Fitted] | None:
     """The best zero of those named, else of the grids, that is clearly better."""
     cases = [case, replace(case, theta=now.theta)]
-    ways = (_named, _searched) if now.missed.mean() > len(case.trial.given.observed) * _BELIEVED else (_named,)
-    for zeros_of in ways:
+    unlike = {k: joint for k, joint in joints.items() if now.misses[case.layout.channels[k][0]] > _BELIEVED}
+    for zeros_of, of in ((_named, joints), (_searched, unlike)):
         tried: list[tuple[float, _Zero, Readings]] = []
-        for k, joint in joints.items():
+        for k, joint in of.items():
             tried += [one for one in zeros_of(cases, model, k, joint, near) if one[0] < now.missed.mean()]
         tried = sorted(tried, key=lambda one: one[0])[:_FITTED]
         after = [(zero, _fitted(case, readings)) for _, zero, readings in tried]

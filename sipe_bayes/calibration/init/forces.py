@@ -25,7 +25,7 @@ from sipe_bayes.likelihood.starts import estimate_states
 from sipe_bayes.simulation.simulator import Simulator
 
 _FOLLOWS = 0.3  # share of variance from which a column is the force of a drive, whose gains may be off
-_NEAR = np.log(4.0)  # of the logarithm of how many times it is as large as the model's, for the same reason
+_UNSURE, _FAR = np.log(1.5), np.log(4.0)  # of the logarithm of how many times the model's force it is
 _SAMPLES, _FEWEST = 400, 20  # of each log, and of all
 _LATE = (0, 1, 2, 4, 8)  # samples, of the commands
 
@@ -48,50 +48,53 @@ def with_forces(
         sources: logs.
         folder: of the configuration.
     """
-    if not matches:
-        return draft, []
-    first = tuple(_first(machine, match) for match in matches)
+    known = [match for match in matches if match.label.unit in ("", *_words(machine, match))]
+    notes = [f"{m.column!r} is not used: {m.label.unit} is no unit of a force" for m in matches if m not in known]
+    if not known:
+        return draft, notes
+    first = tuple(Reading(m, m.label.unit or _words(machine, m)[0]) for m in known)
     whole = replace(draft, measurements=(*draft.measurements, *first))
     trial, layout = trial_of(whole, model, machine, loaded(whole, sources, folder), folder, FEW)
     seen = [np.concatenate([_applied(trial.simulator, trial.theta, log, d) for log in trial.logs]) for d in _LATE]
     measured = np.concatenate([_spread(log.observations[:-1]) for log in trial.logs])
-    readings, notes = [], []
+    readings = []
     for k, reading in enumerate(first, len(draft.measurements)):
         (channel,) = layout.channels[k]
         like = max((_likeness(one[:, channel], measured[:, channel]) for one in seen), key=lambda one: one.share)
-        joint, column = reading.match.target.removeprefix("joint:").removesuffix(".force"), reading.match.column
         decided = _decided(reading, like)
-        share = f"the model's force there explains {100 * like.share:.0f} % of its variance"
-        if decided is None:
-            size = (
-                f"; in {reading.unit} it is {abs(1 / like.factor):.2g} times as large" if like.share > _FOLLOWS else ""
-            )
-            notes.append(f"{column!r} is not used as the force at {joint}: {share}{size}")
+        if decided.fit:
+            readings.append(decided)
         else:
-            note = f"what drives {joint}: {share}"
-            readings.append(replace(decided, notes=(*reading.notes, note)))
+            notes += [f"{reading.match.column!r} is not used: {note}" for note in decided.notes]
     return replace(draft, measurements=(*draft.measurements, *readings)), notes
 
 
-def _first(machine: Machine, match: Match) -> Reading:
-    joint = next(j for j in machine.joints if match.target == f"joint:{j.name}.force")
-    default = "N m" if joint.hinge else "N"
-    named = match.label.unit
-    return Reading(match, named if named in unit_words(find_unit(default).dimension) else default)
+def _words(machine: Machine, match: Match) -> list[str]:
+    """Units that it may have, the likeliest first."""
+    hinge = next(j.hinge for j in machine.joints if match.target == f"joint:{j.name}.force")
+    return unit_words(find_unit("N m" if hinge else "N").dimension)
 
 
-def _decided(reading: Reading, like: Likeness) -> Reading | None:
-    """With the sign and the unit in which it is about as large as the model's; None where it is in none."""
-    words = [reading.unit] if reading.match.label.unit else unit_words(find_unit(reading.unit).dimension)
-    own = find_unit(reading.unit).factor
+def _decided(reading: Reading, like: Likeness) -> Reading:
+    """With the sign and the unit in which it is about as large as the model's force; not fitted where it is in none."""
+    dimension, own = find_unit(reading.unit).dimension, find_unit(reading.unit).factor
+    words = [reading.unit] if reading.match.label.unit else unit_words(dimension)
 
-    def off(word: str) -> float:
-        return abs(float(np.log(abs(like.factor) * own / find_unit(word).factor)))
+    def times(word: str) -> float:
+        """How many times the model's it is."""
+        return find_unit(word).factor / (abs(like.factor) * own)
 
-    unit = min(words, key=off)
-    if like.share < _FOLLOWS or off(unit) > _NEAR:
-        return None
-    return replace(reading, unit=unit, sign=1 if like.factor > 0 else -1)
+    unit = min(words, key=lambda word: abs(float(np.log(times(word)))))
+    joint = reading.match.target.removeprefix("joint:").removesuffix(".force")
+    note = f"the model's force at {joint} explains {100 * like.share:.0f} % of its variance"
+    off = abs(float(np.log(times(unit))))
+    note += f"; in {unit} it is {times(unit):.2g} times as large" if like.share > _FOLLOWS else ""
+    if like.share < _FOLLOWS or off > _FAR:
+        return replace(reading, fit=False, notes=(note,))
+    reading = replace(reading, unit=unit, sign=1 if like.factor > 0 else -1)
+    if not reading.match.label.unit and off > _UNSURE:
+        return replace(reading, doubts=(f"{note}: if it is no force, but a current or a share, leave it out",))
+    return replace(reading, notes=(note,))
 
 
 def _likeness(simulated: FloatArray, measured: FloatArray) -> Likeness:

@@ -284,12 +284,13 @@ def _decided(
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
     trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
     against_world = absolute_angles(part, model, machine, trial, layout)
-    if not against_world:
-        wide, _ = trial_of(part, model, machine, trial.logs, folder, SOME)
-        placed = with_zeros(part, model, machine, wide, layout)
-        if placed != part:
-            part = placed
-            trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
+    wide, _ = trial_of(part, model, machine, trial.logs, folder, SOME)
+    placed = with_zeros(part, model, machine, wide, layout)
+    if placed != part:
+        moved, layout = trial_of(placed, model, machine, loaded(placed, sources, folder), folder, FEW)
+        left = absolute_angles(placed, model, machine, moved, layout)
+        if not (against_world and left):  # else it was no zero that made an angle look like one against the world
+            part, trial, against_world = placed, moved, left
     part = decide(part, machine, trial, layout)
     part, unlike = with_forces(part, forces, model, machine, sources, folder)
     logs = loaded(part, sources, folder)

@@ -77,13 +77,14 @@ def candidates(
 
 
 def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
-    """What is left of zeros that simulations alone tell."""
+    """What is left of zeros that simulations alone tell, but of those that a servo's set-points have, too."""
+    shared = {r.unsure for r in readings if r.commanded}
     return [
         Unknown(
             f"{_word(r.match.column)}_zero", (f"sensor:{r.match.column}.bias",), -r.unsure, r.unsure, False,
             f"SI, what is left of the zero error of {r.match.column!r}",
         )
-        for r in readings if r.unsure and not r.commanded
+        for r in readings if r.unsure and r.unsure not in shared
     ]  # fmt: skip
 
 
@@ -109,7 +110,7 @@ def scale_is_open(model: mujoco.MjModel, machine: Machine, readings: Sequence[Re
     """Whether no force is known: with all forces and masses as many times larger, everything moves alike."""
     driven = _driven(machine, readings)
     known_force = any(r.match.label.kind == Kind.TORQUE or r.unit in ("N m", "N") for _, r in driven)
-    known_force |= any(r.match.target.endswith(".force") for r in readings)
+    known_force |= any(r.match.target.endswith(".force") and not r.doubts for r in readings)
     gains = [unknown for a, r in driven for unknown in _of_actuator(model, a, r)]
     return not driven or (bool(gains) and not known_force)
 
@@ -174,7 +175,7 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
     )
     word = _word(name)
     rows = (
-        ("damping", _round(max(4 * damping, force / speed)), damping, "viscous friction"),
+        ("damping", _round(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
         ("frictionloss", _round(max(4 * dry, 0.4 * force)), dry, "dry friction"),
         ("armature", _round(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
     )

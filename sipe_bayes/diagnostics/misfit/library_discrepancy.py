@@ -29,6 +29,8 @@ grows, no alarm decides, and it is hardly widened where the residuals show none.
 
 Deviations:
 
+- Where all are at work nothing is traded: the root of a small size is not small, and a delay would be wide on any log.
+  One at work, a lag is half normal in its square.
 - All at work have sizes of either sign, also extensions that have but one: they stand for what no extension is, too.
 - Columns that theta imitates almost wholly are left out: of those no residual tells the size (``misfit.tolerances``
   has those that matter). So are gains of single logs.
@@ -117,14 +119,14 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
         return None
     names = [logs.probes[k].name for k in kept]
     columns = Columns(names, information[np.ix_(kept, kept)], seen.score[kept], logs.one_sided[kept])
-    drawn, _ = columns.draws(options, np.random.default_rng(seed))
+    drawn, _, one = columns.draws(options, np.random.default_rng(seed))
     sizes = np.zeros((len(drawn), len(logs.probes)))
     sizes[:, kept] = drawn
 
     def moved(name: str | None = None) -> FloatArray:
         """Theta (M, N), by all extensions or by one."""
         own = np.where([name in (None, probe.name) for probe in logs.probes], sizes, 0.0)
-        return np.asarray(logs.traded(own) - own @ seen.answer.T)
+        return np.asarray(logs.traded(np.where(one[:, None], own, 0.0)) - own @ seen.answer.T)
 
     square = {name: (moved(name) ** 2).mean(0) / np.maximum(seen.variance, 1e-300) for name in dict.fromkeys(names)}
     most = sorted(square, key=lambda name: -float(square[name].sum()))
@@ -153,8 +155,8 @@ class Columns:
         count = Counter(self.names)
         return np.array([1 / (len(count) * count[name]) for name in self.names])
 
-    def draws(self, options: DiscrepancyOptions, random: np.random.Generator) -> tuple[FloatArray, float]:
-        """Of their sizes (M, K), and the probability that there is any."""
+    def draws(self, options: DiscrepancyOptions, random: np.random.Generator) -> tuple[FloatArray, float, BoolArray]:
+        """Of their sizes (M, K), the probability that there is any, and of which draws (M,) one alone is at work."""
         one, every = _OneAtWork(self, options), _AllAtWork(self, options)
         states = np.array([0.0, one.log_evidence, every.log_evidence])
         believed = np.array([options.absent, *[(1 - options.absent) / 2] * 2])
@@ -163,7 +165,7 @@ class Columns:
         counts = random.multinomial(options.draws, weights)
         none = np.zeros((counts[0], len(self.score)))
         drawn = np.concatenate([none, one.draws(counts[1], random), every.draws(counts[2], random)])
-        return drawn, float(1 - weights[0])
+        return drawn, float(1 - weights[0]), np.repeat([False, True, False], counts)
 
 
 class _OneAtWork:

@@ -90,25 +90,30 @@ def untold(logs: ProbedLogs, tolerances: Tolerances) -> list[Untold]:
     return numbers
 
 
+def _sd(logs: ProbedLogs) -> FloatArray:
+    """What the logs tell of theta (N,); infinite of a parameter that is held by its bound, which nothing moves."""
+    variance = logs.seen.variance
+    return np.sqrt(np.where(variance > 0, variance, np.inf))
+
+
 def named(logs: ProbedLogs, numbers: Sequence[Untold]) -> tuple[str, ...]:
     """Of these numbers, in words, those that move a value by more than the sd that the logs tell, the largest first."""
-    sd = np.sqrt(logs.seen.variance)
     size: dict[str, float] = {}
     for one in numbers:
-        size[one.sentence] = max(size.get(one.sentence, 0.0), float(np.abs(one.shift / sd).max()))
+        size[one.sentence] = max(size.get(one.sentence, 0.0), float(np.abs(one.shift / _sd(logs)).max()))
     return tuple(sorted((name for name in size if size[name] > 1), key=lambda name: -size[name])[:_NAMED])
 
 
 def tolerance_findings(logs: ProbedLogs, numbers: Sequence[Untold]) -> list[Finding]:
     """Of the values that one of these numbers moves by more than an sd of what the logs tell."""
-    sd, space = np.sqrt(logs.seen.variance), logs.windows.simulator.space
+    sd, space = _sd(logs), logs.windows.simulator.space
     shifts = np.array([one.shift for one in numbers]).reshape(len(numbers), len(space))
     off, causes = np.sqrt((shifts**2).sum(0)), named(logs, numbers)
     if not causes:
         return []
     moved = np.flatnonzero(np.abs(shifts).max(0) > sd).tolist()
-    low, high = space.values(np.clip([logs.theta - off, logs.theta + off], 0, 1))
-    by = [f"{space[j].name} by {(high[j] - low[j]) / 2:.2g} {space[j].unit}" for j in moved]
+    ends = space.values(np.clip([logs.theta - off, logs.theta, logs.theta + off], 0, 1))
+    by = [f"{space[j].name} by {np.abs(np.diff(ends[:, j])).max():.2g} {space[j].unit}" for j in moved]
     names = [space[j].name for j in moved]
     return [finding(Code.UNTOLD, parameters=names, causes=" or ".join(causes), moved=", ".join(by))]
 

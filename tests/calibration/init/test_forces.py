@@ -58,6 +58,7 @@ def test_efforts_are_measured_with_their_sign_and_unit_and_make_forces_known(tmp
     ("scales", "name", "words"),
     [
         ({"shoulder": 40.0, "elbow": 40.0}, "effort_{}", "times as large"),  # shares of a largest, or counts
+        ({"shoulder": 2.0, "elbow": 2.0}, "effort_{}_A", "A is no unit of a force"),
         ({"shoulder": 0.0, "elbow": 0.0}, "tau_measured_{}", "explains 1 % of"),  # noise
         ({"shoulder": 1.0, "elbow": 1.0}, "torque_cmd_{}", "not used: torque_cmd_shoulder, torque_cmd_elbow"),
     ],
@@ -67,4 +68,16 @@ def test_what_is_no_effort_is_named_and_left(tmp_path: Path, scales: dict[str, f
     print(draft.notes)
     assert not any(r.match.target.endswith(".force") for r in draft.measurements)
     assert any(words in note for note in draft.notes)
+    assert any("no force is known" in doubt for doubt in draft.doubts)
+
+
+def test_an_effort_without_a_unit_that_is_larger_than_the_models_is_open_and_makes_no_force_known(
+    tmp_path: Path,
+) -> None:
+    draft = proposed(tmp_path, {"shoulder": 2.5, "elbow": 2.5})
+    forces = [r for r in draft.measurements if r.match.target.endswith(".force")]
+    print([(r.unit, r.doubts) for r in forces])
+    assert [r.match.column for r in forces] == ["effort_shoulder", "effort_elbow"]
+    assert all("if it is no force" in doubt for r in forces for doubt in r.doubts)
+    assert all(r.doubts for r in forces)
     assert any("no force is known" in doubt for doubt in draft.doubts)

@@ -70,7 +70,7 @@ def test_the_posterior_is_the_exact_one_of_a_linear_model(size: float) -> None:
 
     columns_seen = Columns(NAMES, information, score, ONE_SIDED)
     np.testing.assert_allclose(columns_seen.parts, PARTS)
-    drawn, present = columns_seen.draws(OPTIONS, np.random.default_rng(0))
+    drawn, present, _ = columns_seen.draws(OPTIONS, np.random.default_rng(0))
     shifts, mean, square = drawn @ answer, weights @ np.array(means), weights @ np.array(squares)
     print(present, 1 - weights[0], shifts.mean(), mean, (shifts**2).mean(), square)
     np.testing.assert_allclose(present, 1 - weights[0], atol=1e-3)
