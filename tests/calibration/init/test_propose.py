@@ -50,7 +50,7 @@ def test_units_signs_and_delays_of_ten_logs(tmp_path: Path) -> None:
     for seed, (kind, variant) in enumerate(LOGS):
         folder = tmp_path / f"{kind}{variant}"
         folder.mkdir()
-        truth = make_log(folder, KINDS[kind], variant, seed)
+        truth = make_log(folder, KINDS[kind], variant, seed, steps=700)
         draft = propose(folder / "model.xml", [folder / "log.csv"], folder)
         (folder / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
         config = load_config(folder / "calibrate.toml")
