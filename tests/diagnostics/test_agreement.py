@@ -12,7 +12,7 @@ from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.likelihood.settings import Segments
 from tests.problems.pendulums import log, pendulum
 
-SEEDS = range(12)
+SEEDS = range(8)
 
 
 def alarms(heavier: float, rho: float) -> list[str]:
@@ -36,15 +36,15 @@ def alarms(heavier: float, rho: float) -> list[str]:
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_agreeing_logs_pass_in_silence(rho: float) -> None:
-    """At the 1 % level, 2 or more alarms in 12 have a probability of 0.6 %."""
+    """At the 1 % level, 2 or more alarms in 8 have a probability of 0.3 %."""
     named = alarms(1.0, rho)
-    assert named.count("") >= 11, named
+    assert named.count("") >= 7, named
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_a_heavier_rod_is_named(rho: float) -> None:
     named = alarms(1.1, rho)
-    assert named.count("rod_mass") >= 11, named
+    assert named.count("rod_mass") >= 7, named
 
 
 def test_cochrans_q_against_a_plain_reference() -> None:

@@ -109,12 +109,12 @@ def simulated(model: mujoco.MjModel, commands: np.ndarray, dt: float, delay: int
     return positions, velocities
 
 
-def make_log(folder: Path, kind: Kind, variant: int, seed: int, spring: float = 0.0) -> Truth:
+def make_log(folder: Path, kind: Kind, variant: int, seed: int, spring: float = 0.0, steps: int = 1100) -> Truth:
     """Write ``model.xml`` and ``log.csv``; the variant, from 0 to 4, sets rate, units, noise, clock and delay.
 
     spring: at the first joint, N m/rad or N/m, which the model does not have.
     """
-    rng, steps = np.random.default_rng(seed), 1100
+    rng = np.random.default_rng(seed)
     dt, delay = (0.004, 0.004, 0.012, 0.004, 0.008)[variant], (0, 2, 1, 3, 1)[variant]
     commands = _excitation(steps, dt, kind.sizes, rng)
     model = _real(kind.xml, rng)

@@ -95,18 +95,20 @@ def test_a_base_that_moves_is_found() -> None:
 
 
 @pytest.mark.parametrize(
-    ("label", "targets", "size", "rival"),
+    ("label", "targets", "size", "rival", "steps"),
     [
-        ("supply_sag:world", ("actuator:m1.supply_sag", "actuator:m2.supply_sag"), 0.05, "force_drop"),
-        ("command_limit:m2", ("actuator:m2.command_limit",), 1.8, "offset"),
-        ("mass:upper", ("body:upper.mass",), 1.3, "armature"),
-        ("gain:m1", ("actuator:m1.gain",), 1.12, "force_drop"),
+        ("supply_sag:world", ("actuator:m1.supply_sag", "actuator:m2.supply_sag"), 0.05, "force_drop", 200),
+        ("command_limit:m2", ("actuator:m2.command_limit",), 1.8, "offset", 200),
+        ("mass:upper", ("body:upper.mass",), 1.3, "armature", 140),
+        ("gain:m1", ("actuator:m1.gain",), 1.12, "force_drop", 200),
     ],
 )
-def test_what_is_planted_at_two_joints_is_found(label: str, targets: tuple[str, ...], size: float, rival: str) -> None:
+def test_what_is_planted_at_two_joints_is_found(
+    label: str, targets: tuple[str, ...], size: float, rival: str, steps: int
+) -> None:
     """By the forces of both together, by a set-point that is not reached, by numbers that the model has wrong."""
     machine = Simulator(environment(MACHINES["double"], [Parameter("planted", 0.0, 2 * size, targets=targets)]), 1)
-    rng, time, logs = np.random.default_rng(4), np.arange(200) * 0.01, []
+    rng, time, logs = np.random.default_rng(4), np.arange(steps) * 0.01, []
     for name in ("a", "b"):
         frequencies, phases = rng.uniform(0.3, 1.5, (3, 1, 2)), rng.uniform(0, 6, (3, 1, 2))
         actions = np.sin(2 * np.pi * frequencies * time[:, None] + phases).sum(0)

@@ -58,9 +58,14 @@ def test_planted_friction_is_named_and_the_mass_is_right_with_it() -> None:
     assert value == pytest.approx(0.1, rel=0.2)
 
 
-def test_two_effects_are_found_one_after_the_other() -> None:
-    recorded = log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.15, 0.06], 6)
-    structures = searched(recorded)
+@pytest.fixture(scope="module")
+def two_effects() -> Structures:
+    """Of a pendulum with dry friction and drag."""
+    return searched(log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.15, 0.06], 6))
+
+
+def test_two_effects_are_found_one_after_the_other(two_effects: Structures) -> None:
+    structures = two_effects
     print(structures.table())
     assert set(structures.best.labels) == {"dry_friction:hinge", "quadratic_damping:hinge"}
     for label, truth in (("dry_friction:hinge", 0.15), ("quadratic_damping:hinge", 0.06)):
@@ -68,9 +73,9 @@ def test_two_effects_are_found_one_after_the_other() -> None:
         assert value == pytest.approx(truth, rel=0.25), label
 
 
-def test_a_piece_is_averaged_over_the_structures_that_have_it() -> None:
+def test_a_piece_is_averaged_over_the_structures_that_have_it(two_effects: Structures) -> None:
     """Each counts with its probability, wherever its parameters stand and however much its bounds cut off."""
-    structures = searched(log(pendulum(FRICTION, DRAG), [0.6, 0.08, 0.15, 0.06], 6))
+    structures = two_effects
     cost, label = structures.search.cost, "dry_friction:hinge"
     alike = [replace(one, evidence=cost * len(one.labels), held_out=None) for one in structures.fitted]
     having = [one for one in alike if label in one.labels]
@@ -111,7 +116,7 @@ def test_a_wrong_column_is_found_before_any_physics_is_blamed(factor: float, com
     wrong = replace(recorded, actions=recorded.actions * factor, channels=channels)
     if not command:
         wrong = replace(recorded, observations=recorded.observations * factor, channels=channels)
-    structures = searched(wrong)
+    structures = searched(wrong, names=("dry_friction",))
     (column,) = structures.state.columns
     print(column.sentence, structures.table())
     assert column.factor == pytest.approx(1 / factor)

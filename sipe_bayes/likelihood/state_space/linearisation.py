@@ -141,7 +141,8 @@ def eliminate_states(linear: ChainLinearisation, noise: ChainNoise, damping: flo
     # what they say of theta alone: jumps first, whose large precisions the states all but cancel
     force, precision = pull(linear, noise), np.einsum("kdn,kdm->nm", linear.transition_theta, driven)
     solved = eliminate(diagonal, -onward, cross, force, precision, np.einsum("kdn,kd->n", driven, linear.jump))
-    measured_precision = np.einsum("kcn,kc,kcm->nm", by_theta, rows, by_theta, optimize=True)
+    # as einsum of all three does, which looks anew for the best order each time
+    measured_precision = np.tensordot(np.einsum("kcn,kc->ckn", by_theta, rows), by_theta, ((0, 1), (1, 0)))
     return replace(
         solved,
         precision=measured_precision + solved.precision,

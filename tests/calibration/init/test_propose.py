@@ -18,7 +18,7 @@ from sipe_bayes.cli.app import app
 from tests.problems.log_tables import EXAMPLES
 from tests.problems.made_up_logs import KINDS, PENDULUM, Truth, make_log
 
-LOGS = [(kind, variant) for kind in KINDS for variant in range(5)]
+LOGS = [(kind, variant) for k, kind in enumerate(KINDS) for variant in range(5) if (k + variant) % 2 == 0]
 
 
 def wrong(draft: Draft, truth: Truth) -> list[str]:
@@ -44,12 +44,13 @@ def wrong(draft: Draft, truth: Truth) -> list[str]:
     return out
 
 
-def test_units_signs_and_delays_of_twenty_logs(tmp_path: Path) -> None:
+def test_units_signs_and_delays_of_ten_logs(tmp_path: Path) -> None:
+    """Each kind of machine in two or three of the variants, and each variant twice: all come out."""
     mistakes = {}
     for seed, (kind, variant) in enumerate(LOGS):
         folder = tmp_path / f"{kind}{variant}"
         folder.mkdir()
-        truth = make_log(folder, KINDS[kind], variant, seed)
+        truth = make_log(folder, KINDS[kind], variant, seed, steps=700)
         draft = propose(folder / "model.xml", [folder / "log.csv"], folder)
         (folder / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
         config = load_config(folder / "calibrate.toml")
@@ -57,7 +58,7 @@ def test_units_signs_and_delays_of_twenty_logs(tmp_path: Path) -> None:
         assert len(summary(draft, "calibrate.toml")) <= 20
         if mistake := wrong(draft, truth):
             mistakes[kind, variant] = mistake
-    assert len(mistakes) <= 1, mistakes
+    assert not mistakes
 
 
 @pytest.mark.parametrize(("kind", "variant", "spring"), [("servo", 3, 2.0), ("servo", 3, 0.0), ("arm", 1, 4.0)])

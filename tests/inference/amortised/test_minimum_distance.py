@@ -74,7 +74,7 @@ def test_a_robust_posterior_is_that_of_the_right_samples(method: type[Any]) -> N
 
     space = ParameterSpace([Parameter(f"p{j}", 0.0, 1.0) for j in range(2)])
     simulator = CallableSimulator(function, space, name="faulty")
-    settings = {"components": 2} if method is BayesSim else {"accepted": 0.2, "regression": True}
+    settings = {"components": 2, "calibration": 0.0} if method is BayesSim else {"accepted": 0.2, "regression": True}
     x = measured(3, 4.0)
     mean, sd = exact(x, FAULTY)
     log = Trajectory(np.stack([np.zeros(len(A)), x]), np.zeros((1, 0)), 1.0)

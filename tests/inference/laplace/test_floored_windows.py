@@ -9,10 +9,9 @@ import pytest
 
 import sipe_bayes as sipe
 from sipe_bayes.inference.laplace.estimator import Laplace
-from tests.problems.floors import floored_log, floored_pendulum, grid_posterior
+from tests.problems.floors import damping_quantiles, floored_log, floored_pendulum
 
 LEVELS = [0.05, 0.5, 0.95]
-GRID = (np.arange(100) + 0.5) / 100
 
 
 @pytest.mark.parametrize(
@@ -25,8 +24,7 @@ def test_draws_hold_the_side_that_changes_nothing(starts: str, window: float | N
     """
     for truth, drawn in ((0.3, True), (0.8, False)):
         log = floored_log(np.array([0.4, truth]), seed, 100, 0.02)
-        mass = grid_posterior(log, (GRID, GRID)).sum(0)
-        exact = np.interp(LEVELS, np.cumsum(mass) - 0.5 * mass, GRID)
+        exact = damping_quantiles(log, LEVELS)
         given = log if starts == "recorded" else replace(log, states=None)
         likelihood = sipe.Segments(window, noise="white", starts=starts)
         estimator = Laplace(floored_pendulum(), likelihood=likelihood, seed=seed)
@@ -41,8 +39,7 @@ def test_draws_hold_the_side_that_changes_nothing(starts: str, window: float | N
 def test_a_search_that_ends_where_nothing_changes(starts: str) -> None:
     """Below the floor's edge there is no slope, so the normal is open: the steep side is looked for all the same."""
     log = floored_log(np.array([0.4, 0.3]), 1, 100, 0.02)
-    mass = grid_posterior(log, (GRID, GRID)).sum(0)
-    exact = np.interp(LEVELS, np.cumsum(mass) - 0.5 * mass, GRID)
+    exact = damping_quantiles(log, LEVELS)
     likelihood = sipe.Segments(None, noise="white", starts=starts)
     estimator = Laplace(floored_pendulum(), likelihood=likelihood, seed=1, initial=np.array([[0.4, 0.4999]]))
     drawn = estimator.fit(log if starts == "recorded" else replace(log, states=None)).quantile(LEVELS)[:, 1].numpy()

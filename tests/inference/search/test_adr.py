@@ -75,7 +75,7 @@ def test_recovery() -> None:
 
 
 def test_recovery_with_a_learned_reward() -> None:
-    check_recovery("adr", 300, 1.5, seeds=6, reward="learned")
+    check_recovery("adr", 300, 1.5, reward="learned")
 
 
 def test_paths_are_kept_and_the_first_is_the_prior() -> None:

@@ -22,6 +22,7 @@ from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, proce
 from sipe_bayes.inference.laplace.state_space.options import AverageTuning
 from sipe_bayes.inference.laplace.state_space.target import ChainFit
 from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import integrate
 
@@ -35,28 +36,34 @@ def averaged(problem: SearchProblem, chain: Chain, fit: ChainFit) -> FloatArray:
     of_noise = replace(of_noise, held=of_noise.promised > tuning.wide.tolerance)
     least = of_noise.least[of_noise.free]
 
-    def at(logs: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log posterior of the noise, mean and covariance of theta."""
+    def at(logs: FloatArray) -> tuple[float, Eliminated | None]:
+        """Log posterior of the noise, and what goes with it."""
         if (logs < least).any():
-            return -np.inf, optimum.mean, optimum.covariance
+            return -np.inf, None
         noise = of_noise.at(logs)
         try:
             done = integrate(linear, noise, of_noise.hold, of_noise.held)
         except np.linalg.LinAlgError:  # so far apart that rounding rules
-            return -np.inf, optimum.mean, optimum.covariance
-        normal = problem.normal(optimum.theta, done.solved.precision, done.solved.gradient)
-        return done.value - process_penalty(noise, optimum.movement, tuning.noise), *normal
+            return -np.inf, None
+        return done.value - process_penalty(noise, optimum.movement, tuning.noise), done.solved
+
+    def normal(solved: Eliminated | None) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of theta."""
+        if solved is None:
+            return optimum.mean, optimum.covariance
+        return problem.normal(optimum.theta, solved.precision, solved.gradient)
 
     average, logs = tuning.noise_average, of_noise.start[of_noise.free]
     axes, rng = _axes(of_noise, logs, average), np.random.default_rng([problem.seed, 2])
-    here, means, covariances = at(logs), [], []
+    here, solved = at(logs)
+    beside, means, covariances = normal(solved), [], []
     for draw in range(average.draws):
         proposed = logs + average.step * rng.standard_normal() * axes[draw % len(axes)]
-        tried = at(proposed)
-        if np.log(rng.random()) < tried[0] - here[0]:
-            logs, here = proposed, tried
-        means.append(here[1])
-        covariances.append(here[2])
+        value, solved = at(proposed)
+        if np.log(rng.random()) < value - here:
+            logs, here, beside = proposed, value, normal(solved)
+        means.append(beside[0])
+        covariances.append(beside[1])
     spread = np.array(means) - np.mean(means, axis=0)
     return np.mean(covariances, axis=0) + np.asarray(spread.T @ spread / len(spread))
 

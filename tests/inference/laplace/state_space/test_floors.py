@@ -8,10 +8,9 @@ import pytest
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.likelihood.settings import StateSpace
-from tests.problems.floors import floored_log, floored_pendulum, grid_posterior
+from tests.problems.floors import damping_quantiles, floored_log, floored_pendulum
 
 LEVELS = [0.05, 0.5, 0.95]
-GRID = (np.arange(100) + 0.5) / 100
 
 
 @pytest.mark.parametrize("starts", ["recorded", "estimated"])
@@ -22,8 +21,7 @@ def test_draws_hold_the_side_that_changes_nothing(starts: str) -> None:
     """
     theta = np.array([0.4, 0.3])
     log = floored_log(theta, 0, 100, 0.02)
-    mass = grid_posterior(log, (GRID, GRID)).sum(0)
-    exact = np.interp(LEVELS, np.cumsum(mass) - 0.5 * mass, GRID)
+    exact = damping_quantiles(log, LEVELS)
     estimator = Laplace(floored_pendulum(), likelihood=StateSpace(starts=starts), restarts=1, candidates=0)
     posterior = estimator.fit(log)
     found = posterior.quantile(LEVELS).numpy()

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +15,11 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from sipe_bayes.core.checkpoint import CheckpointError, checksum
+from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.posterior import Posterior
+from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.hung import hung, hung_log
 from tests.problems.interruptions import stop_after
 from tests.problems.springs import (
@@ -22,26 +28,50 @@ from tests.problems.springs import (
 )
 
 
+@dataclass(frozen=True)
+class Whole:
+    """A fit that nothing disturbed, and the same on two threads."""
+
+    starts: str
+
+    @property
+    def simulator(self) -> Callable[..., Simulator]:
+        return spring if self.starts == "estimated" else hung
+
+    @property
+    def logs(self) -> list[Trajectory]:
+        if self.starts == "estimated":
+            return kicked_logs()
+        return [hung_log(np.array([0.4]), 0), hung_log(np.array([0.4]), 1, 61)]
+
+    @cached_property
+    def fits(self) -> tuple[Posterior, Posterior, int]:
+        alone, threads = (Laplace(self.simulator(n), likelihood=StateSpace(starts=self.starts)) for n in (1, 2))
+        return alone.fit(self.logs), threads.fit(self.logs), alone.rollouts
+
+
+WHOLE = {starts: Whole(starts) for starts in ("estimated", "recorded")}
+
+
 @pytest.mark.parametrize(("starts", "steps"), [("estimated", 2), ("estimated", 9), ("recorded", 2), ("recorded", 4)])
 def test_threads_and_an_interruption_change_no_bit(tmp_path: Path, starts: str, steps: int) -> None:
     """After two steps, while jumps are let go, and between estimates of the noise."""
-    logs = kicked_logs() if starts == "estimated" else [hung_log(np.array([0.4]), 0), hung_log(np.array([0.4]), 1, 61)]
-    simulator, likelihood = spring if starts == "estimated" else hung, StateSpace(starts=starts)
-    undisturbed = Laplace(simulator(), likelihood=likelihood)
-    plain = undisturbed.fit(logs)
-    threads = Laplace(simulator(2), likelihood=likelihood).fit(logs)
-    interrupted = Laplace(simulator(), likelihood=likelihood, checkpoint=tmp_path / "fit.safetensors")
+    whole = WHOLE[starts]
+    plain, threads, rollouts = whole.fits
+    interrupted = Laplace(
+        whole.simulator(), likelihood=StateSpace(starts=starts), checkpoint=tmp_path / "fit.safetensors"
+    )
     interrupted.checkpoint_seconds = 0.0
     interrupted.progress = stop_after(steps)
     with pytest.raises(KeyboardInterrupt):
-        interrupted.fit(logs)
+        interrupted.fit(whole.logs)
     outliers = load_file(tmp_path / "fit.safetensors").get(".state.search.here.noise.outliers", np.zeros(1))
     assert outliers.any() == (starts == "estimated" and steps > 2)
     interrupted.progress = None
-    for other in (threads, interrupted.fit(logs)):
+    for other in (threads, interrupted.fit(whole.logs)):
         assert torch.equal(plain.means, other.means)  # type: ignore[attr-defined]
         assert torch.equal(plain.covariances, other.covariances)  # type: ignore[attr-defined]
-    assert interrupted.rollouts == undisturbed.rollouts
+    assert interrupted.rollouts == rollouts
 
 
 def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:

@@ -23,13 +23,13 @@ KNOWN = StateSpace(starts="recorded")
 
 
 def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
-    """Of 20 intervals of 90 % for what bounces at least 14 hold the truth; what nothing moves keeps its prior.
+    """Of 12 intervals of 90 % for what bounces at least 8 hold the truth; what nothing moves keeps its prior.
 
-    Right ones fail with probability 0.2 %, were they independent. Their squared z-scores average 3 at most (0.0007 %;
+    Right ones fail with probability 0.4 %, were they independent. Their squared z-scores average 2.65 at most (0.15 %;
     short differences have 4).
     """
     rng, covered, errors, scores = np.random.default_rng(4), 0, [], []
-    for seed in range(10):
+    for seed in range(6):
         theta = rng.uniform(0.1, 0.9, 3)
         estimator = Laplace(bouncing(), likelihood=KNOWN, restarts=1, seed=seed)
         posterior = estimator.fit(bouncing_log(theta, seed))
@@ -45,10 +45,10 @@ def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
             1 / np.sqrt(12), rel=0.02 if estimator.state.draws is None else 0.14
         )
     square = float(np.mean(np.square(scores)))
-    print("covered", covered, "of 20, median error", np.median(errors), "mean squared z", square)
-    assert covered >= 14
+    print("covered", covered, "of 12, median error", np.median(errors), "mean squared z", square)
+    assert covered >= 8
     assert np.median(errors) < 0.02
-    assert square < 3
+    assert square < 2.65
 
 
 def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray | None, Laplace]:
