@@ -287,16 +287,13 @@ class StructureSearch:
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
-        if rest:
-            return state
-        return self._settled(state)
+        return state if rest else self._settled(state)
 
     def _settled(self, state: DiscoverState) -> DiscoverState:
         """The round's best is looked at once more, or the search for more ends."""
         best = self._best_grown(state)
-        if best is None:
-            return replace(state, phase=Phase.PRUNE)
-        return replace(state, larger=best.labels, phase=Phase.AGAIN)
+        onward = replace(state, phase=Phase.PRUNE)
+        return onward if best is None else replace(state, larger=best.labels, phase=Phase.AGAIN)
 
     def _best_grown(self, state: DiscoverState) -> FittedStructure | None:
         """The best of those with one extension more, where it is better than the present structure."""
