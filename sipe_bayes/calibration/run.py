@@ -208,9 +208,11 @@ def run(
     bind(problem.likelihood, problem.simulator, problem.train)
     if problem.holdout is not None:
         every_channel(problem, problem.holdout)
+    lost = not_followed(problem)
+    problem = replace(problem, findings=(*problem.findings, *lost))
     if tell is not None:
-        for line in not_followed(problem):
-            tell(line)
+        for item in lost:
+            tell(item.text)
     chosen_seed = problem.config.seed if seed is None else seed
     chosen_budget = problem.config.budget if budget is None else budget
     folder = Path("runs") / f"{run_name(problem.config.path)}-{name}" if out is None else out

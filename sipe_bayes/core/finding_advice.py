@@ -160,6 +160,7 @@ ADVICE: dict[Code, str] = {
         "one part and fix its mass with `actuator:NAME.gain` (a servo's `kp`) free; say by `tolerance` of the command "
         "how well forces are known, by `geometry_tolerance` how well the drawing is."
     ),
+    Code.COLUMN_NOT_FOLLOWED: "Look whether the fit follows it; else at its zero, unit and sign.",
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",
     Code.PROCESS_NOISE: "What the model lacks acts there. A few per cent are usual of a good model.",

@@ -289,6 +289,10 @@ class Code(Enum):
         "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s; the calibrated "
         "model follows it all the same"
     )
+    COLUMN_NOT_FOLLOWED = note(
+        "before the fit, nothing that is simulated follows {channel!r}: short windows miss {times:.2g} times what "
+        "going on straight does; look at its zero, unit and sign, which sipe init tries, and at what the model lacks"
+    )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")
     LOGS_DISAGREE = blocking(
         "the logs disagree about {parameters} (p = {p:.1g}): {estimates} {unit}; give it per_log = true, model what "

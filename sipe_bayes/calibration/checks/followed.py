@@ -6,13 +6,15 @@ from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.windows import FEW
 from sipe_bayes.calibration.problem import Problem
+from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.likelihood.settings import fitted_channels
 
 _SHARE = 0.1  # of the time in which the motion goes to and fro: what short windows miss, no start explains
 _ROUNDS = 6  # of the fit, where the model as given misses a column
 
 
-def not_followed(problem: Problem) -> list[str]:
-    """One line for each column that moves, and that windows follow hardly better than a straight line does.
+def not_followed(problem: Problem) -> tuple[Finding, ...]:
+    """One for each fitted column that moves, and that windows follow hardly better than a straight line does.
 
     First with the model as given, then with its unknowns fitted in a few steps: seconds, where the fit takes minutes.
 
@@ -24,8 +26,6 @@ def not_followed(problem: Problem) -> list[str]:
     if lost:
         left = fit(trial, trial.given, (0,), _ROUNDS)
         lost = trial.unfollowed(trial.given, left.theta)
-    return [
-        f"nothing that is simulated follows {problem.environment.channels[k]!r}: short windows miss {by:.2g} times "
-        "what going on straight does; look at its zero, unit and sign; sipe init tries them"
-        for k, by in lost.items()
-    ]
+    fitted = fitted_channels(problem.environment.channels, problem.likelihood.fit)
+    names = {problem.environment.channels[k]: by for k, by in lost.items() if k in fitted}
+    return tuple(finding(Code.COLUMN_NOT_FOLLOWED, channel=name, times=by) for name, by in names.items())

@@ -102,7 +102,7 @@ def test_a_column_that_nothing_follows_is_named_before_a_fit(tmp_path: Path) -> 
     pd.DataFrame({"time": time, "hinge_rad": angle, "motor_torque_Nm": torque}).to_csv(tmp_path / "log.csv")
     path = tmp_path / "calibrate.toml"
     path.write_text(toml_of(propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path), "sipe init"))
-    assert not_followed(prepare(path, 1)) == []
+    assert not_followed(prepare(path, 1)) == ()
     path.write_text(path.read_text().replace('unit = "N m"\n', 'unit = "N m"\nsign = -1\n'))
-    (line,) = not_followed(prepare(path, 1))
-    assert "nothing that is simulated follows 'hinge_rad'" in line
+    (noticed,) = not_followed(prepare(path, 1))
+    assert "nothing that is simulated follows 'hinge_rad'" in noticed.text
